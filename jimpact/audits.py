@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jimpact.compiling import full_precision
 from jimpact.contact import contact_of
 from jimpact.impacts import Impact, judged_beyond
 from jimpact.scene import Scene, as_velocity, gap_velocity, kinetic_energy, momentum
@@ -50,6 +51,7 @@ class Audit(eqx.Module):
         return [name for name in CONSISTENCIES if not bool(getattr(self, name))]
 
 
+@full_precision
 def audit(scene: Scene, velocity: Any, out: Impact) -> Audit:
     """Check an outcome against what every impact must satisfy, whatever the law.
 
@@ -125,6 +127,7 @@ def nothing_approaches(scene: Scene, velocity: Any) -> str | None:
     return "nothing approaches (gamma- < 0 at no contact): is the sign of the velocities as meant?"
 
 
+@full_precision
 def summary(out: Impact, scene: Scene, velocity: Any) -> str:
     """A printable report of one impact (or, for a batch, of its status codes).
 
@@ -142,7 +145,7 @@ def summary(out: Impact, scene: Scene, velocity: Any) -> str:
     >>> import jimpact as ji
     >>> scene, v = ji.chain([1.0, 1.0]), [1.0, 0.0]
     >>> print(ji.summary(ji.impact(ji.Newton(0.5), scene, v), scene, v).splitlines()[0])
-    status         ok: the impact is resolved within tolerance
+    status         ok: resolved within tolerance
     """
     codes = np.asarray(out.status)
     if codes.ndim:

@@ -1,4 +1,7 @@
-"""How the library compiles its programs: compiled faster, run a few percent slower."""
+"""How the library compiles its programs: in full precision, and quickly.
+
+Programs that compile in half of the time run a few percent slower.
+"""
 
 import functools
 from collections.abc import Callable, Iterator
@@ -21,6 +24,30 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 Runner = Callable[[Callable[..., Any], Callable[..., Any], Any, list[jax.Array]], Any]
 
 _runner: "ContextVar[Runner | None]" = ContextVar("runner", default=None)
+
+
+def full_precision(function: Function) -> Function:
+    """`function`, whose products of matrices have the precision of their numbers.
+
+    By default JAX lets accelerators multiply float32 matrices with 10 bits (TF32, bfloat16): laws
+    are wrong by 5e-4 then, and error estimates never reach a tolerance. A product gets its
+    precision where it is traced, so this decorates whatever JAX may trace by itself: public
+    functions and methods, compiled programs, rules of derivatives.
+    """
+
+    @functools.wraps(function)
+    def precise(*args: Any, **keywords: Any) -> Any:
+        """The function, traced or run where products have the highest precision."""
+        with jax.default_matmul_precision("highest"):
+            return function(*args, **keywords)
+
+    return precise  # type: ignore[return-value]
+
+
+def precise_jit(function: Function) -> Function:
+    """`eqx.filter_jit(function)` in full precision."""
+    compiled: Function = full_precision(eqx.filter_jit(function))
+    return compiled
 
 
 @contextmanager
@@ -66,7 +93,7 @@ def is_top_level_call(*args: Any) -> bool:
 
 
 def quick_jit(function: Function) -> Function:
-    """`eqx.filter_jit(function)`, compiled quickly where it is called at top level."""
+    """`eqx.filter_jit(function)` in full precision, compiled quickly where called at top level."""
     inside = eqx.filter_jit(function)
 
     @functools.cache
@@ -85,6 +112,7 @@ def quick_jit(function: Function) -> Function:
         of_arrays.__name__ = f"whole_{function.__name__}" if stored else function.__name__
         return jax.jit(of_arrays, static_argnums=0, compiler_options=known_options())
 
+    @full_precision
     @functools.wraps(function)
     def call(*args: Any, **keywords: Any) -> Any:
         """`function`, compiled by itself or as part of the program that calls it."""

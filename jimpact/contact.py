@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, is_traced
+from jimpact.compiling import full_precision
 from jimpact.scene import Scene, gap_velocity, solve_mass, without_constraints
 from jimpact.solvers.sparse import Sparse
 from jimpact.solvers.tangential import TangentialBlock
@@ -190,6 +191,7 @@ class Contact(eqx.Module):
         """The contact with all gap velocities lower by `speed` () [m/s]."""
         return eqx.tree_at(lambda contact: contact.gap_velocity, self, self.gap_velocity - speed)
 
+    @full_precision
     def gap_velocity_after(self, normal: jax.Array, tangential: jax.Array | None) -> jax.Array:
         """gamma+ (m,) [m/s] of impulses, normal p (m,) and tangential p_t (t,)."""
         after = self.gap_velocity + self.delassus @ normal
@@ -197,12 +199,14 @@ class Contact(eqx.Module):
             return after
         return after + self.tangential_block.normal_tangent @ tangential
 
+    @full_precision
     def slip_after(self, normal: jax.Array, tangential: jax.Array) -> jax.Array:
         """u+ (t,) [m/s] of impulses, normal (m,) and tangential (t,), where there are tangents."""
         assert self.tangential_block is not None
         cross, tangent, slip = self.tangential_block
         return slip + cross.T @ normal + tangent @ tangential
 
+    @full_precision
     def energy_change(self, normal: jax.Array, tangential: jax.Array | None = None) -> jax.Array:
         """T+ - T- () [J] of normal and tangential impulses: their work at the mean velocities."""
         mean = 0.5 * (self.gap_velocity + self.gap_velocity_after(normal, tangential))
@@ -215,6 +219,7 @@ class Contact(eqx.Module):
         """Angles (m, m) [rad] between contacts; pi/2: they are decoupled."""
         return _angles(self.delassus)
 
+    @full_precision
     def rounding(self, normal: jax.Array, tangential: jax.Array | None) -> jax.Array:
         """Rounding (m,) of gamma+ after normal and tangential impulses: terms of W p may cancel."""
         w = self.delassus
@@ -225,6 +230,7 @@ class Contact(eqx.Module):
         return self.noise + ROUNDINGS * eps * (jnp.abs(self.gap_velocity) + size)
 
 
+@full_precision
 def contact_of(
     scene: Scene, velocity: jax.Array, stored: jax.Array | None = None, uses_gaps: bool = False
 ) -> Contact:
@@ -275,6 +281,7 @@ def _taking_part(contact: Contact, part: jax.Array) -> Contact:
     )
 
 
+@full_precision
 def rounded_gap_velocity(scene: Scene, velocity: jax.Array) -> tuple[jax.Array, jax.Array]:
     """gamma- (m,), 0 where it is within the rounding of v-, and that rounding (m,).
 
@@ -293,6 +300,7 @@ def rounded_gap_velocity(scene: Scene, velocity: jax.Array) -> tuple[jax.Array, 
     return gamma - jax.lax.stop_gradient(jnp.where(jnp.abs(gamma) <= noise, gamma, 0.0)), noise
 
 
+@full_precision
 def delassus_matrix(scene: Scene) -> Symmetric:
     """`W = N^T M^-1 N` [1/kg]: (m, m), or `Tridiagonal` for a chain.
 
@@ -338,6 +346,7 @@ def kinetic_norm(scene: Scene) -> jax.Array:
     return jnp.sqrt(jnp.sum(scene.normals * moved, axis=0))
 
 
+@full_precision
 def normalized_delassus(scene: Scene) -> Symmetric:
     """`G = W` between unit normals: unit diagonal, `G_ij = -cos(theta_ij)`.
 
@@ -356,6 +365,7 @@ def normalized_delassus(scene: Scene) -> Symmetric:
     return scaled(delassus_matrix(scene), 1 / kinetic_norm(scene))
 
 
+@full_precision
 def normalized_gap_velocity(scene: Scene, velocity: Any) -> jax.Array:
     """`gamma_j / |grad f_j|` (m,) [sqrt(J)], the normal quasi-velocities.
 
@@ -378,6 +388,7 @@ def normalized_gap_velocity(scene: Scene, velocity: Any) -> jax.Array:
     return gap_velocity(scene, velocity) / kinetic_norm(scene)
 
 
+@full_precision
 def kinetic_angles(scene: Scene) -> jax.Array:
     """Angles `theta_ij = pi - arccos(G_ij)` (m, m) [rad] between contacts; pi/2: decoupled.
 

@@ -16,7 +16,7 @@ from jimpact._checks import (
     in_common_dtype,
     is_traced,
 )
-from jimpact.compiling import is_top_level_call, quick_jit
+from jimpact.compiling import full_precision, is_top_level_call, quick_jit
 from jimpact.contact import Contact, Groups, contacts_of_groups, coupled_groups
 from jimpact.law import Impulses, Law, check_law, is_separable, restrict_law, within_domains
 from jimpact.scene import (
@@ -64,6 +64,7 @@ class Impact(eqx.Module):
     accuracy: jax.Array | float = 0.0
 
 
+@full_precision
 def impact(
     law: Law, scene: Scene, velocity: Any, noise: Any = None, approach: Any = None
 ) -> Impact:

@@ -260,10 +260,10 @@ class _Signed(type(eqx.Module)):  # type: ignore[misc]
                 taken.bind(*args, **kwargs)
             except TypeError as why:
                 names = ", ".join(
-                    name if x.default is x.empty else f"{name}={x.default!r}"
+                    f"`{name}`" if x.default is x.empty else f"`{name}` = {x.default!r}"
                     for name, x in taken.parameters.items()
                 )
-                raise TypeError(f"{cls.__name__} takes ({names}): {why}.") from None
+                raise TypeError(f"{cls.__name__} takes {names}: {why}.") from None
             raise
 
 

@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
+from jimpact.compiling import full_precision
 from jimpact.solvers.sparse import Neighbours, Sparse
 
 # Asymmetry of M, relative to its largest entry, that rounding causes in float32. Ten times more
@@ -78,6 +79,7 @@ class PairNormals(eqx.Module):
             jnp.zeros((self.neighbours.count, d), forces.dtype).at[bodies].add(forces).reshape(-1)
         )
 
+    @full_precision
     def delassus(self, mass: jax.Array) -> Sparse:
         """W for masses (n,)."""
         moved = self.directions / self._at_bodies(mass)
@@ -359,6 +361,7 @@ def as_velocity(scene: Scene, velocity: Any) -> jax.Array:
     return v
 
 
+@full_precision
 def gap_velocity(scene: Scene, velocity: Any) -> jax.Array:
     """Gap velocities `gamma = N^T v` (m,) [m/s] of velocities (n,); negative on approach.
 
@@ -387,6 +390,7 @@ def gap_velocity(scene: Scene, velocity: Any) -> jax.Array:
     return jnp.diff(jnp.pad(v, (int(left), int(right))))
 
 
+@full_precision
 def momentum(scene: Scene, velocity: Any) -> jax.Array:
     """Generalized momenta `M v` (n,); for a chain without walls their sum is conserved.
 
@@ -408,6 +412,7 @@ def momentum(scene: Scene, velocity: Any) -> jax.Array:
     return scene.mass * v if scene.mass.ndim == 1 else scene.mass @ v
 
 
+@full_precision
 def kinetic_energy(scene: Scene, velocity: Any) -> jax.Array:
     """Kinetic energy `T = v^T M v / 2` [J] of velocities (n,).
 
@@ -435,6 +440,7 @@ def dense_mass(scene: Scene) -> np.ndarray:
     return np.diag(mass) if mass.ndim == 1 else mass
 
 
+@full_precision
 def solve_mass(scene: Scene, right: jax.Array) -> jax.Array:
     """`M^-1 right`, with the reactions of bilateral constraints if the scene has any."""
     if scene.mass.ndim == 1:
@@ -449,6 +455,7 @@ def solve_mass(scene: Scene, right: jax.Array) -> jax.Array:
     return free - m_inv_h @ jnp.linalg.solve(h.T @ m_inv_h, h.T @ free)
 
 
+@full_precision
 def velocity_change(scene: Scene, impulse: Any, tangential: Any = None) -> jax.Array:
     """Velocity change by contact impulses: `v+ - v- = M^-1 (N p + H p_t)` (n,) [m/s].
 

@@ -1,4 +1,4 @@
-"""Status codes of an impact: set on the device, worded and raised on the host."""
+"""Status codes of impacts and motions: set on the device, worded and raised on the host."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -14,25 +14,57 @@ class Status(NamedTuple):
     failure: bool
 
 
-# The code is the row number; where several apply the highest wins, so rows go from mild to grave.
+# One table for impacts and motions. The code is the row number; where several apply the highest
+# wins, so rows go from mild to grave. `failure` marks impacts without a usable outcome and motions
+# that end before t_end.
 STATUS = (
-    Status("ok", "the impact is resolved within tolerance", False),
+    Status("ok", "resolved within tolerance", False),
     Status("impulse_not_unique", "v+ is determined, the impulses are one of many", False),
     Status("order_dependent", "the outcome depends on the order of adjacent collisions", False),
-    Status("several_outcomes", "the law allows several velocities, these are one of them", False),
+    Status("several_outcomes", "the law allows several outcomes, this is one of them", False),
     Status("plastic_limit", "contacts re-close without end; finished in the plastic limit", False),
     Status("ill_conditioned", "the outcome depends on the tolerance by more than 10 rtol", False),
+    Status(
+        "coarse_step",
+        "steps are too long: within 3 a contact is struck again, at more than a tenth of the "
+        "largest gap velocity, or in one bodies pass each other, or a disc of a pile moves by more "
+        "than the least radius",
+        False,
+    ),
+    Status("unsolved_step", "impulses of a step are off by > 1 % of its velocities", False),
+    Status(
+        "no_derivatives",
+        "the motion is right, but its derivatives are NaN: it takes more steps than they keep "
+        "(samples + 16 `max_events` + 1024)",
+        False,
+    ),
     Status("energy_gain", "the outcome holds more energy than was there before", True),
     Status("inadmissible_velocity", "a contact still approaches after the impact", True),
     Status("negative_impulse", "a contact would have to pull (p < 0)", True),
     Status("infeasible", "the law has no solution for this scene", True),
+    Status("law_failed", "the law fails at an impact of the motion (see `events.status`)", True),
     Status(
-        "max_steps",
-        "the step limit ended the impact before it was over; for LZB and Compliant try "
-        "method='implicit'",
+        "no_contact_force",
+        "contact forces with friction have no solution, and the law has no impact without "
+        "collision for it: LZB with `friction` has one",
         True,
     ),
-    Status("out_of_range", "an argument, or the energy of the impact, is outside its range", True),
+    Status("room", "more contacts are closed than the body has `room` for", True),
+    Status("max_events", "more events than `max_events`", True),
+    Status(
+        "max_steps",
+        "the step limit, or steps that vanish, ended the impact or the motion before it was over; "
+        "for LZB and Compliant try method='implicit'",
+        True,
+    ),
+    Status("penetration", "a gap is negative at the start", True),
+    Status("backward", "t_end is not after t_start", True),
+    Status("singular_mass", "the mass matrix is not positive definite on the way", True),
+    Status(
+        "out_of_range",
+        "an argument, the energy of the impact or a gap function on the way is outside its range",
+        True,
+    ),
     Status("not_finite", "the result or its input is NaN or infinite", True),
 )
 

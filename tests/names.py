@@ -10,7 +10,6 @@ from jimpact.fits.least_squares import DEFAULT_STEPS
 from jimpact.fits.observables import QUANTITIES
 from jimpact.methods.contenders import METHODS
 from jimpact.motion.simulate import METHODS as MOTION_METHODS
-from jimpact.plot.chapter.figures import CAPTIONS
 
 PATH = Path(ji.__file__).parent / "data" / "names.json"
 
@@ -38,7 +37,6 @@ def names():
         "losses": ["squares", *LOSSES],
         "quantities": list(QUANTITIES),
         "motion_methods": list(MOTION_METHODS),
-        "figures": CAPTIONS,
     }
 
 

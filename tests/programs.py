@@ -6,6 +6,7 @@ compiled batch of `LANES`, and what is padded tests that open contacts take no p
 """
 
 import functools
+import re
 from dataclasses import dataclass
 from typing import Any
 
@@ -285,3 +286,9 @@ def check_held(name, states, allowed=None):
                 wrong.append((state.name or i, error, got))
     assert not wrong, wrong
     return out
+
+
+def below_highest(text):
+    """Lines of a StableHLO program with products that ask for less than the highest precision."""
+    products = re.finditer(r"^.*\bstablehlo\.dot_general\b.*$", text, re.M)
+    return [x[0].strip() for x in products if "HIGHEST, HIGHEST" not in x[0]]

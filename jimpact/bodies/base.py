@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
-from jimpact.compiling import quick_jit
+from jimpact.compiling import full_precision, quick_jit
 from jimpact.scene import Scene, check_mass, sparse_scene
 
 STANDARD_GRAVITY = 9.80665  # m/s^2
@@ -182,6 +182,7 @@ class Body(eqx.Module):
         mass = self.mass
         return jnp.asarray(mass(q) if callable(mass) else mass)
 
+    @full_precision
     def inertial_force(self, q: jax.Array, v: jax.Array) -> jax.Array:
         """What constant velocities take (n,) at q: `M v' = F + inertial_force`, Coriolis terms.
 
@@ -424,6 +425,7 @@ class GivenBody(Body):
         return _parts(self, q)  # each new lambda would be compiled anew
 
 
+@full_precision
 def scene_from_gaps(
     gap_function: Callable[[jax.Array], jax.Array],
     mass: Any,
@@ -459,6 +461,7 @@ class LinearPotential(eqx.Module):
 
     weights: jax.Array
 
+    @full_precision
     def __call__(self, q: jax.Array) -> jax.Array:
         """V () [J]."""
         return self.weights @ q

@@ -9,6 +9,7 @@ import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values
 from jimpact.bodies.base import CIRCLE, PLANAR, Body, numbered, positive, positives
+from jimpact.compiling import full_precision
 from jimpact.scene import Scene
 
 
@@ -107,6 +108,7 @@ class PendulumPotential(eqx.Module):
 
     weight_length: jax.Array
 
+    @full_precision
     def __call__(self, q: jax.Array) -> jax.Array:
         """V () [J]."""
         return self.weight_length @ (1 - jnp.cos(q))

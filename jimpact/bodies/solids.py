@@ -20,6 +20,7 @@ from jimpact.bodies.base import (
     positives,
     projected,
 )
+from jimpact.compiling import full_precision
 from jimpact.scene import check_mass
 
 # How far a quaternion may be from length 1. Numbers written with six digits are within; ten times
@@ -114,6 +115,7 @@ class Solid(Body):
         """How much farther from 1 the quaternion's length may be ()."""
         return UNIT_WITHIN - jnp.abs(jnp.sqrt(jnp.sum(q[3:] ** 2)) - 1)
 
+    @full_precision
     def moved(self, q: jax.Array, u: jax.Array) -> jax.Array:
         """q displaced by u[:3] and turned by the vector u[3:] of the body's axes; |e| = 1."""
         e = q[3:] / jnp.sqrt(jnp.sum(q[3:] ** 2))
@@ -122,6 +124,7 @@ class Solid(Body):
         turn = jnp.concatenate([cosine[None], ratio * half])
         return jnp.concatenate([q[:3] + u[:3], _product(e, turn)])
 
+    @full_precision
     def nearby(self, q: jax.Array, u: jax.Array) -> jax.Array:
         """q after the displacement u, to second order in u: without sine and cosine."""
         e = q[3:] / jnp.sqrt(jnp.sum(q[3:] ** 2))
@@ -129,12 +132,14 @@ class Solid(Body):
         turn = jnp.concatenate([(1 - 0.5 * (half @ half))[None], half])
         return jnp.concatenate([q[:3] + u[:3], _product(e, turn)])
 
+    @full_precision
     def pulled(self, q: jax.Array, gradient: jax.Array) -> jax.Array:
         """Gradient (7,) in q as one (6,) in the displacements, by `e' = e (0, omega) / 2`."""
         e = q[3:] / jnp.sqrt(jnp.sum(q[3:] ** 2))
         turns = 0.5 * jnp.tensordot(e, jnp.asarray(_QUATERNION_PRODUCT, e.dtype), (0, 1))[:, 1:]
         return jnp.concatenate([gradient[:3], gradient[3:] @ turns])
 
+    @full_precision
     def inertial_force(self, q: jax.Array, v: jax.Array) -> jax.Array:
         """`-(0, omega x I omega)` (6,)."""
         omega = v[3:]
@@ -155,6 +160,7 @@ class Solid(Body):
         """Heights of the contact points over the plane (m,)."""
         return self.gaps_and_normals(q)[0]
 
+    @full_precision
     def gaps_and_normals(self, q: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Heights, and columns `(n, c_i x R^T n)`."""
         up = rotation(q).T @ self.normal
@@ -164,6 +170,7 @@ class Solid(Body):
         gaps = self.normal @ q[:3] + points @ up - self.rim
         return gaps, jnp.concatenate([still, turn], axis=1).T
 
+    @full_precision
     def tangents(self, q: jax.Array) -> jax.Array:
         """H_t (6, 2 m): two directions in the plane for each contact."""
         n = self.normal
@@ -177,6 +184,7 @@ class Solid(Body):
         still = jnp.broadcast_to(both[None], turn.shape)
         return jnp.concatenate([still, turn], axis=2).reshape(-1, 6).T
 
+    @full_precision
     def at(self, position: Any, quaternion: Any = _UPRIGHT) -> jax.Array:
         """q (7,), the middle of its shape at `position` (3,) [m], turned by `quaternion` (4,)."""
         place, e = _vector("position", position), _unit(quaternion)
@@ -202,6 +210,7 @@ class Solid(Body):
         """None: outlines have a shadow on the plane instead."""
         return ()
 
+    @full_precision
     def _drawn(self, q: np.ndarray, curve: np.ndarray) -> list[np.ndarray]:
         """A curve (k, 3) of the body in projection, and its shadow."""
         placed = q[:3] + curve @ np.asarray(rotation(jnp.asarray(q))).T
@@ -331,6 +340,7 @@ class Sphere(Solid):
         """The radius."""
         return self.radius
 
+    @full_precision
     def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
         """Its silhouette, and two great circles of the body with their shadow, in projection."""
         flat = np.insert(CIRCLE, 2, 0.0, axis=1)
@@ -413,6 +423,7 @@ class Coin(Solid):
         """Corners, or the lowest points (2, 3) of round rims."""
         return self.points if self.corners else self._rims(lengths(down[None, :2])[1])
 
+    @full_precision
     def valid(self, q: jax.Array) -> jax.Array:
         """As of `Solid`; of round coins also the tilt beyond `FLAT`."""
         length = super().valid(q)
@@ -430,6 +441,7 @@ class Coin(Solid):
         return [line for curve in (*rims, across[2:]) for line in self._drawn(q, curve)]
 
 
+@full_precision
 def rotation(q: jax.Array) -> jax.Array:
     """R (3, 3) of q (7,), from the body's axes to those of space, whatever the length of e."""
     cross = jnp.asarray(-_CROSS, q.dtype) @ q[4:]
@@ -437,11 +449,13 @@ def rotation(q: jax.Array) -> jax.Array:
     return jnp.eye(3, dtype=q.dtype) + turn
 
 
+@full_precision
 def cross(a: jax.Array, b: jax.Array) -> jax.Array:
     """Vector products (.., 3), in fewer operations to compile than `jnp.cross`."""
     return jnp.sum(a[..., None, :] * jnp.tensordot(b, _CROSS.astype(b.dtype), (-1, 2)), axis=-1)
 
 
+@full_precision
 def _product(e: jax.Array, other: jax.Array) -> jax.Array:
     """Product (4,) of the quaternions e and `other`."""
     return (jnp.asarray(_QUATERNION_PRODUCT, e.dtype) @ other) @ e

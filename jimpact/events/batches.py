@@ -18,6 +18,7 @@ from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir, partial_eval as pe
 
+from jimpact.compiling import full_precision
 from jimpact.events.tangents import TANGENT_AXIS, Dual, dual_like, is_dual, value_of
 from jimpact.loops import kinds_like, varying_like
 from jimpact.solvers.sensitivity import unit_directions
@@ -274,6 +275,7 @@ def _queues(function: Any, arrays: Arrays) -> bool:
     return queues is not None and queues(*arrays)
 
 
+@full_precision
 def _in_chunks(function: Callable[..., Arrays], *arrays: jax.Array) -> Arrays:
     """On a CPU piece by piece, the last one filled up; on accelerators all at once."""
     size = arrays[0].shape[-1]

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 
+from jimpact.compiling import full_precision
 from jimpact.contact import Contact
 from jimpact.events import implicit_steps, impulse_form, stepper
 from jimpact.events.batches import in_columns, with_tangents_in_columns
@@ -367,6 +368,7 @@ class ImplicitProgram(ImpulseProgram):
             flow, start = self.steps(jax.tree.unflatten(self.tree, leaves))
             return self.results(implicit_steps.repeat(flow, start, run.plan))
 
+        @full_precision
         def tangent(primals: Any, tangents: Any) -> tuple[Any, Any]:
             """Those of the steps that were taken; events within them spoil second ones."""
             leaves = without_derivatives(primals[0], NotImplementedError(NO_SECOND))
@@ -504,6 +506,7 @@ def evaluate(function: ImpulseProgram, leaves: tuple[jax.Array, ...]) -> tuple[j
         """The values."""
         return in_columns(function, *leaves)
 
+    @full_precision
     def rule(primals: Any, tangents: Any) -> Any:
         """Values at the tolerance of derivatives, and their tangents."""
         # in reverse mode values keep the steps: one loop where they are one program

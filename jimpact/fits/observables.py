@@ -10,6 +10,7 @@ import numpy as np
 
 from jimpact._checks import as_float_array, check_choice, check_values
 from jimpact.bodies.base import STANDARD_GRAVITY
+from jimpact.compiling import full_precision
 from jimpact.fits.problem import Prediction, meaningless
 from jimpact.impacts import impact
 from jimpact.law import Law
@@ -71,6 +72,7 @@ class Observations(eqx.Module):
             for row in self.rows
         )
 
+    @full_precision
     def __call__(self, law: Law) -> Prediction:
         """The values that this law predicts."""
         if any(row.quantity in _OF_FORCES for row in self.rows):

@@ -3,12 +3,12 @@
 import operator
 from typing import Any, ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_whole, check_values, in_common_dtype
+from jimpact.compiling import full_precision, precise_jit
 from jimpact.contact import Contact
 from jimpact.law import Impulses, Law, OptionalValues, Values, check_law, option, parameter
 from jimpact.laws.friction import friction_fields
@@ -120,6 +120,7 @@ class Binary(Law):
                 f"follow each other), but has value {self.order!r}: it separates at once."
             )
 
+    @full_precision
     def impulses(self, contact: Contact) -> Impulses:
         """Sum of the impulses of all collisions; gaps matter in the order 'earliest'."""
         p, tangential, end = self._solve(contact)
@@ -223,10 +224,10 @@ class Binary(Law):
         return law, scene, v
 
 
-@eqx.filter_jit
+@precise_jit
 def _count(law: Binary, scene: Scene, velocity: jax.Array) -> jax.Array:
     """Number of collisions."""
     return law._solve(law.contact(scene, velocity))[2].number
 
 
-_collide = eqx.filter_jit(collisions.collide)
+_collide = precise_jit(collisions.collide)

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from jimpact._checks import check_choice, check_values
+from jimpact.compiling import full_precision
 from jimpact.contact import Contact
 from jimpact.events.contact_flow import Viscous
 from jimpact.events.impact_dynamics import (
@@ -140,6 +141,7 @@ class Compliant(Law):
             problem = problem._replace(sides=sides_of(contact, self.friction, units))
         return Dynamics(problem, units, exponent, contact.structure, self.max_steps, method)
 
+    @full_precision
     def impulses(self, contact: Contact) -> Impulses:
         """Impulses over the whole encounter, gaps included."""
         checked = contact if self.check_conditioning else None

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from jimpact._checks import as_whole, check_values, in_common_dtype
-from jimpact.compiling import quick_jit
+from jimpact.compiling import full_precision, quick_jit
 from jimpact.events.batches import in_columns
 from jimpact.events.contact_flow import ContactStates
 from jimpact.events.impact_history import history_program
@@ -43,6 +43,7 @@ class History(eqx.Module):
     status: jax.Array
 
 
+@full_precision
 def history(law: Law, scene: Scene, velocity: Any, samples: int = 200) -> History:
     """Sample the impact of a law that has a history at equal intervals of impact time.
 

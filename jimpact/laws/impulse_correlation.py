@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_per_contact, check_values, is_traced
+from jimpact.compiling import full_precision
 from jimpact.contact import Contact, delassus_matrix
 from jimpact.law import Impulses, Law, Values, option, parameter
 from jimpact.scene import Scene
@@ -80,6 +81,7 @@ class ImpulseCorrelation(Law):
                     f"{j} beside contact {i}, but has value {ratio[i, j]:.6g}."
                 )
 
+    @full_precision
     def impulses(self, contact: Contact) -> Impulses:
         """Sum of the impulses of all collisions."""
         p, _, end = collisions.solve(

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import check_shape, is_traced
+from jimpact.compiling import full_precision
 from jimpact.contact import Contact
 from jimpact.law import Impulses, Law, OptionalValues, Values, option, parameter
 from jimpact.laws.friction import friction_fields, frictional_impulses
@@ -51,6 +52,7 @@ class Kinematic(Law):
             return (1 + e) * gamma
         return gamma + contact.norm * (e @ contact.normalized_gap_velocity)
 
+    @full_precision
     def impulses(self, contact: Contact) -> Impulses:
         """One linear system, one complementarity problem, or the friction problem."""
         required = self.required(contact)
@@ -278,6 +280,7 @@ class RestitutionMatrix(Kinematic):
             )
         check_independent(scene)
 
+    @full_precision
     def contact(self, scene: Scene, velocity: jax.Array) -> Contact:
         """With tangential blocks the tangential quasi-velocities, too."""
         contact = super().contact(scene, velocity)
@@ -287,6 +290,7 @@ class RestitutionMatrix(Kinematic):
         _, basis = quasi_basis(scene)
         return QuasiContact(contact, basis.T @ momentum(scene, velocity), basis.T @ scene.tangents)
 
+    @full_precision
     def impulses(self, contact: Contact) -> Impulses:
         """Impulses of either form of E."""
         if not isinstance(contact, QuasiContact):

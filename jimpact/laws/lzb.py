@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_values
+from jimpact.compiling import full_precision
 from jimpact.contact import Contact
 from jimpact.events.impact_dynamics import (
     METHODS,
@@ -264,6 +265,7 @@ class LZB(Law):
             problem = problem._replace(sides=sides_of(contact, self.friction, units))
         return Dynamics(problem, units, self.exponent, contact.structure, self.max_steps, method)
 
+    @full_precision
     def impulses(self, contact: Contact) -> Impulses:
         """Impulses at the end of the impact dynamics."""
         checked = contact if self.check_conditioning else None

@@ -5,6 +5,7 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 
+from jimpact.compiling import full_precision
 from jimpact.contact import Contact
 from jimpact.law import Impulses, Law, OptionalValues, Values, option, parameter
 from jimpact.laws.friction import friction_fields
@@ -68,6 +69,7 @@ class Poisson(Law):
             friction, tangential_restitution
         )
 
+    @full_precision
     def impulses(self, contact: Contact) -> Impulses:
         """Two complementarity problems."""
         mu, e_t = self.friction, self.tangential_restitution

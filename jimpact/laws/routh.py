@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 
+from jimpact.compiling import full_precision
 from jimpact.contact import Contact
 from jimpact.law import Impulses, Law, Values, parameter
 from jimpact.solvers.lcp import solve_lcp
@@ -38,6 +39,7 @@ class Routh(Law):
 
     restitution: Values = parameter(low=0.0, high=1.0)
 
+    @full_precision
     def impulses(self, contact: Contact) -> Impulses:
         """The impulse of compression, 1 + e times."""
         w, gamma, e = contact.delassus, contact.gap_velocity, self.restitution

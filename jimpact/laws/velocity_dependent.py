@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_kind
+from jimpact.compiling import full_precision
 from jimpact.contact import Contact
 from jimpact.events.impact_dynamics import Dynamics
 from jimpact.law import (
@@ -109,6 +110,7 @@ class VelocityDependent(Law):
         square = jnp.where(some, y**2 + (1 - y**2) * power**2, 1.0)
         return jnp.where(some, jnp.sqrt(square), power)
 
+    @full_precision
     def impulses(self, contact: Contact) -> Impulses:
         """Those of the law with e at this speed."""
         return self._law_at(contact).impulses(contact)

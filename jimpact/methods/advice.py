@@ -6,12 +6,12 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_whole, check_per_contact, check_shape, check_values
+from jimpact.compiling import full_precision, precise_jit
 from jimpact.contact import components, kinetic_angles
 from jimpact.fits.parameters import with_entries
 from jimpact.impacts import impact
@@ -370,6 +370,7 @@ def blocks_of(
     return tuple(blocks)
 
 
+@full_precision
 def _largest_cosines(scene: Scene, friction: bool) -> np.ndarray:
     """Largest |cosine| (m, m) between normals of two contacts, with friction tangents, too."""
     if not friction:
@@ -456,7 +457,7 @@ def trials(situation: Situation, law: LZB) -> dict[str, Trial]:
 # -------------------------------------------------------------------------- running the laws
 
 
-@eqx.filter_jit
+@precise_jit
 def _batch(law: Law, scene: Scene, velocity: jax.Array, stiffness: jax.Array | None) -> Outcomes:
     """The law at velocities (r, n), and at rows of stiffness (r, m) if it has one."""
 

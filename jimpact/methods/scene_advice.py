@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_whole, check_kind, check_shape, check_values
+from jimpact.compiling import precise_jit
 from jimpact.contact import delassus_matrix
 from jimpact.files.records import fields_as_data, listed, number, table
 from jimpact.impacts import impact
@@ -272,7 +273,7 @@ class _Simpler(NamedTuple):
         return np.where(failed[:, None], np.nan, out.velocity - reference)
 
 
-@eqx.filter_jit
+@precise_jit
 def _batch(law: Law, scene: Scene, velocity: jax.Array, gaps: jax.Array) -> _Outcomes:
     """The impact with each row of gaps (r, m)."""
 

@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_axis, as_float_array, check_choice, check_per_contact, check_values
+from jimpact.compiling import precise_jit
 from jimpact.files.records import fields_as_data, table
 from jimpact.impacts import impact
 from jimpact.law import Law
@@ -145,7 +145,7 @@ def validity_map(
     )
 
 
-@eqx.filter_jit
+@precise_jit
 def _grid(
     scene: Scene, v: jax.Array, ratios: jax.Array, exponents: jax.Array, e: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:

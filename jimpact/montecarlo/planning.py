@@ -20,6 +20,7 @@ import numpy as np
 
 import jimpact
 from jimpact._checks import as_whole, check_kind, in_common_dtype
+from jimpact.compiling import precise_jit
 from jimpact.impacts import impact
 from jimpact.law import Law, within_domains
 from jimpact.montecarlo.distributions import Distribution, Rows, Source, as_source
@@ -56,7 +57,7 @@ def is_random(source: Any) -> bool:
     return not (source is None or isinstance(source, jax.Array | Law))
 
 
-@eqx.filter_jit
+@precise_jit
 def draw(
     sources: Sources,
     sizes: tuple[int, int],
@@ -84,7 +85,7 @@ def _entries(source: Source, size: int, keys: jax.Array, non_negative: bool) -> 
     return jax.vmap(source)(keys) if callable(source) else source
 
 
-@eqx.filter_jit
+@precise_jit
 def impacts(drawn: Drawn, scene: Scene, lanes: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Velocities (C, n) and statuses (C,) of a chunk, those of bad draws included."""
     law_axis = eqx.if_array(0) if drawn.varies[0] else None

@@ -57,7 +57,7 @@ from jimpact.motion.persistent_contact import (
     rest_acceleration,
     with_normal_forces,
 )
-from jimpact.motion.record import KIND_CODE, MOTION_CODE
+from jimpact.motion.record import KIND_CODE
 from jimpact.motion.replays import (
     MotionEnd,
     MotionPlan,
@@ -76,6 +76,7 @@ from jimpact.motion.transitions import (
     slip_stops,
     velocity_noise,
 )
+from jimpact.status import CODE
 
 # Rows of a plan: a contact takes some tens of steps. Ten times more takes ten times the memory of
 # derivatives.
@@ -142,7 +143,7 @@ def _run(problem: MotionProblem, max_events: int, until_apart: bool, records: bo
     start = _begin(problem, max_events, records)
 
     def going(run: _CompliantRun) -> jax.Array:
-        on = (run.status == MOTION_CODE["ok"]) & (run.flight.sample < problem.times.shape[0])
+        on = (run.status == CODE["ok"]) & (run.flight.sample < problem.times.shape[0])
         return on & ~run.apart if until_apart else on
 
     end = jax.lax.while_loop(going, lambda run: _one_pass(problem, max_events, run), start)
@@ -238,7 +239,7 @@ def _with_friction(problem: MotionProblem, run: _CompliantRun) -> _CompliantRun:
     old = run.flight.aim.modes, jnp.asarray(True)
     asked = jnp.any(event)
     modes, found = selected(asked, jax.lax.cond(any_lane(asked), decided, lambda: old), old)
-    status = jnp.where(found, run.status, MOTION_CODE["no_contact_force"]).astype(jnp.int32)
+    status = jnp.where(found, run.status, CODE["no_contact_force"]).astype(jnp.int32)
     aim = run.flight.aim._replace(modes=modes)
     return run._replace(flight=run.flight._replace(aim=aim), status=status)
 
@@ -268,7 +269,7 @@ def _one_pass(problem: MotionProblem, max_events: int, run: _CompliantRun) -> _C
     happened = jnp.any(closed | opened | turned)
     full = happened & (run.event_count >= max_events)
     written = happened & ~full
-    status = jnp.where(full, MOTION_CODE["max_events"], run.status)
+    status = jnp.where(full, CODE["max_events"], run.status)
     status = jnp.where(flown.stuck, why_stuck(system, flown, problem.q0, times), status)
     kind = jnp.where(jnp.any(opened), KIND_CODE["detachment"], KIND_CODE["friction"])
     kind = jnp.where(jnp.any(closed), KIND_CODE["contact"], kind)

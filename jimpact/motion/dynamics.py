@@ -6,6 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jimpact.compiling import full_precision
 from jimpact.motion.system import System
 
 _ROUNDINGS = 4  # that a share may be off by in single precision; more would hide slow approach
@@ -164,6 +165,7 @@ def definite(mass: jax.Array) -> jax.Array:
     return jnp.all(jnp.isfinite(jnp.linalg.cholesky(jax.lax.stop_gradient(mass))))
 
 
+@full_precision
 def kinetic(system: System, q: jax.Array, v: jax.Array) -> jax.Array:
     """`T = v^T M v / 2` [J]."""
     mass = mass_at(system, q)

@@ -41,7 +41,7 @@ from jimpact.motion.flow import (
     toward_sample,
 )
 from jimpact.motion.persistent_contact import no_modes
-from jimpact.motion.record import KIND_CODE, MOTION_CODE, Events
+from jimpact.motion.record import KIND_CODE, Events
 from jimpact.motion.replays import (
     MotionEnd,
     MotionPlan,
@@ -54,6 +54,7 @@ from jimpact.motion.replays import (
 )
 from jimpact.motion.system import System
 from jimpact.motion.transitions import After, Decision, resolve, resolved_again, sides_of
+from jimpact.status import CODE
 
 # M is singular where its scaled least eigenvalue is below this share of that at the start
 _SINGULAR = 1e-6
@@ -170,7 +171,7 @@ def _run(problem: MotionProblem, max_events: int, records: bool) -> MotionEnd:
     def goes_on(run: _EventRun) -> jax.Array:
         flight = run.flight
         reached = flight.sample >= problem.times.shape[0]
-        return (run.status == MOTION_CODE["ok"]) & ~flight.stuck & ~reached
+        return (run.status == CODE["ok"]) & ~flight.stuck & ~reached
 
     def one(run: _EventRun) -> _EventRun:
         on = goes_on(run)
@@ -180,12 +181,12 @@ def _run(problem: MotionProblem, max_events: int, records: bool) -> MotionEnd:
         return _flown(problem, run, goes_on(run) & ~run.waits)
 
     end = jax.lax.while_loop(lambda run: any_lane(goes_on(run)), one, start)
-    stuck = end.flight.stuck & (end.status == MOTION_CODE["ok"])
+    stuck = end.flight.stuck & (end.status == CODE["ok"])
     status = jnp.where(
         stuck, why_stuck(problem.system, end.flight, problem.q0, problem.times), end.status
     ).astype(jnp.int32)
-    reported = end.several & (status == MOTION_CODE["ok"])
-    status = jnp.where(reported, MOTION_CODE["several_outcomes"], status).astype(jnp.int32)
+    reported = end.several & (status == CODE["ok"])
+    status = jnp.where(reported, CODE["several_outcomes"], status).astype(jnp.int32)
     flight, past = end.flight, None
     if problem.past is not None:
         past = _pack_checkpoint(end, problem.past.numbers.shape[0])
@@ -225,7 +226,7 @@ def _unpack_checkpoint(start: _EventRun, past: jax.Array) -> _EventRun:
         several=waits[2],
         last=last,
         table=start.table._replace(samples=samples),
-        status=jnp.where(on, MOTION_CODE["ok"], start.status).astype(jnp.int32),
+        status=jnp.where(on, CODE["ok"], start.status).astype(jnp.int32),
     )
 
 
@@ -247,7 +248,7 @@ def _begin(problem: MotionProblem, max_events: int, records: bool) -> _EventRun:
     status = status_at_start(system, state, times[-1], settings.closed_below)
     if mu is not None:
         known = jnp.all(jnp.isfinite(mu))
-        status = jnp.where(known, status, MOTION_CODE["not_finite"]).astype(jnp.int32)
+        status = jnp.where(known, status, CODE["not_finite"]).astype(jnp.int32)
     return _EventRun(
         flight,
         none,
@@ -280,7 +281,7 @@ def _resolved(
         happened = outcome.kind != KIND_CODE["none"]
         most = max_events if problem.past is None else jnp.minimum(problem.past.most, max_events)
         full = (run.event_count >= most) & happened
-        status = jnp.where(full, MOTION_CODE["max_events"], outcome.status).astype(jnp.int32)
+        status = jnp.where(full, CODE["max_events"], outcome.status).astype(jnp.int32)
         written = mine & happened & ~full
         state = outcome.after.state
         ready = flight._replace(
@@ -357,8 +358,8 @@ def why_stuck(system: System, flight: Flight, q0: jax.Array, times: jax.Array) -
     rates = free_acceleration(system, q, state.v, force, mass_at(system, q))
     parts = (state.q, state.v, rates, gaps(system, q, t))
     finite = jnp.all(jnp.isfinite(jnp.concatenate(parts)))
-    code = jnp.where(finite, MOTION_CODE["max_steps"], MOTION_CODE["not_finite"])
-    code = jnp.where(out_of_range(system, state), MOTION_CODE["out_of_range"], code)
+    code = jnp.where(finite, CODE["max_steps"], CODE["not_finite"])
+    code = jnp.where(out_of_range(system, state), CODE["out_of_range"], code)
     if not callable(system.mass):
         return code
     begin, now = (jax.lax.stop_gradient(mass_at(system, q)) for q in (q0, state.q))
@@ -367,7 +368,7 @@ def why_stuck(system: System, flight: Flight, q0: jax.Array, times: jax.Array) -
     else:
         scale = 1 / jnp.sqrt(jnp.diagonal(begin))
         least = jnp.linalg.eigvalsh(now * scale[:, None] * scale[None, :])[0]
-    return jnp.where(~(least > _SINGULAR), MOTION_CODE["singular_mass"], code)
+    return jnp.where(~(least > _SINGULAR), CODE["singular_mass"], code)
 
 
 # ------------------------------------------------------------------------------ the record

@@ -12,9 +12,10 @@ from jimpact._checks import as_float_array
 from jimpact.fits.fitting import Fit, fit
 from jimpact.fits.problem import FitProblem, Prediction
 from jimpact.law import Law
-from jimpact.motion.record import MOTION_STATUS, Motion
+from jimpact.motion.record import Motion
 from jimpact.motion.simulate import simulate
 from jimpact.motion.system import System
+from jimpact.status import STATUS
 
 Observe = Callable[[Motion], jax.Array]
 
@@ -22,7 +23,7 @@ MAX_PASSES = 50  # steps of one start before it gives up
 # Motions that are simulated side by side. With ten times as many, all wait for the one with the
 # most events, and on two cores the linear algebra of jaxlib 0.10.2 hung.
 LANES = 32
-_FAILS = tuple(row.failure for row in MOTION_STATUS)
+_FAILS = tuple(row.failure for row in STATUS)
 
 
 class MotionObservable(eqx.Module):

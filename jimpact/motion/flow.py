@@ -39,7 +39,7 @@ from jimpact.motion.persistent_contact import (
     rest_acceleration,
     slip_margins,
 )
-from jimpact.motion.record import MOTION_CODE, Events
+from jimpact.motion.record import Events
 from jimpact.motion.slip_in_space import (
     SlipAxes,
     log_rates,
@@ -48,6 +48,7 @@ from jimpact.motion.slip_in_space import (
     turning_errors,
 )
 from jimpact.motion.system import System
+from jimpact.status import CODE
 
 SMALLEST_STEP = 1e-15  # of the time: below it a step does not move time any more
 # Error allowed in the ledger, as a share of the work of the errors allowed in q and v: ten times
@@ -524,11 +525,11 @@ def status_at_start(system: System, at: State, end: jax.Array, closed_below: Any
     """MotionStatus () of a motion that begins here and shall last until `end`."""
     allowed = jnp.maximum(closed_below, system.body.overlap)
     penetrates = jnp.any(recorded_gaps(system, at.q, at.t) < -allowed)
-    status = jnp.where(penetrates, MOTION_CODE["penetration"], MOTION_CODE["ok"])
-    status = jnp.where(out_of_range(system, at), MOTION_CODE["out_of_range"], status)
-    status = jnp.where(end <= at.t, MOTION_CODE["backward"], status)
+    status = jnp.where(penetrates, CODE["penetration"], CODE["ok"])
+    status = jnp.where(out_of_range(system, at), CODE["out_of_range"], status)
+    status = jnp.where(end <= at.t, CODE["backward"], status)
     finite = jnp.all(jnp.isfinite(at.q)) & jnp.all(jnp.isfinite(at.v)) & jnp.isfinite(end)
-    return jnp.where(finite, status, MOTION_CODE["not_finite"]).astype(jnp.int32)
+    return jnp.where(finite, status, CODE["not_finite"]).astype(jnp.int32)
 
 
 def step_again(flow: MotionFlow, aim: stepper.Step, state: State) -> State:

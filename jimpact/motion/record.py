@@ -15,46 +15,6 @@ import numpy as np
 from jimpact.files.records import as_data, fields_as_data
 from jimpact.status import STATUS, Status, raise_for
 
-# of these rows `failure` marks motions that end before t_end; the code is the row number
-MOTION_STATUS = (
-    Status("ok", "the motion reaches t_end", False),
-    Status("law_failed", "the law fails at an impact (see `event_status`)", True),
-    Status(
-        "no_contact_force",
-        "contact forces with friction have no solution, and the law has no impact without "
-        "collision for it: LZB with `friction` has one",
-        True,
-    ),
-    Status("max_events", "more events than `max_events`", True),
-    Status("max_steps", "the flight needs more than `max_steps` or vanishing steps", True),
-    Status("penetration", "a gap is negative at the start", True),
-    Status("singular_mass", "the mass matrix is not positive definite on the way", True),
-    Status("out_of_range", "a gap function does not hold any more (`valid` of the body)", True),
-    Status("not_finite", "the motion or its input is NaN or infinite", True),
-    Status(
-        "coarse_step",
-        "steps are too long: within 3 a contact is struck again, at more than a tenth of the "
-        "largest gap velocity, or in one bodies pass each other, or a disc of a pile moves by more "
-        "than the least radius",
-        False,
-    ),
-    Status("unsolved_step", "impulses of a step are off by > 1 % of its velocities", False),
-    Status("room", "more contacts are closed than the body has `room` for", True),
-    Status(
-        "several_outcomes",
-        "contact forces with friction have several solutions: contacts stick or part (`events`)",
-        False,
-    ),
-    Status("backward", "t_end is not after t_start", True),
-    Status(
-        "no_derivatives",
-        "the motion is right, but its derivatives are NaN: it takes more steps than they keep "
-        "(samples + 16 `max_events` + 1024)",
-        False,
-    ),
-)
-MOTION_CODE = {row.name: code for code, row in enumerate(MOTION_STATUS)}
-
 EVENT_KINDS = ("none", "impact", "accumulation", "contact", "detachment", "friction", "paroxysm")
 _ROUNDING = 1e-12  # of the largest work: what is smaller is not printed
 FORMAT = 1  # version of the files of motions
@@ -63,7 +23,7 @@ KIND_CODE = {name: code for code, name in enumerate(EVENT_KINDS)}
 
 # Codes are saved as their names, so that files outlive the order of these rows.
 _NAMES = {
-    "status": tuple(row.name for row in MOTION_STATUS),
+    "status": tuple(row.name for row in STATUS),
     "events.kind": EVENT_KINDS,
     "events.status": tuple(row.name for row in STATUS),
 }
@@ -251,7 +211,7 @@ class Motion(eqx.Module):
         n = int(self.events.count)
         rows = {k: np.asarray(v)[:n] for k, v in vars(self.events).items() if k != "count"}
         events = rows | {"kind": [EVENT_KINDS[k] for k in rows["kind"]]}
-        status = MOTION_STATUS[int(self.status)].name
+        status = STATUS[int(self.status)].name
         return fields_as_data(self, "events") | as_data({"status": status, "events": events})
 
     def __str__(self) -> str:
@@ -261,7 +221,7 @@ class Motion(eqx.Module):
         kinds = np.asarray(self.events.kind)
         numbers = np.bincount(kinds, minlength=len(EVENT_KINDS))
         counts = [f"{n} {name}" for n, name in zip(numbers, EVENT_KINDS) if n and name != "none"]
-        row = MOTION_STATUS[int(self.status)]
+        row = STATUS[int(self.status)]
         reached = np.asarray(self.time)[np.isfinite(np.asarray(self.energy))]
         last = int(np.isfinite(np.asarray(self.energy)).sum()) - 1
         normal, tangential = np.asarray(self.contact_work)[max(last, 0)].sum(axis=-1)
@@ -353,7 +313,7 @@ def _work_report(works: dict[str, Any]) -> str:
 def _batch_report(motion: Motion) -> str:
     """How many motions of a batch have which status."""
     codes, counts = np.unique(np.asarray(motion.status), return_counts=True)
-    parts = ", ".join(f"{n} {MOTION_STATUS[c].name}" for c, n in zip(codes, counts, strict=True))
+    parts = ", ".join(f"{n} {STATUS[c].name}" for c, n in zip(codes, counts, strict=True))
     return f"{np.size(motion.status)} motions: {parts}"
 
 
@@ -384,5 +344,5 @@ def raise_on_failed_motion(motion: Motion) -> Motion:
     >>> ji.raise_on_failed_motion(motion) is motion
     True
     """
-    raise_for(motion.status, MOTION_STATUS, "motions", partial(_law_failures, motion))
+    raise_for(motion.status, STATUS, "motions", partial(_law_failures, motion))
     return motion

@@ -14,9 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
+from jimpact.compiling import full_precision
 from jimpact.events.batches import any_lane
 from jimpact.motion.flow import State, nan_derivatives, packed, put, selected
-from jimpact.motion.record import MOTION_CODE
+from jimpact.status import CODE
 
 # Rows of a plan, in addition to one a sample: accepted steps of a motion with derivatives. Those
 # of a motion of more steps are NaN. Ten times more takes ten times the memory of derivatives.
@@ -94,6 +95,7 @@ def differentiable(
     def value(*arrays: jax.Array) -> MotionEnd:
         return run(rebuilt(arrays), False)
 
+    @full_precision
     def rule(arrays: Any, tangents: Any) -> Any:
         """Values by the run, tangents by walking through its plan again."""
         marked = [not isinstance(t, SymbolicZero) for t in tangents]
@@ -111,8 +113,8 @@ def differentiable(
         results, slopes = jax.jvp(smooth, values, rates)
         recorded = end.table.samples, end.table.events
         samples, events = selected(plan.lost, recorded, results)
-        lost = plan.lost & (end.status == MOTION_CODE["ok"])
-        status = jnp.where(lost, MOTION_CODE["no_derivatives"], end.status).astype(jnp.int32)
+        lost = plan.lost & (end.status == CODE["ok"])
+        status = jnp.where(lost, CODE["no_derivatives"], end.status).astype(jnp.int32)
         table = MotionTable(samples, events, end.table.marks)
         end = end._replace(table=table, status=status, plan=None)
         none = jax.tree.map(lambda x: np.zeros(x.shape, jax.dtypes.float0), end)

@@ -18,7 +18,7 @@ from jimpact._checks import (
     is_traced,
 )
 from jimpact.bodies.base import check_penetration
-from jimpact.compiling import is_top_level_call, quick_jit
+from jimpact.compiling import full_precision, is_top_level_call, quick_jit
 from jimpact.law import Law
 from jimpact.laws.forces import Force
 from jimpact.motion.arguments import (
@@ -36,10 +36,11 @@ from jimpact.motion.compliant_contact import compliant_motion
 from jimpact.motion.dynamics import is_pile, kinetic, potential, recorded_gaps
 from jimpact.motion.event_driven import MotionProblem, Past, empty_checkpoint, event_driven
 from jimpact.motion.flow import Course, Settings, check_rtol
-from jimpact.motion.record import MOTION_CODE, Events, Motion, joined
+from jimpact.motion.record import Events, Motion, joined
 from jimpact.motion.stepping import time_stepping
 from jimpact.motion.system import System
 from jimpact.progress import progress_bar, waiting
+from jimpact.status import CODE
 
 # [m] Contacts with smaller gaps take part in an impact. Ten times more, and balls a few nanometres
 # apart are struck together.
@@ -58,6 +59,7 @@ MOST_EVENTS = 100_000  # default `max_events` on the host; more only delays the 
 METHODS = ("events", "time_stepping", "contact_forces")
 
 
+@full_precision
 def simulate(
     system: System,
     law: Law,
@@ -229,7 +231,7 @@ def _in_runs(arguments: tuple[Any, ...], samples: int, most: int, progress: floa
             left = jnp.asarray(np.int32(most - CHUNK * len(parts)))
             motion, numbers = _events(*(*arguments, Past(left, numbers), samples, CHUNK))
             parts.append(motion.events)
-            if int(motion.status) != MOTION_CODE["max_events"] or CHUNK * len(parts) >= most:
+            if int(motion.status) != CODE["max_events"] or CHUNK * len(parts) >= most:
                 return dataclasses.replace(motion, events=joined(parts, most))
             show("motion", float(motion.events.time[-1] - start), float(end - start))
 

@@ -43,7 +43,7 @@ from jimpact.motion.dynamics import (
     user_force,
 )
 from jimpact.motion.flow import Course, State, out_of_range, status_at_start
-from jimpact.motion.record import KIND_CODE, MOTION_CODE, Events, no_events, with_row
+from jimpact.motion.record import KIND_CODE, Events, no_events, with_row
 from jimpact.motion.system import System
 from jimpact.motion.transitions import FAILS, scene_at
 from jimpact.scene import Scene
@@ -307,16 +307,16 @@ def time_stepping(
             def go() -> _Progress:
                 return _one_step(problem, progress, t + i.astype(dtype) * h)
 
-            return jax.lax.cond(progress.status == MOTION_CODE["ok"], go, lambda: progress)
+            return jax.lax.cond(progress.status == CODE["ok"], go, lambda: progress)
 
         progress = jax.lax.fori_loop(0, substeps, one, progress)
-        fine = progress.status == MOTION_CODE["ok"]
+        fine = progress.status == CODE["ok"]
         return progress, jax.tree.map(lambda x: jnp.where(fine, x, jnp.nan), progress.state)
 
     end, later = jax.lax.scan(to_sample, start, times[:-1])
     samples = jax.tree.map(lambda x, rest: jnp.concatenate([x[None], rest]), start.state, later)
     steps = substeps * (times.shape[0] - 1)
-    status = jnp.where(end.status == MOTION_CODE["ok"], end.reported, end.status)
+    status = jnp.where(end.status == CODE["ok"], end.reported, end.status)
     return Course(samples, end.events, steps, status)
 
 
@@ -368,8 +368,8 @@ def _begin(
     rows = 1 if is_pile(system) else max_events
     events = no_events(rows, q0, v0, m, sides=m * max(b - 1, 1))
     status = status_at_start(system, begin, times[-1], closed_below)
-    fails = (status == MOTION_CODE["ok"]) & ~within_domains(law)
-    status = jnp.where(fails, MOTION_CODE["law_failed"], status).astype(jnp.int32)
+    fails = (status == CODE["ok"]) & ~within_domains(law)
+    status = jnp.where(fails, CODE["law_failed"], status).astype(jnp.int32)
     return _Progress(
         state=begin,
         speed=zero,
@@ -380,7 +380,7 @@ def _begin(
         closing=_closing_at_start(problem, begin, contacts),
         events=events,
         status=status,
-        reported=jnp.int32(MOTION_CODE["ok"]),
+        reported=jnp.int32(CODE["ok"]),
     )
 
 
@@ -581,17 +581,17 @@ def _status(
     """The status after the step, and what is reported without being a failure."""
     system, contacts = problem.system, setup.contacts
     fails = jnp.asarray(FAILS)[setup.law_status]
-    status = jnp.where(fails, MOTION_CODE["law_failed"], progress.status)
-    status = jnp.where(out_of_range(system, state), MOTION_CODE["out_of_range"], status)
+    status = jnp.where(fails, CODE["law_failed"], progress.status)
+    status = jnp.where(out_of_range(system, state), CODE["out_of_range"], status)
     if isinstance(contacts, _ActiveContacts):
-        status = jnp.where(contacts.pairs.overflows, MOTION_CODE["room"], status)
+        status = jnp.where(contacts.pairs.overflows, CODE["room"], status)
     # a base that is NaN shows in its work, a coefficient in that of the contacts
     finite = jnp.all(jnp.isfinite(trial.v)) & jnp.isfinite(state.base_work)
     finite &= jnp.all(jnp.isfinite(state.contact_work))
-    status = jnp.where(finite, status, MOTION_CODE["not_finite"])
+    status = jnp.where(finite, status, CODE["not_finite"])
     if callable(system.mass):
         positive_definite = definite(setup.mass) | ~jnp.all(jnp.isfinite(setup.mass))
-        status = jnp.where(positive_definite, status, MOTION_CODE["singular_mass"])
+        status = jnp.where(positive_definite, status, CODE["singular_mass"])
     if isinstance(contacts, _ActiveContacts):
         velocities = trial.v.reshape(-1, contacts.inverse.shape[1])
         places = (velocities.shape[1] + 1) // 2  # 2 of 3 in a plane, 3 of 6 in space
@@ -606,8 +606,8 @@ def _status(
         speeds = jnp.abs(contacts.normals).T @ jnp.abs(relative)
         turned = rate - progress.closing > TURN * speeds + setup.slow
         coarse = jnp.any(struck_again | ((progress.closing < 0) & (rate > 0) & turned))
-    coarse = jnp.where(coarse, MOTION_CODE["coarse_step"], 0)
-    unsolved = jnp.where(trial.solution.misfit > OFF, MOTION_CODE["unsolved_step"], 0)
+    coarse = jnp.where(coarse, CODE["coarse_step"], 0)
+    unsolved = jnp.where(trial.solution.misfit > OFF, CODE["unsolved_step"], 0)
     reported = jnp.maximum(progress.reported, jnp.maximum(coarse, unsolved))
     return status.astype(jnp.int32), reported.astype(jnp.int32)
 

@@ -31,7 +31,7 @@ from jimpact.motion.persistent_contact import (
     pressed_together,
     rest_acceleration,
 )
-from jimpact.motion.record import KIND_CODE, MOTION_CODE
+from jimpact.motion.record import KIND_CODE
 from jimpact.motion.system import System
 from jimpact.scene import Scene
 from jimpact.status import CODE, STATUS
@@ -357,7 +357,7 @@ def _status(
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Status of the motion, that of the law, and the approach of an impact without collision."""
     fails = jnp.asarray(FAILS)[jump.code]
-    status = jnp.where(fails, MOTION_CODE["law_failed"], MOTION_CODE["ok"])
+    status = jnp.where(fails, CODE["law_failed"], CODE["ok"])
     code, wedges = jump.code, jnp.zeros_like(strike.rest)
     now, earlier = strike.contacts.tangent, strike.before.tangent
     if now is not None and earlier is not None:
@@ -366,7 +366,7 @@ def _status(
             wedges = jnp.where(choice.consistent, 0.0, _approach(choice, now.rate, held))
         jammed = strike.jams & (change <= SUPPLIED * strike.approach)
         none = jammed | (~choice.consistent & (wedges == 0))
-        status = jnp.where(none, MOTION_CODE["no_contact_force"], status)
+        status = jnp.where(none, CODE["no_contact_force"], status)
         code = jnp.where(choice.several, jnp.maximum(code, CODE["several_outcomes"]), code)
     return status, code, wedges
 

@@ -24,6 +24,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jimpact.compiling import full_precision
 from jimpact.loops import fori_loop
 
 # Rows up to which one system is solved by the loop, not by LAPACK: in a batch that is three to six
@@ -255,6 +256,7 @@ def regularized_once(matrix: jax.Array, ridge: jax.Array, right: jax.Array) -> j
 
 
 @regularized_once.defjvp
+@full_precision
 def _regularized_tangent(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
     """The tangent `dz` of `matrix z = right` solves `matrix dz = dright - dmatrix z`."""
     (matrix, ridge, right), (dmatrix, _, dright) = primals, tangents

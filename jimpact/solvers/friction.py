@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jimpact.compiling import full_precision
 from jimpact.loops import fori_loop, while_loop
 from jimpact.solvers.dense import SINGULAR, block_inverse, block_solve, load_shares, times
 from jimpact.solvers.interior_points import cones_of, within_cones
@@ -84,6 +85,7 @@ class _Modes(NamedTuple):
     turning: jax.Array
 
 
+@full_precision
 def solve(
     matrix: jax.Array,
     normal: jax.Array,

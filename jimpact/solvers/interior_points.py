@@ -23,6 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jimpact.compiling import full_precision
 from jimpact.loops import while_loop
 from jimpact.solvers.dense import block_solve
 
@@ -88,6 +89,7 @@ def cones_of(
     return Cones(coupling, rate * scale, scale, pressed, complementary)
 
 
+@full_precision
 def within_cones(
     cones: Cones,
     misfit: Callable[[jax.Array], jax.Array],

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jimpact.compiling import full_precision
 from jimpact.loops import while_loop
 from jimpact.solvers.dense import null_projector
 from jimpact.solvers.many_contacts import solve_many
@@ -46,6 +47,7 @@ class _Tableau(NamedTuple):
     pivots: jax.Array
 
 
+@full_precision
 def solve_lcp(
     matrix: Symmetric, q: jax.Array, *, symmetric: bool = True, regular: bool | None = None
 ) -> LCP:

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 
+from jimpact.compiling import full_precision
 from jimpact.loops import varying_like
 
 
@@ -30,6 +31,7 @@ def both_modes(
         """The values."""
         return solve(inputs, False)
 
+    @full_precision
     def rule(primals: Any, tangents: Any) -> Any:
         """Values and tangents by the Jacobian."""
         leaves, tree = jax.tree.flatten(primals[0])

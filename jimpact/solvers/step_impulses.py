@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jimpact.compiling import full_precision
 from jimpact.solvers.dense import regularized
 from jimpact.solvers.friction import in_disc
 
@@ -180,6 +181,7 @@ def solve(
 
 
 @solve.defjvp
+@full_precision
 def _solve_tangent(primals: Any, tangents: Any) -> tuple[Any, Any]:
     """The impulses change as the residual, which stays 0, asks for; what is left has no tangent."""
     problem, (change, _, _) = primals[0], tangents

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_per_contact, check_shape, check_values
+from jimpact.compiling import full_precision
 from jimpact.contact import kinetic_norm, normalized_delassus, normalized_gap_velocity
 from jimpact.scene import Scene, velocity_change
 from jimpact.solvers.lcp import solve_lcp
@@ -27,6 +28,7 @@ class InclusionOutcome(NamedTuple):
     status: jax.Array
 
 
+@full_precision
 def contact_coupling(scene: Scene) -> jax.Array:
     """`Gbar = [[G, n_q^T H], [0, t_q^T H]]` (n, m + t): what (pbar, p_t) do to (qn, qt).
 
@@ -55,6 +57,7 @@ def contact_coupling(scene: Scene) -> jax.Array:
     return jnp.concatenate([left, right], axis=1)
 
 
+@full_precision
 def restitution_inclusion(
     coupling: Any, metric: Any, restitution: Any, velocity: Any, low: Any = 0.0, high: Any = jnp.inf
 ) -> InclusionOutcome:
@@ -187,6 +190,7 @@ class _Coupling(NamedTuple):
         return self.delassus - self.normal * self.friction[None, :]
 
 
+@full_precision
 def friction_bounds(scene: Scene, matrix: Any, friction: Any, slip: Any = 1.0) -> FrictionBounds:
     """Sufficient conditions for `qn+ = -E qn-` with `p_t = -[mubar][xi] pbar` to dissipate.
 
@@ -251,6 +255,7 @@ def friction_bounds(scene: Scene, matrix: Any, friction: Any, slip: Any = 1.0) -
     )
 
 
+@full_precision
 def friction_impulses(
     scene: Scene, matrix: Any, friction: Any, slip: Any, velocity: Any
 ) -> tuple[jax.Array, jax.Array]:
@@ -287,6 +292,7 @@ def friction_impulses(
     return pbar / kinetic_norm(scene), -coupling.friction * pbar
 
 
+@full_precision
 def friction_energy_change(
     scene: Scene, velocity: Any, impulse: Any, tangential_impulse: Any
 ) -> jax.Array:

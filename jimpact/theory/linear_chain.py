@@ -8,6 +8,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from jimpact._checks import as_float_array, as_whole, check_per_contact, check_shape, check_values
+from jimpact.compiling import full_precision
 from jimpact.scene import Scene, as_velocity, gap_velocity, velocity_change
 
 # Largest stiffness ratio, and one over the least, whose first opening is searched. Ten times more:
@@ -17,6 +18,7 @@ _STIFFEST = 1e8
 _GRID = 0.05
 
 
+@full_precision
 def bilateral_motion(
     scene: Scene, stiffness: Any, velocity: Any, time: Any
 ) -> tuple[jax.Array, jax.Array]:

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from jimpact._checks import as_float_array, check_shape
+from jimpact.compiling import full_precision
 from jimpact.contact import kinetic_norm, normalized_delassus, normalized_gap_velocity
 from jimpact.quasi_space import quasi_basis as quasi_basis
 from jimpact.scene import Scene, as_velocity, gap_velocity, momentum, velocity_change
@@ -22,6 +23,7 @@ class ContactPower(eqx.Module):
     total: jax.Array
 
 
+@full_precision
 def to_quasi_velocities(scene: Scene, velocity: Any) -> tuple[jax.Array, jax.Array]:
     """Quasi-velocities of a velocity: `qn = n_q^T M v` (m,) and `qt = t_q^T M v` (n - m - b,).
 
@@ -48,6 +50,7 @@ def to_quasi_velocities(scene: Scene, velocity: Any) -> tuple[jax.Array, jax.Arr
     return normalized_gap_velocity(scene, v), tangent.T @ momentum(scene, v)
 
 
+@full_precision
 def from_quasi_velocities(scene: Scene, normal: Any, tangential: Any) -> jax.Array:
     """The velocity (n,) with these quasi-velocities; inverse of `to_quasi_velocities`.
 
@@ -79,6 +82,7 @@ def from_quasi_velocities(scene: Scene, normal: Any, tangential: Any) -> jax.Arr
     return velocity_change(scene, impulse) + tangent @ qt
 
 
+@full_precision
 def kinetic_energy_split(scene: Scene, velocity: Any) -> tuple[jax.Array, jax.Array]:
     """Normal and tangential kinetic energy [J]; their sum is the kinetic energy.
 
@@ -106,6 +110,7 @@ def kinetic_energy_split(scene: Scene, velocity: Any) -> tuple[jax.Array, jax.Ar
     return 0.5 * qn @ weighted, 0.5 * qt @ qt
 
 
+@full_precision
 def contact_power(
     scene: Scene, velocity: Any, force: Any, tangential_force: Any = None
 ) -> ContactPower:

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values
+from jimpact.compiling import full_precision
 from jimpact.contact import kinetic_norm, normalized_delassus, normalized_gap_velocity
 from jimpact.scene import Scene, kinetic_energy, velocity_change
 from jimpact.solvers.tridiagonal import as_matrix
@@ -35,6 +36,7 @@ class Copositivity(NamedTuple):
         return self.answer != "no"
 
 
+@full_precision
 def margin(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Least `x^T Q x` over `x >= 0`, `|x| = 1`, and a minimizer x; pure, jit and vmap.
 
@@ -180,6 +182,7 @@ class MatrixAudit(NamedTuple):
         return _in_words(self)
 
 
+@full_precision
 def dissipation_matrix(delassus: jax.Array, matrix: jax.Array) -> jax.Array:
     """`Q = G^-1 - E^T G^-1 E` (m, m): the law qn+ = -E qn- loses the energy qn-^T Q qn- / 2.
 
@@ -200,6 +203,7 @@ def dissipation_matrix(delassus: jax.Array, matrix: jax.Array) -> jax.Array:
     return jnp.linalg.inv(delassus) - matrix.T @ jnp.linalg.solve(delassus, matrix)
 
 
+@full_precision
 def audit_matrix(scene: Scene, matrix: Any, tolerance: float | None = None) -> MatrixAudit:
     """Check the law `qn+ = -E qn-` for all pre-impact velocities `qn- <= 0` at once.
 

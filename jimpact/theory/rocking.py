@@ -10,6 +10,7 @@ import numpy as np
 
 from jimpact._checks import as_axis, as_float_array, check_shape, check_values
 from jimpact.bodies.blocks import rocking_block
+from jimpact.compiling import precise_jit
 from jimpact.impacts import impact
 from jimpact.laws.lzb import LZB
 from jimpact.status import STATUS
@@ -242,7 +243,7 @@ def critical_kinetic_angle(friction: Any) -> jax.Array:
     return rocking_kinetic_angle((jnp.sqrt(9 * slips**2 + 8) - 3 * slips) / 2)
 
 
-@eqx.filter_jit
+@precise_jit
 def _impacts(a: jax.Array, mu: jax.Array, e: jax.Array, law: LZB) -> tuple[jax.Array, ...]:
     """gamma+ (n, 2), theta'+, slip+, T+ / T-, status, of all (a, mu, e), at unit width and hit."""
 

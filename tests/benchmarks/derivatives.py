@@ -27,8 +27,8 @@ import numpy as np
 from three_balls import SCENE, V, law_of, one_impact, problem, steps
 
 import jimpact as ji
+from jimpact import velocity_change
 from jimpact.methods.contenders.schemes import DOP853_ALIGNED
-from jimpact.scene import velocity_change
 
 BATCH, REPEATS = 4096, 7
 POINTS = 16  # single impacts, one after the other

@@ -27,9 +27,9 @@ import numpy as np
 from kernels import compiled, diffrax_event, siconos
 
 import jimpact as ji
+from jimpact import velocity_change
 from jimpact.events.tableaux import DOP853
 from jimpact.methods.contenders.schemes import DOP853_ALIGNED
-from jimpact.scene import velocity_change
 
 BATCH, CHUNK, REPEATS = 4096, 256, 11
 TRUTH, FINE, COARSE = 1e-13, 3e-8, 1e-6

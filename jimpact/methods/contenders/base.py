@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, in_common_dtype
+from jimpact.compiling import precise_jit
 from jimpact.contact import Contact
 from jimpact.events import impact_dynamics
 from jimpact.events.contact_flow import power
@@ -230,4 +231,4 @@ def stopped_within(sides: Sides, force: jax.Array, step: jax.Array) -> jax.Array
     return sides.friction * force * step * stiffest
 
 
-setup = eqx.filter_jit(problem)
+setup = precise_jit(problem)

@@ -1,0 +1,98 @@
+"""Results as if they had been computed, for tests of reports and pictures."""
+
+import jax.numpy as jnp
+import numpy as np
+
+import jimpact as ji
+from jimpact import Fit
+from jimpact.fits.result import FitMinimum
+from jimpact.laws.histories import History
+from jimpact.motion.record import KIND_CODE, no_events, with_row
+
+
+def canned(shots, **change):
+    """A fit of two parameters to a pair of balls, as if found."""
+    rng = np.random.default_rng(0)
+    pre = np.stack([rng.uniform(1, 2, shots), np.zeros(shots)], axis=1)
+    predicted = np.stack([0.2 * pre[:, 0], 0.8 * pre[:, 0]], axis=1)
+    post = predicted + 0.01 * rng.normal(size=predicted.shape)
+    if shots > 1:
+        post[0, 0] = np.nan
+    given = {
+        "law": ji.LZB([0.6], [2.0]),
+        "method": "levenberg-marquardt",
+        "names": ("restitution[1]", "stiffness[1]"),
+        "value": np.array([0.6, 2.0]),
+        "standard_error": np.array([0.01, np.inf]),
+        "covariance": np.array([[1e-4, np.nan], [np.nan, np.inf]]),
+        "correlation": np.eye(2),
+        "bounds": (np.zeros(2), np.array([1.0, np.inf])),
+        "at_bound": np.array([False, False]),
+        "predicted": predicted,
+        "residual": post - predicted,
+        "rms": 0.01,
+        "noise": 0.0101,
+        "degrees_of_freedom": 2 * shots - 2,
+        "rank": 1,
+        "singular_values": np.array([3.0, 0.0]),
+        "identifiability": (
+            "The data cannot see stiffness[1]: no measured velocity depends on it.",
+        ),
+        "starts": (start(0.6, 3), start(0.4, 5)),
+        "status": np.zeros(shots, int),
+        "converged": True,
+        "steps": 17,
+        "lost_starts": 0,
+        "warnings": ("The data gain energy.",),
+        "problem": ji.FitProblem.from_shots(
+            ji.LZB([0.6], [2.0], exponent=jnp.asarray(1.5)),
+            ji.chain([1.0, 1.0]),
+            ji.Experiments(pre, post),
+            ("restitution", "exponent"),
+        ),
+        "jacobian": np.stack([[-0.5, 0.5] * pre[:, :1], np.zeros_like(pre)], axis=2),
+    }
+    return Fit(**(given | change))
+
+
+def start(value, count):
+    fields = {name: None for name in FitMinimum.__annotations__}
+    known = {"value": np.array([value, 2.0]), "sum_of_squares": 1e-4, "count": count}
+    return FitMinimum(**(fields | {k: v for k, v in known.items() if k in fields}))
+
+
+def rocked(base=None):
+    """A dimer and its motion as if simulated: contact 1 strikes at 0.25 s, between two samples."""
+    body = ji.Dimer(radius=0.1, length=1.0)
+    system = ji.System(body, potential=ji.gravity(body), base=base)
+    time, zero = np.linspace(0.0, 0.5, 6), np.zeros(6)
+    q = np.stack([zero, 0.2 + 0.01 * time, 0.3 - time], axis=1)
+    before, after = np.array([0.0, -1.0, -2.0]), np.array([0.0, 1.0, 3.0])
+    velocity = np.where((time < 0.25)[:, None], before, after)
+    row = {
+        "time": 0.25,
+        "kind": KIND_CODE["impact"],
+        "contacts": np.array([True, False]),
+        "q": np.array([0.0, 0.2, 0.05]),
+        "velocity_before": before,
+        "velocity_after": after,
+    }
+    events = with_row(no_events(4, jnp.asarray(q[0]), jnp.asarray(before), 2), jnp.array(True), row)
+    work = np.zeros((6, 2, 2))
+    work[3:, 0, 0] = -0.5
+    record = ji.Motion(
+        *(time, q, velocity, 1 + zero, 2 - 0.5 * (time > 0.25)),
+        *(zero, zero, work, np.full((6, 2), 0.1), events, jnp.int32(9), jnp.int32(0)),
+    )
+    return system, record
+
+
+def impact_history():
+    t = np.linspace(0, 1, 9)[:, None]
+    rows = np.sin(np.pi * t) * np.array([1.0, 0.5])
+    none = np.zeros((9, 0))
+    return History(
+        *(37e-6 * t[:, 0], 900 * rows, rows, 0.5 * rows**2, rows, rows - 0.5, 0.6 * rows + 0.4 * t),
+        np.zeros((9, 3)),
+        *(none, none, none, np.float64(37e-6), rows.max(axis=0), np.int32(0)),
+    )

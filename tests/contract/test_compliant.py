@@ -1,0 +1,519 @@
+"""Compliant contacts: gapped chains against scipy, forces of a pair, histories, gap scales."""
+
+import functools
+import tomllib
+from importlib.resources import files
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import programs
+import pytest
+from compliant_reference import elastic_plastic, viscous
+from programs import chain, names
+from reference import chain_matrices, lzb_oracle
+from scipy.optimize import brentq
+
+import jimpact as ji
+
+STRIKE = jnp.array([1.0, 0.0, 0.0])
+
+
+def gapped_states(number, seed, e_least=0.3, wall=False):
+    rng = np.random.default_rng(seed)
+    states = []
+    n = 3
+    m = n - 1 + wall
+    for _ in range(number):
+        closed = rng.uniform(size=m) < 0.3
+        states.append(
+            chain(
+                10 ** rng.uniform(-0.7, 0.7, n),
+                np.sort(rng.normal(size=n))[::-1].copy(),
+                wall,
+                k=10 ** rng.uniform(-1, 1, m),
+                e=rng.uniform(e_least, 1.0, m),
+                eta=rng.choice([1.0, 1.5, 1.3], m),
+                gaps=np.where(closed, 0, 10 ** rng.uniform(-2, 1, m)),
+            )
+        )
+    return states
+
+
+@pytest.mark.parametrize("wall", [False, True])
+def test_gapped_chains_against_scipy(wall):
+    states = gapped_states(8, seed=33, wall=wall)
+    for s in states:
+        s.after = elastic_plastic(
+            np.asarray(s.mass), s.normals, s.velocity, s.k, s.eta, s.e, s.gaps
+        )[0]
+    programs.check_held("compliant", states, allowed=1e-6)
+
+
+def test_energy_is_what_the_restitution_leaves():
+    states = gapped_states(32, seed=5, e_least=0.2)
+    lossless = [programs.State(**(vars(s) | {"e": 1.0})) for s in states]
+    out, _ = programs.values("compliant")(states + lossless)
+    energy = [0.5 * s.velocity @ s.mass @ s.velocity for s in states]
+    assert (out.energy_change[:32] < 0).all()
+    assert (out.energy_change[:32] > -np.array(energy)).all()
+    assert (np.abs(out.energy_change[32:]) < 1e-7 * np.array(energy)).all()
+    assert set(names(out.status)) <= {"ok", "plastic_limit"}
+
+
+@pytest.mark.parametrize(
+    ("eta", "force"),
+    [
+        (1.5, lambda k: ji.Hertz(k)),
+        pytest.param(1.0, lambda k: ji.LinearSpring(k), marks=pytest.mark.slow),
+    ],
+)
+def test_forces_without_losses(eta, force):
+    """Forces without an e, and chains, are faster paths of the canonical program."""
+    k = [1.0, 2.5, 0.7]
+    given = [
+        chain([1.0, 1.0, 1.0, 1.0], [1, 0, 0, 0], e=1.0, k=k, eta=eta),
+        chain([1.0, 2.0, 1.5, 0.7], [1.0, 0.4, 0.1, -0.6], k=k, eta=eta, gaps=[0.0, 0.3, 0.0]),
+    ]
+
+    @jax.jit
+    @jax.vmap
+    def run(masses, v, k, gaps):
+        return ji.impact(ji.Compliant(force(k)), ji.chain(masses, gaps=gaps), v)
+
+    rows = [
+        (np.diag(s.mass), s.velocity, *(np.broadcast_to(x, 3) for x in (s.k, s.gaps)))
+        for s in given
+    ]
+    out = run(*(np.array(x, float) for x in zip(*rows)))
+    same, _ = programs.values("compliant")(given)
+    np.testing.assert_allclose(out.velocity, same.velocity, atol=2e-7)
+    np.testing.assert_array_equal(out.status, same.status)
+
+
+def test_lzb_against_an_oracle_of_another_formulation():
+    """Chains with walls, mixed exponents, precompression, by scipy with events."""
+    rows = [
+        # masses, wall, k, e, eta, v, stored
+        ([3, 1, 2], False, [1, 3], [0.95, 0.4], [1.5, 1.5], [1, 0, -0.5], 0.0),
+        ([1, 4, 0.5, 2], False, [0.05, 20, 1], [0.3, 0.9, 1], [1.3] * 3, [1, 0.2, 0, 0], 0.0),
+        ([1, 1, 1], "left", [1, 2, 0.7], [0.8, 0.9, 0.6], [2] * 3, [-1, -1, -1], 0.0),
+        ([1, 2, 1], True, [4, 2, 0.7], [0.8, 0.9, 0.6], [1, 1.5, 2], [1, 0.5, 0.2], 0.0),
+        ([1, 2, 1], False, [1, 2], [0.9, 0.7], [1.5, 1.5], [1, 0, 0.2], [0.3, 0.05]),
+    ]
+    states = []
+    for masses, wall, k, e, eta, v, stored in rows:
+        after, p, *_ = lzb_oracle(*chain_matrices(masses, wall), v, k, e, eta, stored)
+        states.append(
+            chain(masses, v, wall, k=k, e=e, eta=eta, stored=stored, after=after, impulse=p)
+        )
+    programs.check_held("lzb", states, allowed=2e-7)
+
+
+# ------------------------------------------------------------------------------------ forces
+
+# name: (force of (k, damping), the same by numpy, its smooth sign)
+FORCES = {
+    "kelvin-voigt": (ji.KelvinVoigt, lambda k, c: lambda x, u: k * x + c * u, None),
+    "hunt-crossley": (
+        ji.HuntCrossley,
+        lambda k, d: lambda x, u: k * np.maximum(x, 0) ** 1.5 * (1 + d * u),
+        lambda k, d: lambda x, u: 1 + d * u,
+    ),
+    "kuwabara-kono": (
+        ji.KuwabaraKono,
+        lambda k, a: lambda x, u: k * np.sqrt(np.maximum(x, 0)) * (x + 1.5 * a * u),
+        lambda k, a: lambda x, u: x + 1.5 * a * u,
+    ),
+}
+COUNT = 16
+
+
+@functools.cache
+def damped(name):
+    """(k, damping, masses, v, gaps) -> outcome of three balls and its slope along all of them."""
+
+    def velocity(k, c, mass, v, gaps):
+        return ji.impact(ji.Compliant(FORCES[name][0](k, c)), ji.chain(mass, gaps=gaps), v)
+
+    return jax.jit(jax.vmap(velocity))
+
+
+def draw(number=COUNT, seed=1):
+    rng = np.random.default_rng(seed)
+    mass = 10 ** rng.uniform(-0.7, 0.7, (number, 3))
+    v = np.sort(rng.normal(size=(number, 3)))[:, ::-1].copy()
+    k, c = 10 ** rng.uniform(-1, 1, (number, 2)), 10 ** rng.uniform(-2, 0.5, (number, 2))
+    closed = rng.uniform(size=(number, 2)) < 0.3
+    return k, c, mass, v, np.where(closed, 0, 10 ** rng.uniform(-2, 1, (number, 2)))
+
+
+@pytest.mark.parametrize(
+    "force",
+    [pytest.param(x, marks=[pytest.mark.slow] if x != "kelvin-voigt" else []) for x in FORCES],
+)
+def test_damped_chains_against_scipy(force):
+    """Forces that slacken at x > 0 and are loaded again, at any damping; none of it elastic."""
+    k, c, mass, v, gaps = draw()
+    c[-1], gaps[-1] = 0.0, [0.0, 0.1]  # without damping
+    out = damped(force)(k, c, mass, v, gaps)
+    _, numpy_force, onset = FORCES[force]
+    for i in range(COUNT - 1):
+        expected = viscous(
+            *chain_matrices(mass[i]),
+            v[i],
+            numpy_force(k[i], c[i]),
+            gaps[i],
+            onset=onset and onset(k[i], c[i]),
+        )
+        np.testing.assert_allclose(out.velocity[i], expected, atol=1e-6 * np.abs(v[i]).max())
+    assert (np.asarray(out.status) == 0).all()
+    assert (np.asarray(out.energy_change)[:-1] <= 0).all()
+    assert abs(float(out.energy_change[-1])) < 1e-7
+    assert (np.asarray(out.impulse) >= 0).all()
+
+
+@pytest.mark.parametrize(
+    "force",
+    [
+        pytest.param(x, marks=pytest.mark.slow if x == "hunt-crossley" else pytest.mark.release)
+        for x in FORCES
+    ],
+)
+def test_damped_derivatives(force):
+    """At a generic gapped state, in stiffness, damping, gaps and velocity; both modes."""
+    k, c, mass, v, gaps = (jnp.asarray(z[3]) for z in draw())
+
+    def velocity(theta):
+        k, c, gaps, v = theta
+        law = ji.Compliant(FORCES[force][0](k, c), rtol=1e-10)
+        return ji.impact(law, ji.chain(mass, gaps=gaps), v).velocity
+
+    at = (k, c, gaps, v)
+    rng = np.random.default_rng(0)
+    along = jax.tree.map(lambda z: jnp.asarray(rng.normal(size=z.shape)) * jnp.abs(z), at)
+    f = jax.jit(lambda s: velocity(jax.tree.map(lambda z, d: z + s * d, at, along)))
+    rate = jax.jit(lambda d: jax.jvp(velocity, (at,), (d,))[1])(along)
+    h = 1e-4
+    np.testing.assert_allclose(rate, (f(h) - f(-h)) / (2 * h), atol=1e-5)
+    weight = jnp.array([0.3, -1.0, 0.7])
+    back = jax.jit(lambda: jax.vjp(velocity, at)[1](weight))()[0]
+    total = sum(float(jnp.sum(a * b)) for a, b in zip(back, along))
+    assert total == pytest.approx(float(weight @ rate), rel=1e-8)
+
+
+def test_restitution_of_a_damped_spring():
+    """Swinging and creeping, and the series between them: `m x'' = -k x - c x'` until F = 0."""
+    k, m = 2.0, 0.7
+    near = 1 + np.array([-2e-4, -9e-5, 9e-5, 2e-4])
+    zeta = np.concatenate([[0.01, 0.3, 0.65, 0.8], near, [1.2, 3.0, 1.0]])
+    closed = ji.measured_restitution(ji.KelvinVoigt(k, 2 * zeta * np.sqrt(k * m)), m, 1.0)
+    for e, z in zip(closed[:-1], zeta):
+        # x is a sum of exp(r t sqrt(k / m)), and x'' = 0 where the force ends
+        r = np.roots([1.0, 2 * z, 1.0]).astype(complex)
+        end = 2 * np.log(r[1] / r[0]) / (r[0] - r[1])
+        v = (r[0] * np.exp(r[0] * end) - r[1] * np.exp(r[1] * end)) / (r[0] - r[1])
+        np.testing.assert_allclose(e, -v.real, rtol=1e-5)
+    assert float(closed[-1]) == pytest.approx(np.exp(-2), rel=1e-13)  # critical
+
+
+@pytest.mark.slow
+def test_restitution_of_a_pair():
+    """`measured_restitution` is what an impact gives; Hunt and Crossley's implicit relation."""
+    e, speed = 0.5, 2.5
+    a = brentq(lambda a: a * (1 + e) - np.log1p(a) + np.log1p(-a * e), 1e-3, (1 - 1e-13) / e)
+    got = ji.measured_restitution(ji.HuntCrossley(3.0, a / speed), jnp.array([0.2, 4.0]), speed)
+    np.testing.assert_allclose(got, e, atol=1e-9)
+    found = ji.calibrate(ji.HuntCrossley(3.0, 0.0), e, 0.2, speed)
+    assert float(found.damping) == pytest.approx(a / speed, rel=1e-7)
+    assert float(ji.calibrate(ji.Hertz(1.0), 0.4, 1.0, 1.0).restitution) == 0.4
+
+
+@pytest.mark.slow
+def test_calibration_is_differentiable():
+    def damping(x):
+        return ji.calibrate(ji.KelvinVoigt(2.0, 0.0), x[0], x[1], x[2]).damping
+
+    at, h = jnp.array([0.7, 1.3, 0.8]), 1e-4
+    forward, reverse, values = jax.jit(
+        lambda x, moved: (jax.jacfwd(damping)(x), jax.jacrev(damping)(x), jax.vmap(damping)(moved))
+    )(at, at[None] + h * jnp.concatenate([jnp.eye(3), -jnp.eye(3)]))
+    np.testing.assert_allclose(forward, (values[:3] - values[3:]) / (2 * h), rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_user_forces():
+    """One's own force is the built-in one; without a value it is reported; it cannot pull."""
+    gaps = jnp.array([0.0, 0.2])
+    user = ji.UserForce(lambda x, rate, p: p["k"] * x + p["c"] * rate, {"k": 1.0, "c": 0.3})
+    outcomes = [
+        ji.impact(ji.Compliant(force), ji.chain(jnp.ones(3), gaps=gaps), STRIKE)
+        for force in (user, ji.KelvinVoigt(1.0, 0.3))
+    ]
+    np.testing.assert_allclose(outcomes[0].velocity, outcomes[1].velocity, atol=1e-8)
+    for function in (lambda x, rate, _: x * jnp.nan, lambda x, rate, _: jnp.sqrt(0.1 - x)):
+        out = ji.impact(ji.Compliant(ji.UserForce(function)), ji.chain([1.0, 1.0]), [1.0, 0.0])
+        assert names(out.status) == ["not_finite"]
+    sticky = ji.UserForce(lambda x, rate, _: x - 0.05)
+    out = ji.impact(ji.Compliant(sticky), ji.chain([1.0, 1.0]), [1.0, 0.0])
+    assert float(out.impulse[0]) > 0
+    assert float(out.energy_change) == pytest.approx(0, abs=1e-7)
+
+
+@pytest.mark.slow
+def test_many_balls_strike_many():
+    """M of ten Hertz balls strike the others: M + 2 go forward with 99 % of the energy; M = 7: 8."""
+    v = jnp.asarray([[1.0] * m + [0.0] * (10 - m) for m in range(1, 8)])
+    law, scene = ji.Compliant(ji.Hertz(1.0)), ji.chain(jnp.ones(10))
+    got = np.asarray(jax.jit(jax.vmap(lambda v: ji.impact(law, scene, v).velocity))(v))
+    assert [int((row > 0).sum()) for row in got] == [3, 4, 5, 6, 7, 8, 8]
+    for m, row in enumerate(got[:5], start=1):
+        tail = row[10 - (m + 2) :]
+        assert 0.989 < tail @ tail / (row @ row) < 0.995
+    ends = (0.00267195494026627602, 0.147390307201133049, 0.985865866417338406)
+    np.testing.assert_allclose(got[0, -3:], ends, atol=1e-6)
+
+
+# --------------------------------------------------------------------------- closed forms
+
+
+def test_bilateral_chain_and_newby():
+    """(6.15) and the first openings (corrected 6.16); Newby's contacts open together."""
+    motion = jax.jit(
+        lambda ratio, t: ji.theory.bilateral_motion(
+            ji.chain(jnp.ones(3)), jnp.stack([jnp.ones(()), ratio]), STRIKE, t
+        )
+    )
+    x, v = motion(2.7, 2.1)
+    held = (1.05643885373854550, 0.620228862850967355, 0.423332283410487146)
+    np.testing.assert_allclose(x, held, atol=1e-13)
+    held = (-0.142478983904997473, 0.444517042135023372, 0.697961941769974101)
+    np.testing.assert_allclose(v, held, atol=1e-13)
+    table = {
+        0.3: (2.3104357319154176423, 4.5785561388309801779),
+        1: (2.5548129111974902502, 3.3820850513035804078),
+        2: (2.75461756179146516, 2.8391414082694387567),
+        2.7: (2.7494001239988592829, 2.6351145226216572429),
+        5: (2.6536174294728242085, 2.334964664586246076),
+    }
+
+    def opening(ratio, j, low, high):
+        squeeze = lambda t: float(motion(ratio, t)[0][j] - motion(ratio, t)[0][j + 1])  # noqa: E731
+        return brentq(squeeze, low, high, xtol=1e-14)
+
+    for ratio, times in table.items():
+        for j, t in enumerate(times):
+            assert opening(float(ratio), j, t - 0.1, t + 0.1) == pytest.approx(t, rel=1e-12)
+    exact = (2.241337913521566978102, 6.171292729553324410933, 11.45961201072390584258)
+    for n, value in zip((2, 3, 4), exact):
+        assert ji.theory.newby_ratio(n) == pytest.approx(value, rel=1e-14)
+    both = [opening(ji.theory.newby_ratio(2), j, 2.5, 3.0) for j in (0, 1)]
+    assert both[0] == pytest.approx(both[1], rel=1e-11)
+
+
+def test_distributing_rule():
+    rule = ji.distributing_rule([0.2, 0.3], [1.0, 2.0], [1.0, 1.5])
+    np.testing.assert_allclose(rule[1, 0], 1.7555724651363151, rtol=1e-14)
+    np.testing.assert_allclose(rule * rule.T, 1.0, rtol=1e-14)
+    rule = ji.distributing_rule([1.0, 0.3], [1.0, 2.0], 1.5)
+    np.testing.assert_allclose(rule[1, 0], 0.640744299507361192, rtol=1e-14)
+
+
+def test_precompression_energy():
+    """`k x^(eta + 1) / (eta + 1)` at the x of the force; the chapter's number."""
+    energy = ji.precompression_energy(0.328633534503099668, 2.0, 1.5)
+    np.testing.assert_allclose(energy, 0.0394360241403719602, rtol=1e-14)
+    x, k, eta = np.array([0.1, 2.0]), np.array([3.0, 0.7]), np.array([1.0, 3.0])
+    energy = ji.precompression_energy(k * x**eta, k, eta)
+    np.testing.assert_allclose(energy, k * x ** (eta + 1) / (eta + 1), rtol=1e-14)
+
+
+def test_history_of_one_ball_on_a_linear_spring():
+    """Half a period of `x = v / w sin(w t)`, of 1 kg, k = 2 N/m and 1 m/s."""
+    history = ji.history(ji.LZB(1.0, 2.0, exponent=1.0), ji.chain([1.0], wall=True), [1.0])
+    w, t = np.sqrt(2.0), np.asarray(history.time)
+    x = np.sin(w * t) / w
+    np.testing.assert_allclose(t[-1], np.pi / w, rtol=1e-7)
+    np.testing.assert_allclose(history.indentation[:, 0], x, atol=1e-7)
+    np.testing.assert_allclose(history.force[:, 0], 2 * x, atol=1e-7)
+    np.testing.assert_allclose(history.energy[:, 0], x**2, atol=1e-7)
+    np.testing.assert_allclose(history.gap_velocity[:, 0], -np.cos(w * t), atol=1e-7)
+    np.testing.assert_allclose(history.impulse[:, 0], 1 - np.cos(w * t), atol=1e-7)
+    np.testing.assert_allclose(history.approach[:, 0], x, atol=1e-7)
+
+
+def test_the_status_of_a_history_is_that_of_the_impact():
+    """Bad parameters, unknown velocities and energies without a number, inside jit."""
+
+    @jax.jit
+    @jax.vmap
+    def traced(e, v):
+        law = ji.LZB(e, 2.0, exponent=1.0)
+        return ji.history(law, ji.chain([1.0], wall=True), v[None], samples=2).status
+
+    e = np.array([1.0, np.nan, 1.5, 1.0, 1.0])
+    found = traced(e, np.array([1.0, 1.0, 1.0, np.nan, 1e-200]))
+    wanted = ["ok", "not_finite", "out_of_range", "not_finite", "out_of_range"]
+    assert names(found) == wanted
+
+
+def test_a_contact_that_is_compressed_twice():
+    """Figure 6.6: two balls at a wall; approach and force at its turns, by another integration."""
+    law, scene = ji.LZB([0.9, 0.8], [1.0, 2**0.5], 1.5), ji.chain([1.0, 1.0], wall=True)
+    h = ji.history(law, scene, [1.0, 1.0], samples=800)
+    force, approach = np.asarray(h.force[:, 1]), np.asarray(h.approach[:, 1])
+    peak, valley, again = np.flatnonzero(np.diff(np.asarray(h.gap_velocity[:, 1]) > 0))[:3]
+    assert float(h.maximum_force[1]) == pytest.approx(1.344782, abs=1e-6)
+    assert force[peak - 1 : peak + 3].max() == pytest.approx(1.344782, abs=1e-5)
+    assert force[valley - 1 : valley + 3].min() == pytest.approx(0.6709, abs=1e-4)
+    assert float(h.time[valley]) == pytest.approx(2.628, abs=5e-3)
+    end = np.flatnonzero(force > 0)[-1]
+    assert end > again
+    x = (force[end] / 2**0.5) ** (2 / 3)  # the effective one; the true one unloads e^2 of it
+    assert approach[end] - 0.8**2 * x == pytest.approx(0.3917, abs=5e-5)
+    # the two loops enclose what is lost; the kinetic energies say how much that is
+    lost = np.trapezoid(h.force, h.approach, axis=0).sum()
+    assert lost == pytest.approx(1.0 - 0.5 * float(np.sum(h.velocity[-1] ** 2)), rel=1e-4)
+    marks = ji.plot.contact_loop(h).axes[0].texts
+    assert [text.get_text() for text in marks] == ["O", "M1", "R1", "M2", "B"]
+
+
+def test_hertz_stiffness_of_the_steel_beads():
+    """8 mm beads, E = 216 GPa, nu = 0.276: the constants of the bead column within 0.02 %."""
+    radius = 4e-3
+    assert float(ji.hertz_stiffness(21.6e10, 0.276, radius)) == pytest.approx(6.97089e9, rel=1e-6)
+    plane = ji.hertz_stiffness(21.6e10, 0.276, radius, radius2=np.inf)
+    assert float(plane) == pytest.approx(9.85833e9, rel=1e-6)
+    rigid = ji.hertz_stiffness(21.6e10, 0.276, radius, np.inf, 0.276, np.inf)
+    assert float(rigid) == pytest.approx(2 * float(plane), rel=1e-12)
+    assert float(ji.sphere_mass(7650.0, radius)) == pytest.approx(2.05e-3, rel=1e-3)
+
+
+# ------------------------------------------------------------------------------- histories
+
+
+@functools.cache
+def histories():
+    """Three balls and a wall (wall or first ball out of play), as a batch of any law."""
+
+    def one(mass, v, e, k, eta):
+        law = ji.LZB(e, k, eta)
+        h = ji.history(law, ji.chain(mass, wall=True), v, samples=101)
+        return h, ji.impact(law, ji.chain(mass, wall=True), v)
+
+    return jax.jit(jax.vmap(one))
+
+
+@pytest.mark.slow
+def test_histories():
+    """Half a sine, the energy ledger, the end of the impact, Falcon's wall force; no impact."""
+    beads = np.append(np.full(2, 6.9716e9), 9.858e9)
+    speed = np.sqrt(2 * 9.81 * 3.1e-3)
+    e_beads = [0.96, 0.96, 0.92]
+    small = np.full(3, 2.05e-3)
+    rows = [
+        (np.full(3, 2.0), [0, 0, 3.0], [1, 1, 1.0], [8, 8, 8.0], [1, 1, 1.0]),
+        ([1, 2, 1.5], [1, 0.5, 0.2], [0.0, 0.8, 0.6], [1, 3, 2.0], [1.5] * 3),
+        ([1, 2, 1.5], [1, 0.5, 0.2], [0.9, 0.8, 0.6], [1, 3, 2.0], [1.3] * 3),
+        (small, [-1.0, 0, speed], e_beads, beads, [1.5] * 3),  # one bead
+        (small, [-1.0, speed, speed], e_beads, beads, [1.5] * 3),  # two
+        (small, [speed] * 3, e_beads, beads, [1.5] * 3),  # three
+        ([1, 2, 1.5], [-3, -2, -1.0], [1, 1, 1.0], [1, 1, 1.0], [1.5] * 3),
+    ]
+    columns = [np.array(x, float) for x in zip(*rows)]
+    h, out = jax.tree.map(np.asarray, histories()(*columns))
+    # ball 3 at the wall alone: a sine, until it turns back and presses ball 2
+    t, m, k, v = h.time[0], 2.0, 8.0, 3.0
+    omega = np.sqrt(k / m)
+    alone = t < 0.99 * np.pi / (2 * omega)
+    assert alone.sum() > 10
+    deep = v / omega * np.sin(omega * t[alone])
+    np.testing.assert_allclose(h.indentation[0, alone, 2], deep, atol=2e-7)
+    np.testing.assert_allclose(h.force[0, alone, 2], k * deep, atol=2e-6)
+    np.testing.assert_allclose(h.maximum_force[0, 2], v * np.sqrt(k * m), rtol=1e-8)
+    for i in (1, 2):
+        np.testing.assert_allclose(h.velocity[i, -1], out.velocity[i], atol=1e-6)
+        np.testing.assert_allclose(h.impulse[i, -1], out.impulse[i], atol=1e-6)
+        kinetic = 0.5 * h.velocity[i] ** 2 @ columns[0][i]
+        total = kinetic + h.energy[i].sum(axis=1)
+        assert np.diff(total).max() < 1e-7
+        np.testing.assert_allclose(total[0], 0.5 * columns[1][i] ** 2 @ columns[0][i], rtol=1e-12)
+        assert (h.force[i] >= 0).all()
+        assert (h.maximum_force[i] >= h.force[i].max(axis=0) - 1e-9).all()
+    for i, newton in ((3, 51.66), (4, 52.90), (5, 52.90)):
+        assert h.maximum_force[i, 2] == pytest.approx(newton, abs=0.01)
+    assert h.duration[6] == 0.0
+    assert not h.force[6].any()
+
+
+@pytest.mark.slow
+def test_history_across_gaps():
+    scene, law = ji.chain(jnp.ones(3), gaps=jnp.array([0.3, 4.0])), ji.Compliant(ji.Hertz(1.0))
+    h = ji.history(law, scene, STRIKE, samples=400)
+    out = ji.impact(law, scene, STRIKE)
+    np.testing.assert_allclose(h.velocity[-1], out.velocity, atol=1e-7)
+    np.testing.assert_allclose(np.trapezoid(h.force, h.time, axis=0), h.impulse[-1], rtol=2e-3)
+    assert not np.asarray(h.force)[np.asarray(h.time) < 0.29].any()  # still flying
+    pair = (1.25 * 0.5) ** 0.4  # deepest indentation of one pair
+    assert float(h.indentation[:, 0].max()) == pytest.approx(pair, rel=1e-3)
+    np.testing.assert_allclose(np.asarray(h.velocity).sum(axis=1), 1.0, atol=1e-12)
+    data = tomllib.loads((files("jimpact") / "data" / "bead_column.toml").read_text("utf-8"))
+    assert ji.plot.forces({"balls": h}).axes[0].get_ylabel() == "force [N]"
+    assert data["scene"]["masses_kg"] == [2.05e-3] * 12
+
+
+# ------------------------------------------------------------------------------ gap scales
+
+
+def test_gap_scale():
+    """One-inch steel balls at 1 and 0.1 m/s: 31 and 5 um; the same for every law with this k."""
+    scene, k = ji.chain(jnp.full(3, 0.0665), gaps=jnp.array([0.0, 1e-4])), 1.2e10
+    for speed in (1.0, 0.1):
+        expected = (0.0665 * speed**2 / k) ** 0.4
+        for law in (
+            ji.Compliant(ji.Hertz(k)),
+            ji.LZB(0.9, k),
+            ji.Compliant(ji.HuntCrossley(k, 0.1)),
+        ):
+            found = ji.gap_scale(scene, law, [speed, 0.0, 0.0]).delta
+            np.testing.assert_allclose(found, expected, rtol=1e-12)
+    linear = (0.0665 / 1e6) ** 0.5
+    for force in (ji.LinearSpring(1e6), ji.UserForce(lambda x, r, k: k * x, 1e6)):
+        found = ji.gap_scale(scene, ji.Compliant(force), [1.0, 0.0, 0.0]).delta
+        np.testing.assert_allclose(found, linear, rtol=1e-12)
+    many = ji.chain(jnp.ones(5), gaps=jnp.array([0.0, 0.05, 0.7, 5.0]))
+    hertz = ji.Compliant(ji.Hertz(1.0))
+    text = str(ji.gap_scale(many, hertz, [1.0, 0, 0, 0, 0])).splitlines()
+    assert "gap 1 is closed (delta_c = 1 m)" in text[0]
+    assert "touching" in text[1]
+    assert "gap 3 is 0.7 delta_c" in text[2]
+    assert "one after another" in text[3]
+    assert "nothing approaches" in str(ji.gap_scale(many, hertz, [-1.0, 0, 0, 0, 0]))
+
+
+def test_symmetric_discontinuity_is_a_smooth_crossover():
+    """Balls (m/4, m, m/4) at (1, 0, -1): both orders, both at once, and how wide it is."""
+    offset = jnp.linspace(-4, 4, 41)
+    scene, v = ji.chain(jnp.array([0.25, 1.0, 0.25])), jnp.array([1.0, 0.0, -1.0])
+    found = ji.crossover(scene, ji.Compliant(ji.Hertz(1.0)), v, offset)
+    w = np.asarray(found.velocity)
+    assert (np.asarray(found.status) == 0).all()
+    np.testing.assert_allclose(w[0], (-3 / 5, -4 / 25, 31 / 25), atol=1e-7)
+    np.testing.assert_allclose(w[20], (-1, 0, 1), atol=1e-7)
+    np.testing.assert_allclose(w, -w[::-1, ::-1], atol=1e-7)  # mirror
+    assert (np.diff(w[:, 0]) < 1e-8).all()  # monotone
+    part = (w[:, 0] + 0.6) / -0.64
+    ten, ninety = (np.interp(level, part, offset) for level in (0.1, 0.9))
+    assert 1.8 < ninety - ten < 2.2
+
+
+def test_offsets_of_gaps_are_in_units_of_the_larger_indentation():
+    """The lighter pair indents less: `delta_c^2.5 = m v^2 / k`, m = 2 m1 m2 / (m1 + m2)."""
+    masses, v, offset = [0.25, 1.0, 4.0], jnp.array([1.0, 0.0, -1.0]), jnp.linspace(-4, 4, 41)
+    scene, law = ji.chain(jnp.array(masses)), ji.Compliant(ji.Hertz(1.0))
+    outcome = ji.crossover(scene, law, v, offset)
+    larger = (2 * 1.0 * 4.0 / 5.0) ** 0.4
+    gaps = larger * (2.0 + 0.5 * offset[:, None] * jnp.array([[1.0, -1.0]]))
+    direct = jax.vmap(lambda g: ji.impact(law, ji.chain(jnp.array(masses), gaps=g), v))(gaps)
+    np.testing.assert_allclose(outcome.velocity, direct.velocity, rtol=0, atol=1e-9)

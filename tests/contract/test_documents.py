@@ -1,0 +1,323 @@
+"""README, docs, docstrings and notebooks run as printed, in one process that shares programs."""
+
+import ast
+import doctest
+import importlib
+import pkgutil
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jupytext
+import matplotlib
+import matplotlib.pyplot as plt
+import nbformat
+import pytest
+from IPython.core.interactiveshell import InteractiveShell
+
+import jimpact as ji
+
+ROOT = Path(__file__).parents[2]
+DOCS = sorted((ROOT / "docs").glob("*.md"))
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+OPTIONS = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
+MODULES = ["jimpact", *(m.name for m in pkgutil.walk_packages(ji.__path__, "jimpact."))]
+TESTS = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("test_*.py"))
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def examples(name):
+    """The examples of a module."""
+    module = importlib.import_module(name)
+    tests = doctest.DocTestFinder(exclude_empty=True).find(module, name)
+    return [test for test in tests if test.examples]
+
+
+WITH_EXAMPLES = [name for name in MODULES if ">>>" in Path(
+    importlib.util.find_spec(name).origin
+).read_text(encoding="utf-8")]  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def as_a_user_runs_them(tmp_path, monkeypatch):
+    """x64, the promotion rules of JAX, and a temporary folder."""
+    monkeypatch.chdir(tmp_path)
+    laws = dict(ji.REGISTRY)  # some examples register a law
+    jax.config.update("jax_numpy_rank_promotion", "allow")
+    jax.config.update("jax_numpy_dtype_promotion", "standard")
+    yield
+    plt.close("all")
+    ji.REGISTRY.clear()
+    ji.REGISTRY.update(laws)
+    jax.config.update("jax_numpy_rank_promotion", "raise")
+    jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+
+LONG = (  # all rheologies, laws or methods are compiled
+    "laws.calibration", "plot.laws", "plot.charts", "plot.motions", "methods.", "motion.fitting_motion", "comparison",
+    "plot.inference", "montecarlo.gaps", "bodies.solids", "bodies.assemblies", "piles", "motion.record",
+    "pile_contacts", "turning_impact",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "module",
+    [
+        pytest.param(x, marks=[pytest.mark.slow] if any(y in x for y in LONG) else [])
+        for x in WITH_EXAMPLES
+    ],
+)
+def test_docstrings_run(module):
+    runner = doctest.DocTestRunner(optionflags=OPTIONS)
+    tests = examples(module)
+    assert tests
+    for test in tests:
+        runner.run(test)
+    assert runner.summarize(verbose=False).failed == 0
+
+
+def test_readme_runs():
+    done = doctest.testfile(str(ROOT / "README.md"), module_relative=False, optionflags=OPTIONS)
+    assert done.attempted > 10
+    assert done.failed == 0
+    assert len(README.splitlines()) <= 120
+
+
+LONG_PAGES = (
+    "compliant",
+    "embedding",
+    "fitting",
+    "fitting_reference",
+    "from_lmfit",
+    "gradient_descent",
+    "motions",
+    "mujoco",
+    "speed_accuracy",
+    "waves",
+)
+
+
+def code_of(path):
+    """Python code of a page: fenced blocks, those with prompts by doctest."""
+    text = path.read_text(encoding="utf-8")
+    blocks = re.findall(r"```python\n(.*?)```", text, re.S)
+    own = [block for block in blocks if ">>>" not in block and "tcp://" not in block]
+    return own, ">>>" in text  # (a cluster does not exist here)
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(p, id=p.stem, marks=[pytest.mark.slow] if p.stem in LONG_PAGES else [])
+        for p in DOCS
+        if any(code_of(p))
+    ],
+)
+def test_docs_run(path):
+    blocks, prompts = code_of(path)
+    space = {}
+    for block in blocks:
+        exec(compile(block, str(path), "exec"), space)
+    if prompts:
+        done = doctest.testfile(str(path), module_relative=False, optionflags=OPTIONS)
+        assert done.attempted > 0
+        assert done.failed == 0
+
+
+def test_docs_name_what_exists():
+    """Every `ji.name` of the texts is a public name; every path a file."""
+    for path in [ROOT / "README.md", *DOCS]:
+        text = path.read_text(encoding="utf-8")
+        for name in set(re.findall(r"\bji\.([A-Za-z_]\w*)", text)):
+            assert hasattr(ji, name), (path.name, name)
+        for name in set(re.findall(r"\]\(((?!http)[^)#]+)\)", text)):
+            assert (path.parent / name).exists(), (path.name, name)
+
+
+def test_docs_name_files_that_exist():
+    """A page that names a file of the package, or of the tests, names one that is there."""
+    for path in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *DOCS]:
+        names = re.findall(
+            r"`((?:jimpact|tests|docs|notebooks)/[\w/.-]+)`", path.read_text("utf-8")
+        )
+        missing = [x for x in names if not (ROOT / x).exists()]
+        missing += [
+            x
+            for x in re.findall(r"`(test_\w+)`", path.read_text("utf-8"))
+            if f"def {x}(" not in TESTS
+        ]
+        assert not missing, (path.name, missing)
+
+
+@pytest.fixture
+def pages(monkeypatch):
+    """The module that writes generated pages."""
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    return importlib.import_module("pages")
+
+
+def test_every_public_name_has_a_place_in_the_api(pages):
+    names = [name for page in pages.public_names().values() for name in page]
+    everything = [x for x in ji.__all__ if x not in ("plot", "theory", "__version__")]
+    everything += [f"{part.__name__.removeprefix('jimpact.')}.{name}"
+                   for part in (ji.plot, ji.theory) for name in part.__all__]  # fmt: skip
+    assert sorted(names) == sorted(everything)
+    index = pages.api_pages()["api/index.md"]
+    for name in names:
+        assert re.search(rf"\| `ji.{re.escape(name)}` \| \S.* \|", index), name
+
+
+def test_rooms_import_as_the_picture_shows(pages):
+    """Every module has a room in the picture, and imports from rooms of rows below its own."""
+    rows = {name: row for row, rooms in enumerate(pages.ROOMS)
+            for _, _, names in rooms for name in names}  # fmt: skip
+    room_of = {name: room for rooms in pages.ROOMS for room, _, names in rooms for name in names}
+    package = ROOT / "jimpact"
+    for path in package.rglob("*.py"):
+        name = path.relative_to(package).parts[0].removesuffix(".py")
+        if name == "__init__":
+            continue
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("jimpact."):
+                imported = node.module.split(".")[1]
+                allowed = rows[imported] > rows[name] or room_of[imported] == room_of[name]
+                report = path.name == "page.py" and imported == "plot"  # the page of a fit
+                assert allowed or report, (path.name, node.module)
+
+
+def test_constants_are_complete_and_explained(pages, tmp_path):
+    """Every number in capitals at the top of a module is in the table, with a meaning."""
+    module = tmp_path / "example.py"
+    module.write_text(
+        "# [m] above\nA = 1.0\nB = 2  # beside\n\nC: float = 3.0\nD, E = 0, 1\nname = 4\n"
+    )
+    assert pages.constants_of(module) == [
+        ("A", "1.0", "[m] above"), ("B", "2", "beside"), ("C", "3.0", ""),
+    ]  # fmt: skip
+    assert pages.unit_of("[m] above") == "m"
+    unexplained = [(path, name) for path, rows in pages.constants().items()
+                   for name, _, comment in rows if not comment]  # fmt: skip
+    assert not unexplained, "add a comment: unit, meaning, what ten times more would do"
+    page = pages.constants_page()["constants.md"]
+    for path in (ROOT / "jimpact").rglob("*.py"):
+        if path.name == "tableaux.py":
+            continue
+        for line in ast.parse(path.read_text(encoding="utf-8")).body:
+            value = getattr(line, "value", None)
+            target = line.targets[0] if isinstance(line, ast.Assign) else getattr(line, "target", 0)
+            number = isinstance(value, ast.Constant) and isinstance(value.value, int | float)
+            if isinstance(target, ast.Name) and target.id.isupper() and number:
+                row = f"| `{target.id}` | `{value.value}` |"
+                assert row in page, (path, target.id)
+
+
+def test_every_law_is_in_the_readme_as_in_the_registry():
+    for row in ji.REGISTRY.values():
+        assert f"| `{row.law.__name__}` | {row.right_when} | {row.fails_when} |" in README
+
+
+def test_public_names():
+    """Docstrings with examples; no module hides a public name."""
+    without = []
+    for name in ji.__all__:
+        value = getattr(ji, name)
+        assert type(value).__name__ != "module" or name in ("plot", "theory"), name
+        if callable(value) and not (value.__doc__ or "").strip():
+            without.append(name)
+    assert not without
+    functions = [x for x in map(ji.__dict__.get, ji.__all__) if type(x).__name__ == "function"]
+    bare = [x.__name__ for x in functions if ">>>" not in (x.__doc__ or "")]
+    assert not bare, bare
+    with pytest.raises(AttributeError, match="attribute Lzb"):
+        _ = ji.Lzb
+
+
+def run_python(code):
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+
+
+def test_import_sets_nothing_and_is_lazy():
+    code = (
+        "import sys, jimpact; assert 'jax' not in sys.modules; import jax;"
+        "before = jax.config.jax_enable_x64; jimpact.LZB, jimpact.fit, jimpact.history;"
+        "assert jax.config.jax_enable_x64 == before == False; print('ok')"
+    )
+    assert run_python(code).stdout.strip() == "ok"
+
+
+# -------------------------------------------------------------------------------- notebooks
+
+
+def code_and_text(notebook):
+    return [(cell.cell_type, cell.source.strip()) for cell in notebook.cells]
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebook_and_script_agree(path):
+    notebook = nbformat.read(path, as_version=4)
+    assert code_and_text(notebook) == code_and_text(jupytext.read(path.with_suffix(".py")))
+    outputs = [o for cell in notebook.cells for o in cell.get("outputs", [])]
+    assert any("image/png" in output.get("data", {}) for output in outputs)
+    assert not any(output.output_type == "error" for output in outputs)
+
+
+class Shell(InteractiveShell):
+    """IPython in this process, so that notebooks share programs; test_commands runs kernels."""
+
+    def enable_gui(self, gui=None):
+        """There are no windows: pictures are inline."""
+
+
+@pytest.fixture
+def shell():
+    backend = matplotlib.get_backend()
+    yield Shell.instance()
+    Shell.clear_instance()
+    matplotlib.use(backend)
+
+
+RUNNING = ("01", "17")  # running takes most of their time
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(
+            path,
+            id=path.stem,
+            marks=[pytest.mark.long_run] if path.stem.startswith(RUNNING) else [],
+        )
+        for path in NOTEBOOKS
+    ],
+)
+def test_notebook_runs(path, shell):
+    for cell in nbformat.read(path, as_version=4).cells:
+        if cell.cell_type == "code":
+            shell.run_cell(cell.source).raise_error()
+
+
+def test_every_script_has_its_notebook():
+    scripts = sorted((ROOT / "notebooks").glob("[0-9]*.py"))
+    assert [path.stem for path in NOTEBOOKS] == [path.stem for path in scripts]
+    assert NOTEBOOKS
+
+
+def test_notebooks_are_one_course():
+    """Each begins with its aim and a drawing of the system, and links to the next."""
+    scripts = [jupytext.read(path.with_suffix(".py")) for path in NOTEBOOKS]
+    for k, (path, script) in enumerate(zip(NOTEBOOKS, scripts, strict=True)):
+        head, drawing = script.cells[0].source, nbformat.read(path, as_version=4).cells[1]
+        assert f"*Course, part {k}." in head
+        assert "You will" in head
+        assert any("image/png" in output.get("data", {}) for output in drawing.outputs), path.stem
+        links = re.findall(r"\]\((\d\w+\.ipynb)\)", "".join(cell.source for cell in script.cells))
+        for link in links:
+            assert (ROOT / "notebooks" / link).exists(), (path.stem, link)
+        if k + 1 < len(NOTEBOOKS):
+            assert NOTEBOOKS[k + 1].name in script.cells[-1].source, path.stem
+        code = "\n".join(cell.source for cell in script.cells if cell.cell_type == "code")
+        own = set(re.findall(r"^(?:from|import) (jimpact\.\S+)", code, re.M))
+        assert not own, "notebooks use public names only"

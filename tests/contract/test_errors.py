@@ -1,0 +1,344 @@
+"""Each bad input is one clear error on the host that names argument, value and what is allowed."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jimpact as ji
+
+BALLS = ji.chain([1.0, 1.0, 1.0])
+V = [1.0, 0.0, 0.0]
+PAIR = ji.chain([1.0, 1.0])
+TRIANGLE = [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]
+PENTAGRAM = [[np.cos(a), np.sin(a)] for a in 0.8 * np.pi * np.arange(5)]
+LAWS = [
+    (lambda: ji.LZB(1.3), r"`restitution` must lie in \[0, 1\], but has value 1\.3"),
+    (lambda: ji.LZB([0.5, -0.1]), r"`restitution`.*-0\.1 at index 1"),
+    (lambda: ji.LZB(np.nan), r"`restitution`.*nan"),
+    (lambda: ji.LZB(0.9, stiffness=0.0), r"`stiffness` must lie in \(0, inf\), but has value 0"),
+    (lambda: ji.LZB(0.9, stiffness=[1.0, np.inf]), r"`stiffness`.*inf at index 1"),
+    (lambda: ji.LZB(0.9, exponent=0.5), r"`exponent` must lie in \[1, inf\)"),
+    (lambda: ji.LZB(0.9, exponent=(1.5, 0.9)), r"`exponent`.*0\.9 at index 1"),
+    (lambda: ji.LZB(0.9, initial_energy=-1.0), r"`initial_energy`.*-1"),
+    (lambda: ji.LZB(0.9, rtol=0.0), r"`rtol`"),
+    (lambda: ji.LZB(0.9, method="euler"), r"`method` must be one of .*'euler'"),
+    (lambda: ji.LZB("high"), r"`restitution` must be numeric"),
+    (lambda: ji.LZB(None), r"`restitution` must be numeric, but has value None"),
+    (lambda: ji.Newton(-0.1), r"`restitution`"),
+    (lambda: ji.Moreau(-0.1), r"`restitution` must lie in \[0, 1\], but has value -0\.1"),
+    (lambda: ji.Moreau([[0.5, 0.1]]), r"`restitution` must be a square matrix.*\(1, 2\)"),
+    (lambda: ji.Moreau([[0.5, np.nan], [0, 0.5]]), r"`restitution`.*nan at index \(0, 1\)"),
+    (lambda: ji.Poisson([0.5, 1.2]), r"`restitution`.*1\.2 at index 1"),
+    (lambda: ji.Poisson(-1.0, allow_above_one=True), r"`restitution` must lie in \[0, inf\)"),
+    (lambda: ji.Binary(1.1), r"`restitution`.*1\.1"),
+    (lambda: ji.Binary(0.5, "slowest"), r"`order`.*'slowest'"),
+    (lambda: ji.Binary(0.5, ()), r"`order`"),
+    (lambda: ji.Binary(0.5, (0, 1.0)), r"`order`"),
+    (lambda: ji.Binary(0.5, max_collisions=0), r"`max_collisions`"),
+    (lambda: ji.Binary(0.5, max_collisions=2.5), r"`max_collisions`"),
+    (lambda: ji.RestitutionMatrix([[0.5, 0.1]]), r"must be square"),
+    (lambda: ji.RestitutionMatrix(0.5), r"must be square"),
+    (lambda: ji.RestitutionMatrix([[0.5, np.nan], [0, 0.5]]), r"`matrix`.*\(0, 1\)"),
+    (lambda: ji.RestitutionMatrix([["a"]]), r"must be numeric"),
+    (lambda: ji.Compliant(1.0), r"`force`"),
+    (lambda: ji.Compliant(ji.Hertz(1.0), rtol=0.0), r"`rtol`"),
+    (lambda: ji.KelvinVoigt(1.0, -0.1), r"`damping`.*-0\.1"),
+    (lambda: ji.HuntCrossley(0.0, 0.1), r"`stiffness`"),
+    (lambda: ji.KuwabaraKono(jnp.nan, 0.1), r"`stiffness`"),
+    (lambda: ji.HuntCrossley(1.0, 0.1, 0.5), r"`exponent`"),
+    (lambda: ji.ElastoPlastic(1.0, 0.0), r"`yield_force` must lie in \(0, inf\), but has value 0"),
+    (lambda: ji.Compliant(ji.ElastoPlastic(1.0, 1.0), friction=0.1), r"`force` must not yield"),
+    (lambda: ji.Compliant(ji.ElastoPlastic(1.0, 1.0), method="implicit"), r"must not yield"),
+    (lambda: ji.Compliant(ji.ElastoPlastic(1.0, 1.0), initial_energy=1.0), r"`initial_energy`"),
+    (lambda: ji.Bistiffness(1.0, 0.9), r"`exponent`"),
+    (lambda: ji.Bistiffness(1.0, 1.5, 1.2), r"`restitution`"),
+    (lambda: ji.LinearSpring("hard"), r"`stiffness`"),
+    (lambda: ji.UserForce(3.0), r"`function`"),
+    (lambda: ji.UserForce(lambda x, rate, p: x, "hard"), r"`parameters`"),
+    (lambda: ji.distributing_rule([-1.0, 1.0], 1.0, 1.5), r"`energy`"),
+    (lambda: ji.precompression_energy(-1.0, 1.0), r"`force`"),
+    (lambda: ji.precompression_energy(1.0, 0.0), r"`stiffness`"),
+]
+SCENES = [
+    (lambda: ji.chain([1.0, -1.0]), r"`masses` must lie in \(0, inf\).*-1 at index 1"),
+    (lambda: ji.chain([1.0, np.nan]), r"`masses`"),
+    (lambda: ji.chain([[1.0, 1.0]]), r"`masses` must have shape \(n,\)"),
+    (lambda: ji.chain([1.0]), r"at least one contact"),
+    (lambda: ji.chain([1.0, 1.0], wall="up"), r"`wall` must be one of .*'up'"),
+    (lambda: ji.chain([1.0, 1.0], gaps=[-1e-6]), r"`gaps`.*-1e-06"),
+    (lambda: ji.chain([1.0, 1.0], gaps=[0.0, 0.0]), r"`gaps` must have shape \(1,\)"),
+    (lambda: ji.Scene([[1.0, 0.5], [0.0, 1.0]], [[1.0], [0.0]]), r"`mass` must be symmetric"),
+    (lambda: ji.Scene([[1.0, 1.0], [1.0, 1.0]], [[1.0], [0.0]]), r"positive definite"),
+    (lambda: ji.Scene([1.0, -1.0], [[1.0], [0.0]]), r"`mass`.*-1"),
+    (lambda: ji.Scene([1.0, 1.0], [1.0, 0.0]), r"`normals` must have shape \(n, m\)"),
+    (
+        lambda: ji.Scene([1.0, 1.0], [[1.0, 0.0], [0.0, 0.0]]),
+        r"`normals` must have no zero column.* contact 2 is zero",
+    ),
+    (lambda: ji.Scene([1.0, 1.0], [[np.nan], [0.0]]), r"`normals`"),
+    (lambda: ji.Scene([1.0], [[1.0]], tangents=[[1.0, 0.0, 0.0]]), r"`tangents`"),
+    (lambda: ji.Scene([1.0], [[1.0]], constraints=[1.0]), r"`constraints`"),
+    (
+        lambda: ji.Scene([1.0, 1.0], [[1.0], [0.0]], constraints=[[1.0, 2.0], [0.0, 0.0]]),
+        r"`constraints` must have independent columns",
+    ),
+    (lambda: ji.gap_velocity(BALLS, [1.0, 0.0]), r"`velocity` must have shape \(3,\)"),
+    (lambda: ji.velocity_change(BALLS, [1.0]), r"`impulse` must have shape \(2,\)"),
+    (lambda: ji.rocking_block(-1.0, 1.0), r"`width`"),
+    (lambda: ji.rocking_block(1.0, 0.0), r"`height`"),
+    (lambda: ji.rocking_block(1.0, 1.0, mass=np.nan), r"`mass`"),
+    (lambda: ji.rocking_block(1.0, 1.0, inertia=-0.1), r"`inertia`"),
+    (lambda: ji.rocking_block(1.0, 1.0, angle=np.inf), r"`angle`"),
+    (lambda: ji.rocking_block([1.0, 2.0], 1.0), r"`width`.*one number"),
+    (lambda: ji.Block(1.0, 1.0, corners="three"), r"`corners` must be one of all, base"),
+    (lambda: ji.Polygon([[0, 0], [1, 0]]), r"`corners` must have shape \(k, 2\)"),
+    (lambda: ji.Polygon([[0, 0], [1, 0], [0.1, 0.1], [0, 1]]), r"convex polygon.*corner 2"),
+    (lambda: ji.Polygon([[0, 0], [1, 0], [2, 0], [0, 1]]), r"convex polygon.*corner 1"),
+    (lambda: ji.Polygon([[0, 0], [0, 0], [1, 0], [0, 1]]), r"convex polygon"),
+    (lambda: ji.Polygon(PENTAGRAM), r"more than once"),
+    (lambda: ji.Polygon(TRIANGLE, mass=0.0), r"`mass`"),
+    (lambda: ji.Polygon(TRIANGLE, centre=[0.2, 0.2]), r"`inertia` must be given with `centre`"),
+    (lambda: ji.Polygon(TRIANGLE, inertia=1.0, centre=[1, 1]), r"`centre` must lie inside"),
+    (lambda: ji.Disc(0.0), r"`radius`"),
+    (lambda: ji.Disc(1.0, inertia=1.0, centre=[1.0, 0.1]), r"`centre`"),
+    (lambda: ji.PlanarBodies([ji.Column([1.0])]), r"`bodies` must hold planar bodies"),
+    (lambda: ji.PlanarBodies([ji.Disc(1.0)], []), r"must give a contact"),
+    (lambda: ji.PlanarBodies([ji.Disc(1.0)], [np.nan]), r"`planes`"),
+    (lambda: ji.PlanarBodies([ji.Disc(1.0)], pairs=[(0, 1)]), r"bodies 0 to 0"),
+    (lambda: ji.PlanarBodies([ji.Disc(1.0)] * 2, pairs=[(1, 1)]), r"different bodies"),
+    (
+        lambda: ji.PlanarBodies([ji.Disc(1.0), ji.Dimer(0.1, 1.0)], pairs=[(0, 1)]),
+        r"body 1 is a Dimer",
+    ),
+    (lambda: ji.PlanarBodies([ji.Block(1, 1)] * 2, at=[0.0] * 3), r"`at` must have shape \(6,\)"),
+    (
+        lambda: ji.PlanarBodies([ji.Block(1, 1)] * 2, pairs=[((0, 4), (1, 0))]),
+        r"sides 0 to 3 of body 0",
+    ),
+    (lambda: ji.Box([1.0, 1.0, 0.0]), r"`sizes`"),
+    (lambda: ji.Box([1.0, 1.0]), r"`sizes` must have shape \(3,\)"),
+    (lambda: ji.Box([1.0, 1.0, 1.0], mass=0.0), r"`mass`"),
+    (lambda: ji.Box([1.0, 1.0, 1.0], rounding=0.6), r"`rounding`"),
+    (lambda: ji.Box([1.0, 1.0, 1.0], inertia=[1.0, 1.0, 2.5]), r"`inertia`.*sum of the others"),
+    (lambda: ji.Box([1.0, 1.0, 1.0], inertia=[1.0, 1.0, -1.0]), r"`inertia`"),
+    (lambda: ji.Box([1.0, 1.0, 1.0], inertia=1.0), r"`inertia` must have shape"),
+    (lambda: ji.Box([1.0, 1.0, 1.0], inertia=np.ones(3), centre=[0, 0, 0.6]), r"`centre`"),
+    (lambda: ji.Box([1.0, 1.0, 1.0], centre=[0, 0, 0.1]), r"`inertia` must be given"),
+    (lambda: ji.Box([1.0, 1.0, 1.0], normal=[1.0, 0, 0]), r"`normal` must point up"),
+    (lambda: ji.Sphere(-1.0), r"`radius`"),
+    (lambda: ji.Sphere(1.0).touching([1.0, 1.0, 0, 0]), r"`quaternion` must have length 1"),
+    (lambda: ji.Sphere(1.0).scene([0, 0, 1.0, 1, 0, 0]), r"`q` must have shape \(7,\)"),
+    (lambda: ji.dimer(-0.1, 1.0), r"`radius`"),
+    (lambda: ji.dimer(0.1, -1.0), r"`length`"),
+    (lambda: ji.dimer(0.0, 0.0), r"`length`"),
+    (lambda: ji.dimer(0.1, 1.0, rod_mass=-1.0), r"`rod_mass`"),
+    (lambda: ji.dimer_3d(0.0, 1.0), r"`radius`"),
+    (lambda: ji.dimer_3d(0.1, 1.0, angle=1.6), r"`angle`"),
+    (lambda: ji.corner(np.pi), r"`angle`"),
+    (lambda: ji.corner(-0.1), r"`angle`"),
+    (lambda: ji.disk_balls([0.0], disk_mass=0.0), r"`disk_mass`"),
+    (lambda: ji.Discs(1.0, []), "`radii` must hold one or more"),
+    (lambda: ji.disk_balls([0.0, 1.0], [1.0, 1.0, 1.0]), r"`ball_masses`.*shape"),
+    (lambda: ji.disk_balls(0.0), r"`angles`"),
+    (lambda: ji.disk_balls([0.0], gaps=[-1.0]), r"`gaps`"),
+    (lambda: ji.pendulum_cradle([1.0], 1.0, 0.1), r"two balls"),
+    (lambda: ji.pendulum_cradle([1.0, 1.0], -1.0, 0.1), r"`length`"),
+    (lambda: ji.pendulum_cradle([1.0, 1.0], 1.0, [0.1] * 3), r"`radius`"),
+    (lambda: ji.pendulum_cradle([1.0, 1.0], 1.0, 0.1, [0.1, 0.1]), r"`gaps`"),
+    (lambda: ji.pendulum_cradle([1.0, 1.0], 1.0, 0.1, angles=[0.0] * 3), r"`q`"),
+]
+MANY = ji.Scene(np.ones(402), np.eye(402)[:, ::2], tangents=np.eye(402)[:, 1::2])
+WELDED = ji.Scene([1.0] * 3, [[-1.0], [1.0], [0.0]], constraints=[[0.0], [-1.0], [1.0]])
+CALLS = [
+    (lambda: ji.history(ji.LZB(0.5), WELDED, [1.0, 0.0, 0.5]), "satisfy the bilateral constraints"),
+    (lambda: ji.impact(ji.LZB(0.9), BALLS, [1.0, 0.0]), r"`velocity` must have shape \(3,\)"),
+    (lambda: ji.impact(ji.LZB(0.9), BALLS, [1.0, 0, np.nan]), r"`velocity`.*nan at index 2"),
+    (lambda: ji.impact(ji.LZB([0.9] * 3), BALLS, V), r"`restitution` must have shape \(2,\)"),
+    (lambda: ji.impact(ji.LZB(0.9, exponent=(1.5,) * 3), BALLS, V), r"`exponent`.*\(2,\)"),
+    (lambda: ji.impact(ji.Poisson([0.5] * 3), BALLS, V), r"`restitution` must have shape \(2,\)"),
+    (lambda: ji.impact(ji.Moreau(np.eye(3)), BALLS, V), r"`restitution` must have shape \(2, 2\)"),
+    (
+        lambda: ji.impact(
+            ji.LZB(jnp.float32(0.9), jnp.float32(1.0), initial_energy=jnp.float32(0.0), rtol=1e-8),
+            ji.chain(jnp.ones(3, jnp.float32)),
+            jnp.array(V, jnp.float32),
+        ),
+        r"`rtol` must be at least 1\.9e-06 in float32, but has value 1e-08",
+    ),
+    (
+        lambda: ji.impact(ji.Compliant(ji.Hertz(1.0), rtol=1e-20), PAIR, [1.0, 0.0]),
+        r"`rtol` must be at least",
+    ),
+    (lambda: ji.impact(ji.Compliant(ji.Hertz([1.0, 1.0])), PAIR, [1.0, 0.0]), r"`stiffness`"),
+    (
+        lambda: ji.impact(ji.Compliant(ji.KelvinVoigt(1.0, [0.1, 0.2])), PAIR, [1.0, 0.0]),
+        r"`damping`",
+    ),
+    (
+        lambda: ji.impact(ji.LZB(0.9, friction=0.1), MANY, np.ones(402)),
+        r"`scene` must have at most 200 contacts .*, but has 201",
+    ),
+    (
+        lambda: ji.impact(ji.Compliant(ji.Hertz(1.0), friction=0.1), MANY, np.ones(402)),
+        r"`scene` must have at most 200 contacts .*, but has 201",
+    ),
+    (lambda: ji.LZB(0.9, friction=np.nan), r"`friction` must lie in \[0, inf\).*nan"),
+    (lambda: ji.Moreau(0.9, friction=[0.1, -0.1]), r"`friction`.*-0\.1 at index 1"),
+    (lambda: ji.impact(ji.LZB, BALLS, V), r"`law` must be of type Law"),
+    (lambda: ji.impact(ji.LZB(0.9), [1.0, 1.0, 1.0], V), r"`scene` must be of type Scene"),
+    (
+        lambda: ji.impact(ji.Newton(0.5), WELDED, [1.0, 0.0, 0.5]),
+        r"`velocity` must satisfy .*constraint 1 has the rate 0.5",
+    ),
+    (lambda: ji.impact(ji.Newton(0.5), BALLS, V, noise=-1.0), r"`noise` must lie in \[0, inf\)"),
+    (lambda: ji.impact(ji.Newton(0.5), BALLS, V, noise=np.nan), r"`noise`.*nan"),
+    (lambda: ji.impact(ji.Newton(0.5), BALLS, V, noise=[0.1, 0.1]), r"`noise` must have shape"),
+    (lambda: ji.impact(ji.Newton(0.5), BALLS, V, approach=-1.0), r"`approach`.*-1"),
+    (lambda: ji.impact(ji.Binary(0.5, (0, 1, 2)), BALLS, V), r"0 to 1"),
+    (lambda: ji.impact(ji.Binary(0.5, (0,)), BALLS, V), r"contact 1 is missing"),
+    (lambda: ji.impact(ji.Binary(0.5, (0, 0, 1)), BALLS, V), r"twice in a row"),
+    (
+        lambda: ji.impact(ji.RestitutionMatrix(jnp.eye(4)), BALLS, V),
+        r"shape \(2, 2\) or \(3, 3\) for 2 contacts",
+    ),
+    (lambda: ji.impact(ji.RestitutionMatrix(jnp.eye(3)), BALLS, V), r"must have tangents"),
+    (lambda: ji.history(ji.Newton(0.9), BALLS, V), r"`law`"),
+    (lambda: ji.history(ji.LZB(0.9), BALLS, V, samples=1), r"`samples`"),
+    (lambda: ji.fit(ji.LZB(0.9), BALLS, [V, V]), r"`experiments` must be of type Experiments"),
+    (
+        lambda: ji.simulate(ji.Newton(0.5), ji.ball_system(), [1.0], [0.0], 1.0),
+        r"`system` must be of type System",
+    ),
+    (lambda: ji.calibrate(ji.KelvinVoigt(1.0, 0.0), 0.01, 1.0, 1.0), r"`restitution`"),
+    (lambda: ji.calibrate(ji.KelvinVoigt(1.0, 0.0), 0.5, -1.0, 1.0), r"`mass`"),
+    (lambda: ji.calibrate(ji.UserForce(lambda x, rate, p: x), 0.5, 1.0, 1.0), r"`force`"),
+    (lambda: ji.measured_restitution(ji.Hertz(1.0), 1.0, 0.0), r"`speed`"),
+    (lambda: ji.hertz_stiffness(-1.0, 0.3, 1.0), r"`modulus"),
+    (lambda: ji.hertz_stiffness(1.0, 0.6, 1.0), r"`poisson"),
+    (lambda: ji.hertz_stiffness(1.0, 0.3, 1.0, radius2=0.0), r"`radius2"),
+    (lambda: ji.gap_scale(PAIR, ji.Newton(1.0), [1.0, 0.0]), r"`law`"),
+    (lambda: ji.gap_scale(PAIR, ji.LZB(1.0), [1.0]), r"`velocity`"),
+    (lambda: ji.crossover(PAIR, ji.Compliant(ji.Hertz(1.0)), [1.0, 0.0], [0.0]), r"two contacts"),
+    (lambda: ji.crossover(BALLS, ji.Compliant(ji.Hertz(1.0)), V, [[0.0]]), r"`offset`"),
+    (lambda: ji.theory.rocking_dispersion(0.0), r"`aspect`"),
+    (lambda: ji.theory.rocking_dispersion([[1.0]]), r"`aspect`.*one axis"),
+    (lambda: ji.theory.rocking_dispersion(1.0, friction=-0.1), r"`friction`"),
+    (lambda: ji.theory.rocking_dispersion(1.0, restitution=[0.5, 1.1]), r"`restitution`.*index 1"),
+    (lambda: ji.theory.rocking_dispersion(1.0, exponent=0.5), r"`exponent`"),
+    (lambda: ji.theory.critical_kinetic_angle(-0.1), r"`friction`"),
+    (lambda: ji.theory.search_critical_angle(0.1, 0.0), r"`restitution`.*0, 1"),
+    (lambda: ji.theory.rocking_matrix(1.5), r"must lie in"),
+    (lambda: ji.theory.housner_restitution(0.0), r"`aspect` must lie in"),
+    (lambda: ji.theory.newby_ratio(1), r"`n`"),
+    (lambda: ji.theory.newby_ratio(2.5), r"`n`"),
+    (lambda: ji.theory.restitution_inclusion([[1.0]], [[1.0]], 0.5, [1.0, 2.0]), r"`velocity`"),
+    (
+        lambda: ji.theory.restitution_inclusion([1.0], [[1.0]], 0.5, [1.0]),
+        r"`coupling` must be a matrix",
+    ),
+    (lambda: ji.theory.restitution_inclusion([[np.nan]], [[1.0]], 0.5, [1.0]), r"`coupling`"),
+]
+MOTIONS = [
+    ({"t_end": 0.0}, "`t_end` must be larger than `t_start` = 0"),
+    ({"t_end": np.nan}, "`t_end` must be finite"),
+    ({"q0": [-0.1]}, "no penetration"),
+    ({"q0": [np.nan]}, "`q0` must be finite"),
+    ({"q0": [[1.0]]}, r"`q0` must have shape \(n,\)"),
+    ({"v0": [0.0, 0.0]}, r"`v0` must have shape \(1,\)"),
+    ({"q0": [1.0, 2.0], "v0": [0.0, 0.0]}, r"`q0` must have shape \(1,\)"),
+    ({"samples": 1}, "`samples` must be an int >= 2"),
+    ({"max_events": 0}, "`max_events` must be an int >= 1"),
+    ({"method": "euler"}, "`method` must be one of"),
+    ({"method": "time_stepping"}, "`step` must be given"),
+    ({"rtol": 0.0}, r"`rtol` must lie in \(0"),
+    ({"friction": 0.3}, "needs a system with a `tangent_function`"),
+]
+SYSTEMS = [
+    (
+        lambda: ji.simulate(
+            ji.ball_system(base=lambda t: jnp.where(t < 0.5, 0.0, jnp.nan)),
+            ji.Newton(0.5),
+            [1.0],
+            [0.0],
+            1.0,
+        ),
+        r"finite base motion.* at t = 0\.5",
+    ),
+    (lambda: ji.System(lambda q: q, [1.0], base=lambda t: t), "`base_directions` must be given"),
+    (lambda: ji.System(lambda q: q, [[1.0, 2.0], [2.0, 1.0]]), "`mass` must be positive definite"),
+    (lambda: ji.System(None, [1.0]), "`gap_function` must be a function"),
+    (
+        lambda: ji.simulate(
+            ji.block_system(1.0, 1.0), ji.Moreau(0.5), [0, 1, 0], [0] * 3, 1.0, friction=-0.1
+        ),
+        "`friction` must lie in",
+    ),
+    (
+        lambda: ji.fit_motion(ji.ball_system(), ji.Newton(0.7), [1.0, 2.0], [1.0], [0.0], 1.0),
+        r"`measured` must have shape \(S, 1\)",
+    ),
+    (
+        lambda: ji.fit_motion(ji.ball_system(), ji.Newton(0.7), [[1.0]], [[1.0]], [[0.0]], 1.0),
+        r"`measured` must have shape \(1, S, 1\)",
+    ),
+    (
+        lambda: ji.fit_motion(ji.ball_system(), ji.Newton(0.7), [[1.0]], [[1.0]], [0.0], 1.0),
+        r"`v0` must have shape \(n,\), or \(K, n\)",
+    ),
+    (
+        lambda: ji.fit_motion(ji.ball_system(), ji.Newton(0.7), [[np.nan]], [1.0], [0.0], 1.0),
+        "at least one value",
+    ),
+    (
+        lambda: ji.fit_motion(
+            ji.ball_system(), ji.Newton(0.7), [[1.0]], [1.0], [0.0], 1.0, "stiffness"
+        ),
+        "must name parameters of Newton",
+    ),
+]
+
+
+@pytest.mark.parametrize(("call", "message"), [*LAWS, *SCENES, *CALLS, *SYSTEMS])
+def test_bad_input(call, message):
+    with pytest.raises((ValueError, TypeError), match=message) as error:
+        call()
+    text = str(error.value)
+    assert text.count("\n") == 0
+    assert "Array(" not in text
+    assert "Traced" not in text
+
+
+@jax.jit
+@jax.vmap
+def traced(velocity, noise, approach):
+    """Of an impact against two welded bodies."""
+    return ji.impact(ji.Newton(0.5), WELDED, velocity, noise, approach).status
+
+
+def test_what_the_host_refuses_has_a_status_inside_jit():
+    velocity = np.array([[1.0, 0, 0]] * 8)
+    velocity[0] = 1.0, 0.0, 0.5
+    velocity[1] = 1.0, 0.3, 0.3 + 1e-12  # within rounding
+    noise, approach = np.zeros(8), np.zeros(8)
+    noise[2:5] = approach[5:8] = -1e-9, np.nan, np.inf
+    wanted = ["out_of_range", "ok", *["out_of_range", "not_finite", "out_of_range"] * 2]
+    found = traced(velocity, noise, approach)
+    assert [ji.STATUS[code].name for code in found] == wanted
+
+
+@pytest.mark.parametrize(("change", "message"), MOTIONS)
+def test_bad_motions(change, message):
+    arguments = {"q0": [1.0], "v0": [0.0], "t_end": 1.0} | change
+    with pytest.raises(ValueError, match=message):
+        ji.simulate(ji.ball_system(), ji.Newton(0.5), **arguments)
+
+
+def test_python_numpy_and_jax_inputs_agree():
+    outs = [
+        ji.impact(ji.Moreau(kind([0.9, 0.8])), ji.chain(kind([1.0, 2.0, 3.0])), kind(V))
+        for kind in (list, np.array, jnp.array)
+    ]
+    ints = ji.impact(ji.Moreau([0.9, 0.8]), ji.chain([1, 2, 3]), [1, 0, 0])
+    for out in (*outs, ints):
+        np.testing.assert_allclose(out.velocity, outs[0].velocity, atol=1e-14)

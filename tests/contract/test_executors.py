@@ -1,0 +1,173 @@
+"""The same bits from every executor, from any number of devices, and when a worker dies."""
+
+import os
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jimpact as ji
+from jimpact import Binary, RandomLaw, Uniform, chain, monte_carlo
+
+BALLS = chain([0.25, 1.0, 0.25])
+
+
+def drawn_law():
+    return RandomLaw(Binary(1.0, order="earliest"), restitution=Uniform(0.8, 1.0))
+
+
+def run(executor, samples=1000, **options):
+    gaps = Uniform(0.0, 1e-5)
+    return monte_carlo(
+        drawn_law(), BALLS, [1.0, 0.0, -1.0], gaps, samples, chunk=128, executor=executor, **options
+    )
+
+
+def test_errors_of_a_chunk_come_through():
+    class Broken:
+        def run(self, plan, tasks):
+            for task in tasks:
+                if task.number == 2:
+                    raise ArithmeticError("chunk 2")
+                yield plan(task)
+
+    with pytest.raises(ArithmeticError, match="chunk 2"):
+        run(Broken())
+
+
+# A body in space on two contacts with friction, and in the plane.
+IN_SPACE = ji.Scene(
+    np.array([1.0, 1.0, 1.0, 0.2, 0.2, 0.2]),
+    np.array([[0, 0], [0, 0], [1, 1], [0.5, 0.5], [-0.5, 0.4], [0, 0.0]]),
+    np.array(
+        [
+            [1, 0, 1, 0],
+            [0, 1, 0, 1],
+            [0, 0, 0, 0],
+            [0, 0.5, 0, 0.5],
+            [-0.5, 0, -0.5, 0],
+            [0.5, 0.1, -0.4, 0.1],
+        ]
+    ),
+)
+
+
+IN_PLANE = ji.Scene(
+    np.array([1.0, 1.0, 0.1]),
+    np.array([[0, 0], [1, 1], [-0.5, 0.6]]),
+    np.array([[1, 1], [0, 0], [0.1, 0.1]]),
+)
+
+
+V_SPACE, V_PLANE = [0.6, 0.3, -1.0, 0.1, 0.2, 0.05], [0.5, -1.0, 0.3]
+
+
+V_BALLS = [1.0, 0.0, -0.8]
+
+
+SHARDED = {
+    "moreau": (ji.Moreau, BALLS, V_BALLS),
+    "poisson": (ji.Poisson, BALLS, V_BALLS),
+    "matrix": (lambda e: ji.RestitutionMatrix(e * jnp.eye(2)), BALLS, V_BALLS),
+    "binary": (Binary, BALLS, V_BALLS),
+    "velocity": (
+        lambda e: ji.VelocityDependent(ji.Moreau(e), speed_exponent=0.25),
+        BALLS,
+        V_BALLS,
+    ),
+    "lzb": (ji.LZB, BALLS, V_BALLS),
+    "compliant": (lambda e: ji.Compliant(ji.KelvinVoigt(1e4, e)), BALLS, V_BALLS),
+    "friction-moreau": (lambda e: ji.Moreau(e, friction=0.4), IN_SPACE, V_SPACE),
+    "friction-binary": (lambda e: Binary(e, friction=0.4), IN_PLANE, V_PLANE),
+    "friction-lzb": (lambda e: ji.LZB(e, friction=0.4, method="time"), IN_PLANE, V_PLANE),
+    "friction-implicit": (
+        lambda e: ji.LZB(e, friction=0.4, method="implicit"),
+        IN_SPACE,
+        V_SPACE,
+    ),
+}
+
+
+def sharded(name):
+    """Of a restitution and velocities (K, n) shared out among all devices: velocities after."""
+    make, scene, velocity = SHARDED[name]
+
+    def after(e, v):
+        return ji.impact(make(e), scene, v).velocity
+
+    velocities = jnp.outer(jnp.linspace(0.7, 1.3, 4), jnp.asarray(velocity))
+    return after, jnp.asarray(0.6), velocities
+
+
+def on_a_mesh(function, batch=(None, 0)):
+    """`function` of velocities shared out among all devices, and its sum over the devices.
+
+    The law is on all of them, or with `batch` (0, 0) shared out as well.
+    """
+    mesh, axis = jax.sharding.Mesh(np.array(jax.devices()), ("shot",)), jax.sharding.PartitionSpec
+    specs = tuple(axis() if first is None else axis("shot") for first in batch)
+
+    def part(parameter, velocities):
+        here = jax.vmap(function, batch)(parameter, velocities)
+        return here, jax.tree.map(lambda x: jax.lax.psum(x.sum(axis=0), "shot"), here)
+
+    return jax.shard_map(part, mesh=mesh, in_specs=specs, out_specs=(axis("shot"), axis()))
+
+
+@pytest.mark.parametrize("name", ["binary", "lzb", "friction-moreau", "friction-implicit"])
+def test_shard_map_takes_laws(name):
+    """With its default check of what varies among devices; nothing is compiled."""
+    after, e, velocities = sharded(name)
+    reverse = on_a_mesh(jax.jacrev(after, (0, 1)))
+    each, total = jax.eval_shape(reverse, e, velocities)
+    assert each[1].shape == (*velocities.shape, velocities.shape[1])
+    assert total[1].shape == each[1].shape[1:]
+    if name == "lzb":
+        jax.jit(on_a_mesh(after)).lower(e, velocities)
+
+
+ON_FOUR_DEVICES_SHARDED = """
+import sys
+import jax, jax.numpy as jnp, numpy as np
+jax.config.update("jax_enable_x64", True)
+sys.path[:0] = [sys.argv[1], sys.argv[1] + "/.."]
+from test_executors import SHARDED, on_a_mesh, sharded
+assert len(jax.devices()) == 4
+for name in sys.argv[2:] or SHARDED:
+    after, e, v = sharded(name)
+    def both(e, v):
+        return after(e, v), jax.jacfwd(after, (0, 1))(e, v), jax.jacrev(after, (0, 1))(e, v)
+    each = jnp.linspace(0.3, 0.9, 4)
+    got = jax.jit(on_a_mesh(both, (0, 0)))(each, v)[0]
+    alone = jax.jit(jax.vmap(both))(each, v)
+    # steps without events wait for each other, so they depend on those beside them
+    atol = 2e-3 if "implicit" in name else 1e-9
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=atol), got, alone)
+    # one law on all devices: its gradient is the sum over them
+    slope = jax.grad(lambda e: jnp.sum(on_a_mesh(after)(e, v)[1] ** 2))
+    wanted = jax.grad(lambda e: jnp.sum(jax.vmap(after, (None, 0))(e, v).sum(axis=0) ** 2))
+    np.testing.assert_allclose(jax.jit(slope)(e), jax.jit(wanted)(e), rtol=1e-9 + atol)
+"""
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(x, marks=pytest.mark.slow if x == "moreau" else pytest.mark.release)
+        for x in SHARDED
+    ],
+)
+def test_shard_map_on_four_devices(name):
+    """Values and derivatives in both modes are those of one device."""
+    flags = {"XLA_FLAGS": "--xla_force_host_platform_device_count=4"}
+    done = subprocess.run(
+        [sys.executable, "-c", ON_FOUR_DEVICES_SHARDED, os.path.dirname(__file__), name],
+        env=os.environ | flags,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,89 @@
+"""Motions with friction in space, event by event: closed forms and time stepping."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jimpact as ji
+
+BRICK = ji.Box([0.1, 0.06, 0.04], mass=0.5)
+
+
+SYSTEM, LAW = ji.System(BRICK, potential=ji.gravity(BRICK)), ji.Moreau(0.3, friction=0.4)
+
+
+def thrown(q0, v0, duration, **options):
+    return ji.simulate(SYSTEM, LAW, q0, v0, duration, samples=21, **options)
+
+
+@pytest.mark.release
+def test_derivatives_of_a_thrown_brick_agree_with_differences():
+    """Both modes, through impacts, accumulations and slip that turns until it ends; mu and e last."""
+    q0 = BRICK.at([0.0, 0.0, 0.1], [0.99, np.sqrt(1 - 0.99**2), 0.0, 0.0])
+    x, h = jnp.array([0.5, 0.2, 0, 1.0, 2.0, 5.0, 0.3, 0.2]), 1e-5
+
+    def place(x):
+        law = ji.Moreau(x[7], friction=x[6])
+        return ji.simulate(SYSTEM, law, q0, x[:6], 0.5, samples=3, max_events=40).q[-1]
+
+    slope = jax.jacfwd(place)(x)
+    central = [(place(x + h * e) - place(x - h * e)) / (2 * h) for e in jnp.eye(8)]
+    size = float(jnp.abs(slope).max())
+    np.testing.assert_allclose(slope, jnp.stack(central, axis=1), atol=1e-5 * size)
+    np.testing.assert_allclose(jax.grad(lambda x: place(x).sum())(x), slope.sum(axis=0), atol=1e-6)
+
+
+@pytest.mark.release
+def test_a_spinning_box_slides_as_by_time_stepping():
+    """Slip of four corners turns until all stop at once; the error falls with the step."""
+    q0, v0 = BRICK.touching(), np.array([0.5, 0.2, 0, 0, 0, 10.0])
+    motion = thrown(q0, v0, 0.6)
+    assert ji.STATUS[int(motion.status)].name == "ok"
+    np.testing.assert_allclose(motion.velocity[-1], 0, atol=1e-12)
+    np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-11)
+    wrong = [
+        np.abs(thrown(q0, v0, 0.6, method="time_stepping", step=h).q[-1] - motion.q[-1]).max()
+        for h in (1e-3, 1e-4)
+    ]
+    assert wrong[1] < 1e-4
+    assert wrong[1] < 0.3 * wrong[0]
+
+
+@pytest.mark.release
+def test_a_thrown_brick_comes_to_rest_on_a_face():
+    motion = thrown(
+        BRICK.at([0.0, 0.0, 0.3], [0.8, 0.6, 0.0, 0.0]), [0.5, 0.2, 0.0, 3.0, 12.0, 5.0], 0.6
+    )
+    assert ji.STATUS[int(motion.status)].name == "ok"
+    np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-11)
+    np.testing.assert_allclose(motion.velocity[-1], 0, atol=1e-10)
+    np.testing.assert_allclose(np.sort(np.asarray(motion.gaps[-1]))[:4], 0, atol=1e-12)
+    # the first impact is on one corner, at the time of free fall
+    assert int(motion.events.contacts[0].sum()) == 1
+    assert motion.events.tangential_impulse.shape[1] == 16
+
+
+@pytest.mark.release
+def test_a_coin_with_corners_is_thrown_and_comes_to_rest():
+    coin = ji.Coin(0.05, 0.01, mass=0.1, corners=6)
+    system = ji.System(coin, potential=ji.gravity(coin))
+    q0 = coin.at([0.0, 0.0, 0.2], [0.8, 0.6, 0.0, 0.0])
+    v0, law = [0.3, 0.1, 0.0, 5.0, 3.0, 20.0], ji.Moreau(0.0, friction=0.3)
+    motion = ji.simulate(system, law, q0, v0, 1.5, samples=31)
+    assert ji.STATUS[int(motion.status)].name == "ok"
+    assert (np.diff(motion.energy) <= 1e-12).all()
+    np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-10)
+    np.testing.assert_allclose(motion.velocity[-1], 0, atol=1e-9)
+    np.testing.assert_allclose(np.sort(np.asarray(motion.gaps[-1]))[:6], 0, atol=1e-12)
+
+
+def test_derivatives_at_no_displacement_take_two_terms():
+    q, v = BRICK.at([0.1, 0.2, 0.3], [0.8, 0.6, 0.0, 0.0]), jnp.arange(1.0, 7.0)
+
+    def rates(moved):
+        path = lambda s: BRICK.gap_function(moved(q, s * v))  # noqa: E731
+        once = lambda s: jax.jvp(path, (s,), (1.0,))[1]  # noqa: E731
+        return jnp.stack(jax.jvp(once, (0.0,), (1.0,)))
+
+    np.testing.assert_allclose(rates(BRICK.nearby), rates(BRICK.moved), rtol=1e-12, atol=1e-12)

@@ -1,0 +1,32 @@
+"""Contract tests know the package by its public names only."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import jimpact as ji
+
+PUBLIC = {
+    "jimpact": {*ji.__all__, "plot", "theory"},
+    "jimpact.plot": set(ji.plot.__all__),
+    "jimpact.theory": set(ji.theory.__all__),
+}
+FILES = sorted(Path(__file__).parent.glob("*.py"))
+
+
+def imported(tree):
+    """Pairs (module, name) of everything that a file imports."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom):
+            yield from ((node.module, alias.name) for alias in node.names)
+        elif isinstance(node, ast.Import):
+            yield from ((alias.name, None) for alias in node.names)
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_imports_are_public(path):
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    own = [x for x in imported(tree) if x[0].partition(".")[0] == "jimpact"]
+    private = [x for x in own if x[0] not in PUBLIC or x[1] not in {None, *PUBLIC[x[0]]}]
+    assert not private

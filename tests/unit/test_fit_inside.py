@@ -1,0 +1,203 @@
+"""Fits with a closed form, recovery of known parameters, honesty about what cannot be known."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from fit_cases import BALLS, PAIR, PRE_3, SHOTS, THREE, Coupled, simulated, two_thirds
+from scipy import optimize
+
+import jimpact as ji
+from jimpact.files.records import with_error
+from jimpact.fits import multistart
+from jimpact.fits.least_squares import SolverState
+from jimpact.fits.multistart import quiet
+from jimpact.fits.parameters import bounds_of, free_parameters
+from jimpact.fits.prediction import placed_fit
+from jimpact.fits.profiles import _Scans
+from jimpact.fits.saved import write_fit
+from jimpact.fits.scene_parameters import LawInScene
+from jimpact.fits.ties import tied
+
+
+def test_entries_are_named_as_in_the_report():
+    """`free` and `bounds` take the names that a fit prints: the same groups as with masks."""
+    law = ji.Newton([0.8, 0.7, 0.6])
+    named, _ = free_parameters(law, ("restitution[2]", "restitution[1=3]"))
+    assert named.names == ("restitution[1=3]", "restitution[2]")
+    assert named.groups == ((0, 2), (1,))
+    but_one, _ = free_parameters(law, {"restitution": True, "restitution[2]": False})
+    assert but_one.names == ("restitution[1]", "restitution[3]")
+    low, high = bounds_of(but_one, law, {"restitution[3]": (0.5, 0.9)})
+    np.testing.assert_array_equal([low, high], [[0.0, 0.5], [1.0, 0.9]])
+    matrix, _ = free_parameters(Coupled(jnp.eye(2)), "matrix[2,1]")
+    assert (matrix.names, matrix.groups) == (("matrix[2,1]",), ((2,),))
+    for free, message in (
+        ("restitution[4]", r"`free` must name entries that the field has.*of shape \(3,\)"),
+        ({"restitution[1]": 2}, "must map `restitution.1.` to True or False"),
+        ("friction[1]", "must name parameters of Newton"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            free_parameters(law, free)
+    with pytest.raises(ValueError, match="one value for all contacts"):
+        free_parameters(ji.Newton(0.8), "restitution[1]")
+
+
+def test_functions_cannot_be_saved(tmp_path):
+    observed = ji.FitProblem.from_observable(ji.Newton(0.9), lambda law: law.restitution, 0.5)
+    for problem, message in (
+        (observed, "must be to shots to be saved"),
+        (ji.FitProblem.from_shots(ji.Newton([0.5, 0.5]), BALLS, THREE, ties={"restitution[2]": two_thirds}), "must have no ties"),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=message):
+            write_fit(Saved(problem), tmp_path / "fit.json")
+
+
+class Saved:
+    """What `write_fit` looks at first."""
+
+    def __init__(self, problem):
+        self.problem, self.experiments = problem, problem.experiments
+
+
+def test_a_mass_with_a_prior_is_fitted_with_the_law():
+    """Against scipy on the closed form `v1 = (1 - e m) v / (1 + m)`, `v2 = (1 + e) v / (1 + m)`."""
+    heavier, speed, prior, sigma = 2.05, SHOTS[:, 0] - SHOTS[:, 1], (2.0, 0.05), 0.02
+    post = simulated(ji.Newton(0.6), ji.chain([1.0, heavier]), SHOTS, noise=sigma)
+    data = ji.Experiments(SHOTS, post, sigma)
+
+    def residual(x):
+        e, m = x
+        after = SHOTS[:, 1:] + np.array([1 - e * m, 1 + e]) * speed[:, None] / (1 + m)
+        return np.append((after - post) / sigma, (m - prior[0]) / prior[1])
+
+    best = optimize.least_squares(residual, [0.7, 2.0], jac="3-point", xtol=1e-12)
+    error = np.sqrt(np.diag(np.linalg.inv(best.jac.T @ best.jac)))
+    choice = {"free": ("restitution", "mass[2]"), "priors": {"mass[2]": prior}}
+    found = ji.fit(ji.Newton(0.9), PAIR, data, **choice)
+    np.testing.assert_allclose(found.value, best.x, rtol=1e-6)
+    np.testing.assert_allclose(found.standard_error, error, rtol=1e-5)
+    np.testing.assert_allclose(found.chi_squared, 2 * best.cost, rtol=1e-8)
+    np.testing.assert_allclose(found.scene.mass, [1.0, found.value[1]])
+    assert type(found.law) is type(found.problem.to_law(found.value)) is ji.Newton
+    law, scene = placed_fit(found, None)  # by which further shots are predicted
+    np.testing.assert_allclose(law.in_scene(scene).mass, found.scene.mass)
+    with pytest.raises(ValueError, match="`scene` must be left out"):
+        found.predict(SHOTS, BALLS)
+
+
+def test_parts_of_a_scene_move_it():
+    """A tilt of pi / 2 makes the tangent the normal; gaps and masses take the place of the old."""
+    wall = ji.Scene([1.0, 2.0, 0.5], [[0.0], [1.0], [0.2]], [[1.0], [0.0], [0.5]], gaps=[0.1])
+    parts = LawInScene(ji.Newton(0.5), mass=[3.0, 4.0, 5.0], gaps=[0.2], tilt=[np.pi / 2])
+    moved = parts.in_scene(wall)
+    np.testing.assert_allclose(moved.normals, wall.tangents, atol=1e-15)
+    np.testing.assert_allclose(moved.tangents, -wall.normals, atol=1e-15)
+    np.testing.assert_array_equal([*moved.gaps, *moved.mass], [0.2, 3.0, 4.0, 5.0])
+
+
+def test_ties_follow_and_pass_their_errors_on():
+    """e2 = 2/3 e1 by a tie, and by linear regression: v+ of Newton's law is linear in both."""
+    post = simulated(ji.Newton([0.9, 0.6]), BALLS, PRE_3, noise=0.01)
+    corners = [simulated(ji.Newton(e), BALLS, PRE_3) for e in ([0.0, 0.0], [0.9, 0.6])]
+    x, y = (corners[1] - corners[0]).ravel() / 0.9, (post - corners[0]).ravel()
+    data, ties = ji.Experiments(PRE_3, post, 0.01), {"restitution[2]": two_thirds}
+    found = ji.fit(ji.Newton([0.5, 0.5]), BALLS, data, ties=ties, starts=1)
+    e, error = x @ y / (x @ x), 0.01 / np.sqrt(x @ x)
+    assert found.names == ("restitution[1]",)
+    np.testing.assert_allclose(found.law.restitution, [e, e * 2 / 3], rtol=1e-9)
+    np.testing.assert_allclose(found.tied["restitution[2]"], [e * 2 / 3, error * 2 / 3], rtol=1e-6)
+    np.testing.assert_allclose(found.standard_error, [error], rtol=1e-6)
+    assert f"restitution[2] = {with_error(e * 2 / 3, error * 2 / 3)} is tied" in str(found)
+    further = found.predict(2 * PRE_3)
+    slope = 2 * x.reshape(PRE_3.shape)
+    np.testing.assert_allclose(further.standard_error, error * np.abs(slope), atol=1e-9)
+
+
+def test_ties_reach_across_fields_in_any_order():
+    law = ji.LZB([0.5, 0.5, 0.5], [1.0, 1.0, 1.0])
+    ties = (
+        ("stiffness[3]", lambda p: p["stiffness[2]"] + p["restitution"][1]),
+        ("stiffness[2]", lambda p: 2 * p["stiffness[1]"]),
+        ("restitution[2]", lambda p: p["restitution[1]"] / 2),
+    )
+    for order in (ties, ties[::-1]):
+        np.testing.assert_array_equal(tied(law, order).stiffness, [1.0, 2.0, 2.25])
+    chosen, _ = free_parameters(law, ("restitution", "stiffness"), ties=ties)
+    assert chosen.names == ("restitution[1]", "restitution[3]")  # stiffness[1]: only ratios matter
+
+
+def test_masks_groups_and_held_contacts():
+    truth = ji.LZB([0.9, 0.9], [3.0, 6.0])
+    data = ji.Experiments(PRE_3, simulated(truth, BALLS, PRE_3))
+    start = ji.LZB([0.8, 0.9], [3.0, 5.0])
+    tied = ji.fit(start, BALLS, data, {"restitution": [1, 1], "stiffness": True})
+    assert tied.names == ("restitution", "stiffness[2]")
+    np.testing.assert_allclose(tied.law.restitution, [0.9, 0.9], rtol=1e-6)
+    np.testing.assert_allclose(tied.law.stiffness, [3.0, 6.0], rtol=1e-6)
+    law = ji.Newton([0.5, 0.9])
+    data = ji.Experiments(PRE_3, simulated(ji.Newton([0.7, 0.9]), BALLS, PRE_3))
+    masked = ji.fit(law, BALLS, data, {"restitution": [True, False]})
+    assert masked.names == ("restitution[1]",)
+    np.testing.assert_allclose(masked.law.restitution, [0.7, 0.9], rtol=1e-9)
+
+
+def test_holes_that_a_scan_left_are_filled():
+    post = simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.02)
+    found = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post, 0.02))
+    scans = _Scans(found, [0], 0.95, quiet)
+    scans.scan(5, 2.0)
+    values, deviance = scans.deviance(0)
+    lost = values[np.flatnonzero(deviance < scans.limit)[1]]
+    scans.solved[0][lost] = (1e3, scans.solved[0][lost][1])
+    assert len(scans.profile(0).intervals) == 2
+    scans.finish(2.0)
+    np.testing.assert_allclose(scans.profile(0).intervals, found.intervals()[0:1][0], rtol=1e-5)
+
+
+def test_a_scan_finds_the_valleys_of_other_parameters_after_their_step():
+    """r = (cos(t) + u, u - .2): u follows by a step, so valleys of t are where cos t = -.2."""
+    t = np.linspace(-9.0, 9.0, multistart.SCANNED)
+    y, zero = np.stack([t, np.full_like(t, 5.0)], axis=1), np.zeros_like(t)  # u far from its value
+    residual = np.stack([np.cos(t) + 5.0, zero + 4.8], axis=1)
+    jacobian = np.stack([[-np.sin(t), zero], [zero + 1, zero + 1]], axis=2).transpose(1, 0, 2)
+    moved = 0.5 * (np.cos(t) + 9.8)  # Gauss-Newton in u
+    trial = y - np.stack([zero, moved], axis=1)
+    arrays = {"y": y, "trial": trial, "residual": residual, "jacobian": jacobian}
+    scan = SolverState(
+        **arrays, **dict.fromkeys(("aux", "cost", "gain", "memory", "steps", "done"))
+    )
+    own = np.arccos(-0.2)
+    found = multistart._turns(0, 2, scan, np.array([own, 0.2]))
+    expected = np.sort([s * own + 2 * np.pi * k for s in (-1, 1) for k in (-1, 0, 1)])
+    expected = expected[(np.abs(expected) < 9) & (expected != own)]
+    np.testing.assert_allclose(np.sort([at[0] for _, at in found]), expected, atol=0.02)
+    assert max(squares for squares, _ in found) < 1e-3
+
+
+@pytest.mark.parametrize(("share", "rivals", "expected"), [
+    (0.05, True, 8),  # far behind the best, and hardly gaining
+    (0.05, False, 40),  # a fit of its own
+    (0.2, True, 40),  # gains enough to catch up
+])  # fmt: skip
+def test_starts_far_behind_the_best_are_given_up_sooner(monkeypatch, share, rivals, expected):
+    """The first start is at its end with cost 1; the second, at 1e6, loses a share every 4 passes."""
+
+    def advanced(problems, states, method, limit, passes):
+        last = states.y[:, 0] == 0
+        cost = np.where(last, 1.0, (1 - share) * states.cost)
+        return replace(states, cost=cost, steps=states.steps + passes, done=last)
+
+    def begun(problems, points, method, limit):
+        count = len(points)
+        rest = dict.fromkeys(("residual", "jacobian", "aux", "gain", "trial", "memory"))
+        steps, done = np.zeros(count, int), np.zeros(count, bool)
+        return SolverState(y=points, cost=np.full(count, 1e6), steps=steps, done=done, **rest)
+
+    monkeypatch.setattr(multistart, "begin_all", begun)
+    monkeypatch.setattr(multistart, "advance_all", advanced)
+    problem = ji.FitProblem.from_shots(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, SHOTS[:, ::-1]))
+    problems, points = multistart.repeated(problem.residuals, 2), np.array([[0.0], [1.0]])
+    states = multistart.run(problems, points, "levenberg-marquardt", 40, quiet, rivals=rivals)
+    assert states.steps[1] == expected

@@ -1,0 +1,28 @@
+"""Chains of so many bodies that a look ahead tells whether they come to rest together."""
+
+import jax
+import jax.numpy as jnp
+
+import jimpact as ji
+from jimpact.contact import contact_of
+from jimpact.events.impact_dynamics import flow_of
+from jimpact.events.look_ahead import comes_to_rest
+
+ROW = 12  # balls in a row: more contacts than return as multiples of themselves
+
+
+def test_a_look_ahead_concludes_nothing_without_a_margin():
+    """Before the first impact one contact holds all that it has to carry: 12 balls at e = .5 end as
+    a block, but this is not known yet. At rest, all but 1e-12 of the velocity, it is."""
+    scene, m = ji.chain([1.0] * ROW), ROW - 1
+    contact = contact_of(scene, jnp.zeros(ROW).at[0].set(1.0))
+    dynamics = ji.LZB(0.5).dynamics(contact)
+    flow, modes, y = flow_of(jax.tree.map(lambda x: x[..., None], dynamics.problem), 1.5, "chain")
+    every, asked = jnp.ones((m, 1), bool), jnp.ones((1, 1), bool)
+    part = (jnp.arange(ROW - 1.0, 0.0, -1.0) / ROW)[:, None]  # p_j in the limit, by momentum
+    share = 2 * part  # in units of Q / sqrt(W_jj), of the inverse mass of both balls
+    look = jax.jit(comes_to_rest)
+    assert not look(flow, modes, y, every, share, asked)
+    slow = y.at[m : 2 * m].set(1e-12 * y[m : 2 * m])
+    assert look(flow, modes, slow, every, 1e-12 * share, asked)
+    assert not look(flow, modes, slow, every & False, 0 * share, asked)
