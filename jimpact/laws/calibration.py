@@ -117,6 +117,7 @@ def _integrated(force: Force, mass: jax.Array, speed: jax.Array) -> jax.Array:
 def _damping(force: Force, mass: jax.Array, speed: jax.Array, e: jax.Array) -> jax.Array:
     """The damping with which one pair has the restitution e, all arguments scalars."""
     unit = force.damping_scale(mass, speed)
+    assert unit is not None  # `calibrate` has looked
 
     def excess(s: jax.Array) -> jax.Array:
         """e less that of the damping `unit s / (1 - s)`: from 0 on, s from 0 to 1."""

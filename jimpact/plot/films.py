@@ -217,7 +217,7 @@ def _write(film: _Film, path: Path, advance: Callable[[int], None]) -> None:
     frames = FuncAnimation(figure, draw, frames=len(film.time))
     if path.suffix == ".html":
         with rc_context({"animation.embed_limit": _LARGEST_PAGE}):
-            path.write_text(frames.to_jshtml(fps=film.rate), encoding="utf-8")
+            path.write_text(frames.to_jshtml(fps=round(film.rate)), encoding="utf-8")
         advance(len(film.time))
         return
     kind: Any = PillowWriter if path.suffix == ".gif" else FFMpegWriter  # both take fractions
