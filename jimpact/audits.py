@@ -9,7 +9,7 @@ import numpy as np
 
 from jimpact.compiling import full_precision
 from jimpact.contact import contact_of
-from jimpact.impacts import Impact
+from jimpact.impacts import Impact, judged_beyond
 from jimpact.scene import Scene, as_velocity, gap_velocity, kinetic_energy, momentum
 from jimpact.solvers.tridiagonal import diagonal
 from jimpact.status import STATUS, sign_tolerance
@@ -100,12 +100,12 @@ def audit(scene: Scene, velocity: Any, out: Impact) -> Audit:
     worst_impulse = jnp.min(out.impulse * root) / size
     gain = (change - out.initial_energy) / size**2
     off = jnp.abs(residual).max() / jnp.maximum(jnp.abs(momentum(scene, v)).max(), 1e-300)
-    tolerance = sign_tolerance(out.velocity.dtype)
+    tolerance = judged_beyond(out.velocity.dtype, jnp.asarray(out.accuracy))
     return Audit(
         kinematic=worst_gap_velocity >= -tolerance,
         kinetic=worst_impulse >= -tolerance,
         energetic=gain <= tolerance,
-        momentum=off <= tolerance,
+        momentum=off <= sign_tolerance(out.velocity.dtype),
         worst_gap_velocity=worst_gap_velocity,
         worst_impulse=worst_impulse,
         energy_gain=gain,
@@ -120,7 +120,10 @@ def nothing_approaches(scene: Scene, velocity: Any) -> str | None:
     if (approaches & np.asarray(scene.closed)).any():
         return None
     if approaches.any():
-        return "no closed contact approaches (gamma- < 0), only open ones do: few laws use these"
+        return (
+            "no closed contact approaches (gamma- < 0), only open ones do: laws that use gaps are "
+            "Compliant and Binary"
+        )
     return "nothing approaches (gamma- < 0 at no contact): is the sign of the velocities as meant?"
 
 

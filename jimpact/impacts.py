@@ -1,6 +1,7 @@
 """`impact`: the one place that turns a law's impulses into velocities, energy and status."""
 
 import dataclasses
+import warnings
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -50,7 +51,8 @@ class Impact(eqx.Module):
 
     `velocity` v+ (n,) [m/s]; `impulse` p (m,) [N s]; `tangential_impulse` (t,), t = 0 without
     friction [N s]; `energy_change` T+ - T- () [J]; `initial_energy` stored before () [J]; `status`
-    () int32, a row of `jimpact.STATUS`, 0 = ok.
+    () int32, a row of `jimpact.STATUS`, 0 = ok; `accuracy` (), the error of v+ that the law allows
+    itself, relative to the size of the impact.
     """
 
     velocity: jax.Array
@@ -59,6 +61,7 @@ class Impact(eqx.Module):
     energy_change: jax.Array
     initial_energy: jax.Array
     status: jax.Array
+    accuracy: jax.Array | float = 0.0
 
 
 @full_precision
@@ -95,6 +98,7 @@ def impact(
             positive, a negative gap, `noise` or `approach`, a velocity that breaks a bilateral
             constraint). An energy of the impact, `sum gamma-^2 / W_jj`, that the floating type
             takes for 0 or infinite is `out_of_range` on the host, too: choose other units.
+            Warns where only open contacts approach and the law leaves those out.
 
     >>> import jimpact as ji
     >>> out = ji.impact(ji.LZB(0.9, stiffness=1.0, exponent=1.5), ji.chain([1, 1, 1]), [1, 0, 0])
@@ -116,6 +120,7 @@ def impact(
         None if noise is None else jnp.asarray(noise, v.dtype),
         None if approach is None else jnp.asarray(approach, v.dtype),
     )
+    _warn_of_unused_gaps(law, scene, v)
     separable = is_separable(law)
     groups = coupled_groups(scene) if separable else None
     few = scene.contacts <= SHARED and scene.walls != (True, True) and scene.tangents is None
@@ -123,6 +128,20 @@ def impact(
     if pads and not is_traced((law, scene, v, offsets)) and is_top_level_call():
         return _impact_of_padded_scene(law, scene, v, offsets)
     return _impact(law, scene, v, groups, offsets, Traced.of(law, scene, v, offsets))
+
+
+def _warn_of_unused_gaps(law: Law, scene: Scene, v: jax.Array) -> None:
+    """Warn where only open contacts approach, and the law leaves these out."""
+    if scene.gaps is None or law.uses_gaps or is_traced((scene, v)):
+        return
+    approaches = np.asarray(scene.normals).T @ np.asarray(v) < 0
+    closed = np.asarray(scene.gaps) == 0
+    if approaches.any() and not (approaches & closed).any() and not np.any(law.stored):
+        warnings.warn(
+            f"Nothing happens: only open contacts (gap > 0) approach, and {type(law).__name__} "
+            "leaves them out. Laws that use gaps are Compliant and Binary.",
+            stacklevel=3,
+        )
 
 
 class _Offsets(NamedTuple):
@@ -252,7 +271,7 @@ def _impact(
     finite = jnp.all(jnp.isfinite(v_plus)) & jnp.all(jnp.isfinite(p)) & jnp.isfinite(change)
     size = jnp.where(happens, outcome.size, 1.0)
     code = traced.status((law, scene, v, offsets), code, size, finite)
-    return Impact(v_plus, p, tangential, change, total, code)
+    return Impact(v_plus, p, tangential, change, total, code, outcome.accuracy)
 
 
 def _has_scale(size: jax.Array, v: jax.Array) -> jax.Array:
@@ -273,6 +292,12 @@ class _Resolved(NamedTuple):
     status: jax.Array
     size: jax.Array  # () of the impact, square root of an energy
     noise: jax.Array  # () energy that the rounding of v- and the law's accuracy leave unknown
+    accuracy: jax.Array  # () see `Impact`
+
+
+def judged_beyond(dtype: Any, accuracy: Any) -> Any:
+    """Part of the impact's size beyond which signs and gains of energy are violated."""
+    return jnp.maximum(sign_tolerance(dtype), ACCURACIES * accuracy)
 
 
 def _resolved(law: Law, contact: Contact, happens: jax.Array) -> _Resolved:
@@ -287,12 +312,13 @@ def _resolved(law: Law, contact: Contact, happens: jax.Array) -> _Resolved:
     if impulses.tangential is not None:
         rows = jnp.repeat(part, contact.tangents)
         tangential = jnp.where(rows, impulses.tangential, 0.0)
-    tolerance = max(sign_tolerance(p.dtype), ACCURACIES * law.accuracy(contact))
+    accuracy = law.accuracy(contact)
+    tolerance = judged_beyond(p.dtype, accuracy)
     signs = _signs(contact, p, tangential, tolerance * contact.size)
     code = jnp.maximum(impulses.status, signs)
     code = jnp.where(happens, code, CODE["ok"])
     noise = jnp.sum(contact.noise * jnp.abs(p)) + tolerance * contact.size**2
-    return _Resolved(p, tangential, code, contact.size, noise)
+    return _Resolved(p, tangential, code, contact.size, noise, jnp.asarray(accuracy, p.dtype))
 
 
 def _in_groups(
@@ -312,6 +338,7 @@ def _in_groups(
     each = 0 if scene.tangents is None else scene.tangents.shape[1] // m
     tangential = jnp.zeros((m, each), v.dtype)
     code, square, noise = jnp.asarray(CODE["ok"]), jnp.zeros((), v.dtype), jnp.zeros((), v.dtype)
+    accuracy = jnp.zeros((), v.dtype)
     for padded, contacts, acts in zip(groups, batches, active):
         index = jnp.asarray(padded % m)
         acts = happens & (acts | law.pulls)
@@ -331,7 +358,8 @@ def _in_groups(
         tangential = tangential.at[at].set(rows, mode="drop")
         code = jnp.maximum(code, jnp.max(part.status))
         square, noise = square + jnp.sum(part.size**2), noise + jnp.sum(part.noise)
-    outcome = _Resolved(p, tangential.reshape(-1), code, jnp.sqrt(square), noise)
+        accuracy = jnp.maximum(accuracy, jnp.max(part.accuracy))
+    outcome = _Resolved(p, tangential.reshape(-1), code, jnp.sqrt(square), noise, accuracy)
     return outcome, happens, stored
 
 

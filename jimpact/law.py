@@ -2,6 +2,7 @@
 
 import abc
 import dataclasses
+import inspect
 import operator
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, NamedTuple, TypeVar, get_args, overload
@@ -246,7 +247,27 @@ def _field(declared: Domain | Option, default: Any, kw_only: bool, static: bool)
     )
 
 
-class Declared(eqx.Module):
+class _Signed(type(eqx.Module)):  # type: ignore[misc]
+    """The metaclass of equinox; calls that do not fit a class are told what it takes."""
+
+    def __call__(cls, *args: Any, **kwargs: Any) -> Any:
+        """An instance."""
+        try:
+            return super().__call__(*args, **kwargs)
+        except TypeError:
+            taken = inspect.signature(cls)
+            try:
+                taken.bind(*args, **kwargs)
+            except TypeError as why:
+                names = ", ".join(
+                    f"`{name}`" if x.default is x.empty else f"`{name}` = {x.default!r}"
+                    for name, x in taken.parameters.items()
+                )
+                raise TypeError(f"{cls.__name__} takes {names}: {why}.") from None
+            raise
+
+
+class Declared(eqx.Module, metaclass=_Signed):
     """A module whose fields are parameters and options: laws, contact forces."""
 
     def __init_subclass__(cls, **options: Any) -> None:

@@ -134,7 +134,7 @@ MUTATIONS = [
     Mutation("no convex problem for fast expansions", "ImplicitSteps.normal_impulses", "unloading > 0", "unloading > jnp.inf", ("test_implicit.py",)),
     Mutation("free flight ends late", "ImplicitSteps.coasted", "wait * self.omega", "1.01 * wait * self.omega", ("test_implicit.py",)),
     Mutation("unloading forgotten", "StepProblem.projected", "self.unloading * tried[:m]", "0 * tried[:m]", ("test_implicit.py",)),
-    Mutation("signs judged finer than the law's accuracy", "_resolved", "ACCURACIES * law.accuracy(contact)", "0.0", ("test_implicit.py",)),
+    Mutation("signs judged finer than the law's accuracy", "judged_beyond", "ACCURACIES * accuracy", "0.0", ("test_friction_reports.py::test_what_rtol_allows_is_no_gain_of_energy",)),
     Mutation("vertical and horizontal bases exchanged", "HarmonicBase.__call__", "self.direction == 'vertical'", "self.direction == 'horizontal'", ("test_documents.py::test_docstrings_run[jimpact.motion.system]",)),
     Mutation("dispersion over the sum, not the mean", "energy_dispersion", "deviation / mean", "deviation / jnp.sum(share)", ("test_methods.py::test_energy_kept_and_its_dispersion",)),
     Mutation("integral of a history without its correction", "_integral", "step ** 2", "0 * step ** 2", ("test_compliant.py::test_history_of_one_ball_on_a_linear_spring",)),

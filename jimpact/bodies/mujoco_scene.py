@@ -34,6 +34,13 @@ _DRIFT = 1e-2
 # have gaps of 1e-17 m. Ten times more closes gaps of 10 nm in a model of a metre.
 _TOUCHING = 1e-9
 
+# MuJoCo's names of constraints that are no contacts of geoms, of their objects; words for them.
+_EQUALITIES = "mjCNSTR_EQUALITY"
+_LIMITS = (
+    ("mjCNSTR_LIMIT_JOINT", "mjOBJ_JOINT", "joint"),
+    ("mjCNSTR_LIMIT_TENDON", "mjOBJ_TENDON", "tendon"),
+)
+
 _LEFT_OUT = (2, 3)  # `contact.exclude`: a contact of bodies that are one, or that cannot move
 
 
@@ -48,7 +55,7 @@ class MujocoScene(NamedTuple):
         velocity: v (n,), `data.qvel` [m/s, rad/s], that obeys the constraints of the scene.
         friction: mu (m,), sliding friction of each contact; None where the scene has no tangents.
         names: the two geoms of each contact, as in "floor, box"; its normal points from the
-            first one to the second one.
+            first one to the second one. Then "limit of joint knee" of each limit that is reached.
 
     >>> import jimpact as ji
     >>> world = ji.MujocoScene(ji.chain([1.0, 1.0]), [1.0, 0.0], None, ("left, right",))
@@ -71,9 +78,9 @@ def from_mujoco(model: Any, data: Any, margin: float = 0.0) -> MujocoScene:
     need not have been called; a positive distance is a gap, a negative one is taken for 0, as is
     what rounding leaves of bodies that touch. `solref` and `solimp` play no part: the impact law
     decides. Equality constraints of the model are bilateral constraints of the scene; those that
-    repeat others are left out. Where each contact slides in one direction (a planar model) the
-    scene is planar, where none does it has no tangents. `data.qvel[:] = out.velocity` is the way
-    back.
+    repeat others are left out. Limits of joints and tendons are contacts that do not slide. Where
+    each contact slides in one direction (a planar model) the scene is planar, where none does it
+    has no tangents. `data.qvel[:] = out.velocity` is the way back.
 
     Args:
         model: `mujoco.MjModel` with n velocities, of any MJCF or URDF.
@@ -89,10 +96,9 @@ def from_mujoco(model: Any, data: Any, margin: float = 0.0) -> MujocoScene:
         TypeError: not a model and its data.
         ValueError: data of another model, a negative margin, no contact, a deformable body.
             Warnings name bodies that overlap, unequal, torsional or rolling friction that is left
-            out, a joint or tendon at its limit (not a contact of the scene), and a velocity that
-            breaks constraints.
+            out, and a velocity that breaks constraints.
 
-    Limits: contacts of flexible bodies, limits of joints, adhesion.
+    Limits: contacts of flexible bodies, adhesion.
 
     Source: Todorov, Erez & Tassa (2012), IROS, 5026-5033; MuJoCo documentation, Computation.
 
@@ -128,30 +134,42 @@ def from_mujoco(model: Any, data: Any, margin: float = 0.0) -> MujocoScene:
     model, data = copy.copy(model), copy.copy(data)
     model.geom_margin += margin + touching
     model.pair_margin += margin + touching
+    for margins in (model.jnt_margin, model.tendon_margin):
+        margins += margin + touching
     mujoco.mj_fwdPosition(model, data)
     mass = _mass(mujoco, model, data)
     root = np.linalg.cholesky(mass)
     contacts, jacobians = _contacts(mujoco, model, data)
+    limits, ends, distances = _limits(mujoco, model, data)
+    if not contacts and not limits:
+        raise ValueError(
+            "Argument `data` must have a contact that can move, but has none: no geoms touch at "
+            "data.qpos. Argument `margin` finds contacts before they close."
+        )
     names = tuple(
         f"{_geom_name(mujoco, model, c.geom[0])}, {_geom_name(mujoco, model, c.geom[1])}"
         for c in contacts
     )
     _warn_of_overlap(model, contacts, names)
-    _warn_of_limits(mujoco, model, data)
-    constraints = _independent(root, _equalities(mujoco, model, data))
-    gaps = np.array([c.dist if c.dist > touching else 0.0 for c in contacts])
+    jacobians = np.concatenate([jacobians, np.pad(ends[:, None], ((0, 0), (0, 2), (0, 0)))])
+    constraints = _independent(root, _rows_of(mujoco, model, data, _EQUALITIES)[1].T)
+    gaps = np.concatenate([[c.dist for c in contacts], distances])
+    gaps = np.where(gaps > touching, gaps, 0.0)
     tangents = _tangents(root, jacobians[:, 1:])
-    friction = None if tangents is None else jnp.asarray(_friction(contacts, names))
+    sliding = np.pad(_friction(contacts, names), (0, len(limits)))
+    friction = None if tangents is None else jnp.asarray(sliding)
     diagonal = np.diag(mass)
-    scene = Scene(
-        mass=diagonal if np.array_equal(mass, np.diag(diagonal)) else mass,
-        normals=jacobians[:, 0].T,
-        tangents=tangents,
-        gaps=gaps if gaps.any() else None,
-        constraints=constraints if constraints.size else None,
-    )
+    with warnings.catch_warnings():  # tangents of 0, where nothing slides, are meant
+        warnings.filterwarnings("ignore", "The normal and tangents of contact")
+        scene = Scene(
+            mass=diagonal if np.array_equal(mass, np.diag(diagonal)) else mass,
+            normals=jacobians[:, 0].T,
+            tangents=tangents,
+            gaps=gaps if gaps.any() else None,
+            constraints=constraints if constraints.size else None,
+        )
     velocity = jnp.asarray(_admissible(root, constraints, np.array(data.qvel)))
-    return MujocoScene(scene, velocity, friction, names)
+    return MujocoScene(scene, velocity, friction, names + limits)
 
 
 def _mass(mujoco: ModuleType, model: Any, data: Any) -> np.ndarray:
@@ -166,7 +184,8 @@ def _mass(mujoco: ModuleType, model: Any, data: Any) -> np.ndarray:
 def _contacts(mujoco: ModuleType, model: Any, data: Any) -> tuple[list[Any], np.ndarray]:
     """The contacts, and for each the velocities n, t1, t2 of its second body as seen from the first
     one, by qvel: (m, 3, n)."""
-    contacts, jacobians = [], []
+    contacts: list[Any] = []
+    jacobians = [np.zeros((0, 3, model.nv))]
     for contact in data.contact:
         if contact.exclude in _LEFT_OUT:
             continue
@@ -179,13 +198,8 @@ def _contacts(mujoco: ModuleType, model: Any, data: Any) -> tuple[list[Any], np.
         jacobian = contact.frame.reshape(3, 3) @ (second - first)
         if jacobian[0].any():
             contacts.append(contact)
-            jacobians.append(jacobian)
-    if not contacts:
-        raise ValueError(
-            "Argument `data` must have a contact that can move, but has none: no geoms touch at "
-            "data.qpos. Argument `margin` finds contacts before they close."
-        )
-    return contacts, np.stack(jacobians)
+            jacobians.append(jacobian[None])
+    return contacts, np.concatenate(jacobians)
 
 
 def _point_jacobian(
@@ -214,34 +228,56 @@ def _tangents(root: np.ndarray, jacobians: np.ndarray) -> np.ndarray | None:
 
 
 def _friction(contacts: list[Any], names: tuple[str, ...]) -> np.ndarray:
-    """mu (m,), with a warning for what sliding friction leaves out."""
+    """mu (m,), with one warning for each thing that sliding friction leaves out."""
+    unequal, turning = [], []
     for contact, name in zip(contacts, names):
-        first, second, *turning = contact.friction
+        first, second, *others = contact.friction
         if contact.dim > 1 and first != second:
-            warnings.warn(
-                f"Contact {name!r} has friction {first:g} and {second:g} in two directions; "
-                "the first one is taken for both.",
-                stacklevel=3,
-            )
-        if contact.dim > 3 and any(turning):
-            warnings.warn(
-                f"Contact {name!r} has torsional or rolling friction, which is left out.",
-                stacklevel=3,
-            )
+            unequal.append(f"{name!r}: {first:g} and {second:g}")
+        if contact.dim > 3 and any(others):
+            turning.append(repr(name))
+    if unequal:
+        warnings.warn(
+            "Friction differs in two directions, and the first one is taken for both, at "
+            f"{_in_words(unequal)}.",
+            stacklevel=3,
+        )
+    if turning:
+        warnings.warn(
+            f"Torsional or rolling friction is left out at {_in_words(turning)}.", stacklevel=3
+        )
     return np.array([c.friction[0] if c.dim > 1 else 0.0 for c in contacts])
 
 
-def _equalities(mujoco: ModuleType, model: Any, data: Any) -> np.ndarray:
-    """The gradients (n, c) of the model's active equality constraints."""
-    rows = np.flatnonzero(data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY)
-    gradients = np.zeros((model.nv, rows.size))
+def _rows_of(mujoco: ModuleType, model: Any, data: Any, kind: str) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers (c,) of the model's active constraints of a kind, and their gradients (c, n)."""
+    rows = np.flatnonzero(data.efc_type == getattr(mujoco.mjtConstraint, kind))
+    gradients = np.zeros((rows.size, model.nv))
     if not mujoco.mj_isSparse(model):
-        gradients[:] = data.efc_J.reshape(-1, model.nv)[rows].T
-        return gradients
-    for column, row in enumerate(rows):
+        gradients[:] = data.efc_J.reshape(-1, model.nv)[rows]
+        return rows, gradients
+    for gradient, row in zip(gradients, rows):
         entries = slice(data.efc_J_rowadr[row], data.efc_J_rowadr[row] + data.efc_J_rownnz[row])
-        gradients[data.efc_J_colind[entries], column] = data.efc_J[entries]
-    return gradients
+        gradient[data.efc_J_colind[entries]] = data.efc_J[entries]
+    return rows, gradients
+
+
+def _limits(
+    mujoco: ModuleType, model: Any, data: Any
+) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
+    """Names of the joints and tendons at their limits, the gradients (c, n) of the distances to
+    these, and the distances (c,) [rad, m]."""
+    names: list[str] = []
+    gradients, distances = [np.zeros((0, model.nv))], [np.zeros(0)]
+    for kind, of, word in _LIMITS:
+        rows, ends = _rows_of(mujoco, model, data, kind)
+        for row in rows:
+            number = int(data.efc_id[row])
+            name = mujoco.mj_id2name(model, getattr(mujoco.mjtObj, of), number) or number
+            names.append(f"limit of {word} {name}")
+        gradients.append(ends)
+        distances.append(data.efc_pos[rows])
+    return tuple(names), np.concatenate(gradients), np.concatenate(distances)
 
 
 def _independent(root: np.ndarray, gradients: np.ndarray) -> np.ndarray:
@@ -276,26 +312,18 @@ def _geom_name(mujoco: ModuleType, model: Any, geom: int) -> str:
 
 def _warn_of_overlap(model: Any, contacts: list[Any], names: tuple[str, ...]) -> None:
     """Warn of bodies that are deep in each other: their contact points are arbitrary."""
+    deep = []
     for contact, name in zip(contacts, names):
         radii = [r for r in model.geom_rbound[contact.geom] if r > 0]  # a plane's is 0
         if radii and -contact.dist > _DEEP * min(radii):
-            warnings.warn(
-                f"Contact {name!r} overlaps by {-contact.dist:.3g} m; its point and normal mean "
-                "little there.",
-                stacklevel=3,
-            )
+            deep.append(f"{name!r} by {-contact.dist:.3g} m")
+    if deep:
+        warnings.warn(
+            f"Bodies overlap, where points and normals mean little: {_in_words(deep)}.",
+            stacklevel=3,
+        )
 
 
-def _warn_of_limits(mujoco: ModuleType, model: Any, data: Any) -> None:
-    """Warn of joints and tendons at their limits, where an impact would push them further."""
-    kinds = (
-        (mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT, mujoco.mjtObj.mjOBJ_JOINT, "Joint"),
-        (mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON, mujoco.mjtObj.mjOBJ_TENDON, "Tendon"),
-    )
-    for kind, of, word in kinds:
-        for number in data.efc_id[data.efc_type == kind]:
-            name = mujoco.mj_id2name(model, of, int(number)) or int(number)
-            warnings.warn(
-                f"{word} {name!r} is at its limit, which is not a contact of the scene.",
-                stacklevel=3,
-            )
+def _in_words(places: list[str]) -> str:
+    """The places without repetition, one after the other."""
+    return "; ".join(dict.fromkeys(places))

@@ -56,10 +56,9 @@ IMPLICIT_TIGHTENING = 0.1  # the same of method 'implicit', whose steps cost mor
 # add up, so the tolerance falls with their number. Ten times more: it begins to fall too late.
 WIDE_SPREAD = 5.0
 METHODS = ("auto", "time", "implicit", "impulse")
-# Contacts with friction in space up to which 'auto' is 'time' at tolerances of FINE or more, and
-# below. More of them change between stick and slip thousands of times, one after the other. Ten
-# times more: some impacts do not end. A tolerance ten times finer: 'implicit' takes 1000 steps.
-EXACT_CONTACTS, EXACT_CONTACTS_FINE, FINE = 1, 4, 1e-6
+# Contacts with friction in space up to which 'auto' is 'time'. More of them change between stick
+# and slip thousands of times, one after the other: already of two, some impacts do not end.
+EXACT_CONTACTS = 1
 # Tolerance of the second run that shows how well an outcome is conditioned, as a multiple of that
 # of the first one: FINER, or APART coarser where the precision allows none so fine. Ten times more:
 # runs that differ too little, or the error of a coarse one.
@@ -386,13 +385,12 @@ class ImplicitProgram(ImpulseProgram):
         return code.astype(jnp.int32)
 
 
-def method_for(method: str, contact: Contact, rtol: float | None) -> str:
-    """What 'auto' stands for at these contacts and this tolerance; another method is itself."""
+def method_for(method: str, contact: Contact, friction: bool) -> str:
+    """What 'auto' stands for at these contacts; another method is itself."""
     if method != "auto":
         return method
-    fine = rtol is not None and rtol < FINE
-    exact = EXACT_CONTACTS_FINE if fine else EXACT_CONTACTS
-    return "implicit" if contact.tangents == 2 and contact.contacts > exact else "time"
+    in_space = friction and contact.tangents == 2
+    return "implicit" if in_space and contact.contacts > EXACT_CONTACTS else "time"
 
 
 class Dynamics(NamedTuple):

@@ -234,6 +234,7 @@ class ImplicitSteps:
         x = jnp.where(opened, -h / 2 * self.omega * after if self.gapped else 0.0, x)
         loss = self.lost(s.indentation, jnp.where(stiff, s.indentation, half), x, after)
         loss = loss + left + self.dropped(load, opened, gamma, after)
+        loss = loss + self.slackened(s.indentation, x, gamma, after, h)
         # no tangents: where nothing is stored, the slope of a root would be infinite
         loss = jax.lax.stop_gradient(loss)
         return ImplicitState(x, velocity, rate, s.impulse + impulse, s.time + h), loss
@@ -246,6 +247,9 @@ class ImplicitSteps:
         m, inner = self.contacts, INNER * self.tolerance
         gamma = s.velocity[:m]
         half, load, unloading = middle
+        if self.viscous is not None:  # about the force in the middle, with friction as it was
+            middle_gamma = gamma + self.coupling.times(self.guess(s.rate, load))[:m] / 2
+            load = h * self.force_of(half, middle_gamma)
         # first stage of friction; the normal rows are those at the end of the step
         ahead = jnp.concatenate([gamma, s.velocity[m:] / PART])
         stage = self.problem(ahead, load, unloading, self.friction)
@@ -341,6 +345,19 @@ class ImplicitSteps:
         turns = opened & (before < 0)
         part = -before / jnp.where(turns, after - before, 1.0)
         return jnp.max(jnp.where(turns, part * load, 0.0), axis=0, keepdims=True)
+
+    def slackened(
+        self, begun: jax.Array, x: jax.Array, before: jax.Array, after: jax.Array, h: jax.Array
+    ) -> jax.Array:
+        """Impulse (1, B) of a damped force that ends, or sets in again, within the step.
+
+        It has a kink at x > 0, which the difference between one step and two halves may not show.
+        """
+        if self.viscous is None:
+            return jnp.zeros_like(self.tolerance)
+        first, last = self.force_of(begun, before), self.force_of(x, after)
+        turns = (begun > 0) & (x > 0) & ((first > 0) != (last > 0))
+        return jnp.max(jnp.where(turns, h / 2 * (first + last), 0.0), axis=0, keepdims=True)
 
     def unseen(self, s: ImplicitState, end: ImplicitState, h: jax.Array) -> jax.Array:
         """Part (1, B) of a force that sets in with a jump which a step may miss by its estimate."""

@@ -9,6 +9,7 @@ from jimpact.contact import contact_of
 from jimpact.fits.experiments import Experiments
 from jimpact.law import AnyLaw
 from jimpact.scene import Scene
+from jimpact.status import sign_tolerance
 
 # Error of computed gap velocities, as a part of their noise. Ten times more: as large as the noise
 # itself, and the same in all shots.
@@ -24,13 +25,14 @@ def tolerated(
 ) -> tuple[AnyLaw, tuple[str, ...]]:
     """The law at a tolerance that the noise of the data allows, and a sentence that says so.
 
-    Of a law without `rtol` that errs by a tolerance (`Law.accuracy`), where `sigma` is known.
+    Of a law without `rtol` that errs by more than signs do (`Law.accuracy`), where `sigma` is
+    known.
     """
     if data.sigma is None or getattr(law, "rtol", COARSE) is not None:
         return law, ()
     pre, sigma = np.asarray(data.pre), np.asarray(data.sigma)
     shapes = _CONTACT.eval_shape(data.largest_scene(scene), pre[0])
-    if not 0 < law.accuracy(shapes) < COARSE:
+    if not sign_tolerance(pre.dtype) < law.accuracy(shapes) < COARSE:
         return law, ()
     normals = data.each(scene, lambda each: np.asarray(each.normals))
     fastest = [np.abs(n.T @ v).max() for n, v in zip(normals, pre)]

@@ -15,7 +15,7 @@ from jimpact.compiling import precise_jit
 from jimpact.impacts import impact
 from jimpact.law import with_parameter
 from jimpact.laws.compliant import Compliant
-from jimpact.laws.forces import Force
+from jimpact.laws.forces import Force, UserForce
 from jimpact.scene import chain
 
 # Tolerance of the pair's impact (else the law's default): the calibrated e is right to as many
@@ -32,7 +32,8 @@ def measured_restitution(force: Force, mass: Any, speed: Any) -> jax.Array:
     Equation: `m x'' = -F(x, x')`, `x(0) = 0`, `x'(0) = v`, until the force ends; `e = -x'/v`.
 
     Args:
-        force: a contact force; its parameters broadcast with `mass` and `speed`.
+        force: a contact force; its parameters broadcast with `mass` and `speed`, but those of a
+            `UserForce` are passed on as they are.
         mass: reduced mass m > 0 [kg]: `m1 m2 / (m1 + m2)`, or `1 / W_jj` of a contact.
         speed: approach v > 0 [m/s].
 
@@ -96,10 +97,12 @@ def calibrate(force: Force, restitution: Any, mass: Any, speed: Any) -> Force:
 def _each(function: Any, force: Force, *values: jax.Array) -> jax.Array:
     """`function(force, *values)` of scalars, over their common shape."""
     arrays = eqx.filter(force, eqx.is_array)
+    if isinstance(force, UserForce):  # its arrays are not contact by contact
+        arrays = None
     shapes = [leaf.shape for leaf in jax.tree.leaves(arrays)]
     shape = jnp.broadcast_shapes(*shapes, *(jnp.shape(z) for z in values))
     spread = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, shape).ravel(), (arrays, values))
-    fixed = eqx.filter(force, eqx.is_array, inverse=True)
+    fixed = force if arrays is None else eqx.filter(force, eqx.is_array, inverse=True)
     run = jax.vmap(lambda leaves, rest: function(eqx.combine(leaves, fixed), *rest))
     return run(*spread).reshape(shape)
 

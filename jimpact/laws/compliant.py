@@ -106,9 +106,8 @@ class Compliant(Law):
         check_friction(self.friction, scene)
 
     def accuracy(self, contact: Contact) -> float:
-        """`rtol` where method 'implicit' solves this `contact`, else 0: `impact` sees no error."""
-        method, rtol = solver_of(self, contact)
-        return rtol if method == "implicit" else 0.0
+        """`rtol`, or its default at this `contact`."""
+        return solver_of(self, contact)[1]
 
     def dynamics(self, contact: Contact) -> Dynamics:
         """The dimensionless dynamics of the whole encounter."""

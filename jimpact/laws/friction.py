@@ -40,6 +40,7 @@ def frictional_impulses(
     assert contact.slip is not None  # see `check_law`
     ones = jnp.ones_like(contact.gap_velocity)
     slip = (1 + jnp.repeat(tangential_restitution * ones, contact.tangents)) * contact.slip
-    return Impulses(
-        *solve(contact.whole_delassus, normal, slip, friction * ones, complementary=complementary)
+    solution = solve(
+        contact.whole_delassus, normal, slip, friction * ones, complementary=complementary
     )
+    return Impulses(solution.normal, solution.tangential, solution.status)

@@ -53,7 +53,7 @@ def default_rtol(method: str, dtype: jnp.dtype) -> float:
 
 def solver_of(law: Any, contact: Contact) -> tuple[str, float]:
     """The method of a law with impact dynamics at these contacts, and its tolerance there."""
-    method = method_for(law.method, contact, law.rtol)
+    method = method_for(law.method, contact, law.friction is not None)
     return method, law.rtol or default_rtol(method, contact.gap_velocity.dtype)
 
 
@@ -169,7 +169,7 @@ class LZB(Law):
             3, compiled as soon for many contacts with friction as for one;
             'impulse', the published scheme in the impulse of a primary contact, order 1; 'auto'
             (default): 'time', but 'implicit' for several contacts with friction in space, where
-            events may be endless; 'time' for up to 4 of them if `rtol` is below 1e-6.
+            events may be endless.
         check_conditioning: solve a second time with rtol / 100 and with perturbed last digits, and
             set `ill_conditioned` if gap velocities or slips differ by more than 10 rtol of the
             fastest approach (not with 'impulse'; cost and float32: `docs/speed_accuracy.md`).
@@ -225,9 +225,8 @@ class LZB(Law):
         check_friction(self.friction, scene)
 
     def accuracy(self, contact: Contact) -> float:
-        """`rtol` where method 'implicit' solves this `contact`, else 0: `impact` sees no error."""
-        method, rtol = solver_of(self, contact)
-        return rtol if method == "implicit" else 0.0
+        """`rtol`, or its default at this `contact`."""
+        return solver_of(self, contact)[1]
 
     @property
     def pads_scenes(self) -> bool:  # type: ignore[override]

@@ -81,7 +81,8 @@ class Poisson(Law):
         supplement = solve_lcp(w, compression.w + w @ returned)
         code = jnp.maximum(compression.code, supplement.code)
         if self.restitution.ndim == 1 and not is_regular(w):
-            shared = _depends_on_sharing(as_matrix(w), self.restitution, compression.z > 0)
+            free = _free(as_matrix(w), compression.z > 0)
+            shared = _depends_on_sharing(as_matrix(w), self.restitution, free)
             code = jnp.maximum(code, jnp.where(shared, CODE["several_outcomes"], CODE["ok"]))
         return Impulses(compression.z + returned + supplement.z, None, code)
 
@@ -100,20 +101,25 @@ class Poisson(Law):
         second = solve(a, rate[:m], rate[m:], mu, complementary=True, load=load)
         code = jnp.maximum(first.status, second.status)
         if self.restitution.ndim == 1:
-            loaded = jnp.concatenate([first.normal > 0, jnp.repeat(first.normal > 0, each)])
             e = jnp.concatenate([self.restitution, jnp.zeros_like(contact.slip)])
-            shared = _depends_on_sharing(a, e, loaded)
+            shared = _depends_on_sharing(a, e, first.free)
             code = jnp.maximum(code, jnp.where(shared, CODE["several_outcomes"], CODE["ok"]))
         p = first.normal + returned + second.normal
         return Impulses(p, first.tangential + second.tangential, code)
 
 
-def _depends_on_sharing(w: jax.Array, e: jax.Array, loaded: jax.Array) -> jax.Array:
-    """Whether `W diag(e) p_c` differs among the p_c of loaded rows with the same `W p_c`."""
-    norm = jnp.sqrt(jnp.diagonal(w))
-    g = jax.lax.stop_gradient(w / (norm[:, None] * norm[None, :]))
+def _free(w: jax.Array, loaded: jax.Array) -> jax.Array:
+    """Columns (m, m) of changes of loaded impulses that leave W p as it is."""
+    norm = jax.lax.stop_gradient(jnp.sqrt(jnp.diagonal(w)))
     both = loaded[:, None] & loaded[None, :]
-    unit = jnp.eye(len(e), dtype=w.dtype)
-    projector, _ = null_projector(jnp.where(both, g, unit))
-    returned = g @ (jax.lax.stop_gradient(e)[:, None] * projector)
+    unit = jnp.eye(len(loaded), dtype=w.dtype)
+    projector, _ = null_projector(jnp.where(both, w / (norm[:, None] * norm[None, :]), unit))
+    return projector / norm[:, None]
+
+
+def _depends_on_sharing(w: jax.Array, e: jax.Array, free: jax.Array) -> jax.Array:
+    """Whether `W diag(e) p_c` differs among p_c that differ by `free` columns."""
+    w, e = jax.lax.stop_gradient((w, e))
+    norm = jnp.sqrt(jnp.diagonal(w))
+    returned = w @ (e[:, None] * free) / jnp.where(norm > 0, norm, 1.0)[:, None]
     return jnp.abs(returned).max() > jnp.sqrt(jnp.finfo(w.dtype).eps)

@@ -308,6 +308,11 @@ def _checked_sources(sources: Sources, scene: Scene) -> Sources:
     drawn = law if isinstance(law, Law) else law(jax.random.key(0, impl="threefry2x32"))
     if not isinstance(drawn, Law):
         raise TypeError(f"Argument `law` must give a Law for a key, but gives {drawn!r}.")
+    if gaps is not None and not drawn.uses_gaps:
+        raise ValueError(
+            f"Argument `gaps` must be None for {type(drawn).__name__}, which leaves open contacts "
+            "out: laws that use gaps are Compliant and Binary."
+        )
     return in_common_dtype(Sources(law, velocity, gaps), scene, drawn)[0]
 
 

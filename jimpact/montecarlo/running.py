@@ -65,7 +65,8 @@ def monte_carlo(
         `MonteCarlo`. Samples whose status is a failure are counted, listed and left out.
 
     Raises:
-        ValueError: bad arguments, gaps that can be negative, a folder that holds a different run.
+        ValueError: bad arguments, gaps that can be negative or that the law does not use, a
+            folder that holds a different run.
         RuntimeError: no sample of the first chunk could be used.
         OSError: the folder cannot be written; what was written before is intact.
         KeyboardInterrupt: with a message that says how to continue.

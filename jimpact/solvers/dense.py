@@ -28,8 +28,10 @@ from jimpact.compiling import full_precision
 from jimpact.loops import fori_loop
 
 # Rows up to which one system is solved by the loop, not by LAPACK: in a batch that is three to six
-# times as fast. With ten times more the cubic cost of many contacts would not be blocked.
-_BY_LOOP = 4
+# times as fast for 4 rows, and independent batched triangular solves of LAPACK can wait for each
+# other for ever on few cores (jaxlib 0.10). With ten times more the cubic cost of many contacts
+# would not be blocked.
+_BY_LOOP = 16
 # Columns up to which products are written out: a reduction does not fuse with what follows it, and
 # is no vector operation: four times as long for the 12 of four contacts with friction in space. Ten
 # times more would make large programs of long chains.
@@ -150,6 +152,24 @@ def block_inverse(matrix: jax.Array) -> jax.Array:
         return jnp.where(replaced, 0.0, inverse) - spread
 
     return fori_loop(0, m, eliminate, matrix)
+
+
+def block_solve(matrix: jax.Array, right: jax.Array) -> jax.Array:
+    """`matrix^-1 right` (m, b, c) of one matrix (m, b, m, b), block by block, without pivots."""
+    m, b = matrix.shape[:2]
+    perturbation = float(jnp.finfo(matrix.dtype).eps) ** 2  # of a block that is singular
+    rows = jnp.concatenate([matrix.reshape(m, b, m * b), right], axis=2)
+
+    def eliminate(i: jax.Array, rows: jax.Array) -> jax.Array:
+        """Rows after the block pivot i."""
+        row = jax.lax.dynamic_index_in_dim(rows, i, 0, keepdims=False)
+        block = jax.lax.dynamic_slice_in_dim(row, i * b, b, axis=1)
+        row = _small_inverse(block[..., None], perturbation)[..., 0] @ row
+        column = jax.lax.dynamic_slice_in_dim(rows, i * b, b, axis=2)
+        rows = rows - jnp.einsum("jab,bk->jak", column, row)
+        return jax.lax.dynamic_update_index_in_dim(rows, row, i, 0)
+
+    return fori_loop(0, m, eliminate, rows)[..., m * b :]
 
 
 def _small_inverse(block: jax.Array, perturbation: float) -> jax.Array:

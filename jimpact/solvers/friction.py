@@ -13,6 +13,7 @@ in proportion to mu p, and normal impulses are the least, wherever that is allow
 """
 
 import itertools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -21,9 +22,10 @@ import numpy as np
 
 from jimpact.compiling import full_precision
 from jimpact.loops import fori_loop, while_loop
-from jimpact.solvers.dense import SINGULAR, block_inverse, load_shares, times
-from jimpact.solvers.interior_points import within_cones
-from jimpact.solvers.lcp import gathered_rounding, solve_lcp
+from jimpact.solvers.dense import SINGULAR, block_inverse, block_solve, load_shares, times
+from jimpact.solvers.interior_points import cones_of, within_cones
+from jimpact.solvers.lcp import gathered_rounding
+from jimpact.solvers.many_contacts import solve_many
 from jimpact.status import CODE
 
 ENUMERATED = 3  # contacts up to which all modes are tried: 4^3 in the plane, 6^3 in space
@@ -32,15 +34,13 @@ _ITERATIONS = 8  # of Newton's method for the directions of slip; 4 to 6 are usu
 # Part of the largest mu p: the weight in the sharing of a contact without load. Ten times more: it
 # takes a visible share.
 _LEAST_SHARE = 1e-6
-# Projected Gauss-Seidel: sweeps at each tolerance; the coarsest tolerance, the factor to the next
-# finer one, and how many levels there are, each tolerance taken twice. Ten times more sweeps: slow
-# scenes end later.
-_SWEEPS = 2000
-_COARSEST, _FINER, _LEVELS = 1e-4, 1e-3, 8
-# What counts as no impulse and as no slip, in parts of that tolerance. The second value is for
-# contacts that reach their cone while others hold them: sweeps bring those to rest slowly. Ten
-# times more: contacts that slip are taken to stick, and the law is not satisfied.
-_NEAR_ZERO, _SLOW_NEAR_ZERO = 10.0, 100.0
+DENSE = 64  # contacts up to which interior points are used; ten times more take a minute
+# Projections at most, and steps of Newton's method after them. Ten times more: jammed scenes end
+# later.
+_PROJECTIONS, _POLISHES = 5000, 3
+# Added to the diagonal of the equations of Newton's method, which are singular where impulses are
+# free. Ten times more: another step of it.
+_RIDGE = 1e-8
 # `distribute`: sweeps at most; part of the largest limit below which a sweep changes nothing; part
 # of the limit below which a force is inside its disc, or a rate is 0. Ten times more of the last
 # two: contacts on the rim of their cone stick.
@@ -49,11 +49,13 @@ _SETTLED, _INSIDE = 1e-13, 1e-9
 
 
 class FrictionImpulses(NamedTuple):
-    """p (m,), p_t (m,) or (2 m,), and the status code ()."""
+    """p (m,), p_t (m,) or (2 m,), the status code (), and columns (m + t, m + t) in which they are
+    free, p first (0: they are unique); without derivatives."""
 
     normal: jax.Array
     tangential: jax.Array
     status: jax.Array
+    free: jax.Array
 
 
 class _FrictionProblem(NamedTuple):
@@ -181,9 +183,13 @@ def solve(
     code = jnp.where(jnp.any(moves > root), CODE["several_outcomes"], code)
     status = jnp.maximum(status, code)
     x = _on_modes(problem, modes, inverted, x)
+    wrong = ~(_misfit(fixed, jax.lax.stop_gradient(x)[..., None])[0] <= fixed.tolerance)
+    status = jnp.where(wrong & (status < CODE["infeasible"]), CODE["max_steps"], status)
     x = x.at[:, 1:].add(drag * x[:, :1]) * scale * size
     p = jnp.where(x[:, 0] < 0, 0.0, x[:, 0]) if complementary else x[:, 0]  # rounding
-    return FrictionImpulses(p, x[:, 1:].reshape(-1), status)
+    free = jax.lax.stop_gradient(scale)[..., None] * free.reshape(*scale.shape, -1)
+    both = [free[:, 0], free[:, 1:].reshape(m * rows, -1)]
+    return FrictionImpulses(p, x[:, 1:].reshape(-1), status, jnp.concatenate(both))
 
 
 # ------------------------------------------------------------------- the equations of modes
@@ -353,6 +359,7 @@ def _enumerate(problem: _FrictionProblem) -> tuple[_Modes, jax.Array, jax.Array]
 
 def _newton(problem: _FrictionProblem, modes: _Modes) -> tuple[_Modes, jax.Array]:
     """x (m, b, N) of modes, in space with the directions of slip that they lead to."""
+    none = jnp.zeros((*problem.rate.shape, modes.taking.shape[1]), problem.matrix.dtype)
     if modes.direction.shape[1] == 1:
         return modes, _solved(problem, modes)
 
@@ -361,7 +368,6 @@ def _newton(problem: _FrictionProblem, modes: _Modes) -> tuple[_Modes, jax.Array
         x = _solved(problem, state[0])
         return _turned(problem, state[0], x), x
 
-    none = jnp.zeros((*problem.rate.shape, modes.taking.shape[1]), problem.matrix.dtype)
     return fori_loop(0, _ITERATIONS, step, (modes, none))
 
 
@@ -457,122 +463,75 @@ def _on_modes(
 # ------------------------------------------------------------------- many contacts
 
 
-class _Searched(NamedTuple):
-    x: jax.Array
-    modes: _Modes
-    done: jax.Array
-    level: jax.Array
+def _modes_at(problem: _FrictionProblem, x: jax.Array) -> _Modes:
+    """The modes (N = 1) to which x (m, b) is closest, by which Newton's method goes on."""
+    x = x[..., None]
+    rate, p = _rates(problem, x), x[:, 0]
+    taking = p > rate[:, 0] if problem.complementary else jnp.ones(p.shape, bool)
+    pull, bound = rate[:, 1:] - x[:, 1:], _bound(problem, x)
+    length = _length(pull)
+    sticks = length <= bound
+    slides = ~sticks & (bound > 0)
+    direction = jnp.where(slides[:, None], _over(pull, length), 0.0)
+    return _turned(problem, _Modes(taking, sticks, direction, jnp.zeros_like(p)), x)
 
 
 def _search(problem: _FrictionProblem) -> tuple[_Modes, jax.Array, jax.Array]:
-    """Modes, x (m, b) and status from Lemke's method (planar), interior points or sweeps.
+    """Modes, x (m, b) and status of many contacts: by interior points up to DENSE of them, by
+    projections where these find nothing, and by Newton's method on the modes of either."""
 
-    Gauss-Seidel sweeps, where they are needed, at finer and finer tolerances give modes, Newton's
-    method finishes on them, until the law is satisfied.
-    """
-    x, code = jnp.zeros_like(problem.rate), jnp.asarray(CODE["ok"])
-    planar = problem.rate.shape[1] == 2
-    started = problem.complementary and (planar or problem.load is None)
-    if started and planar:
-        x, code = _by_lemke(problem)
-    elif started:
-        x = within_cones(
-            problem.matrix,
+    def misfit(x: jax.Array) -> jax.Array:
+        """How far x is from the law."""
+        return _misfit(problem, x[..., None])[0]
+
+    def polish(x: jax.Array) -> jax.Array:
+        """A step of Newton's method on the modes of x; what is free in them stays as it is."""
+        matrix, right = (y[..., 0] for y in _equations(problem, _modes_at(problem, x)))
+        missed = (right - jnp.sum(matrix * x[None, None], axis=(2, 3)))[..., None]
+        return x + block_solve(matrix + _RIDGE * unit, missed)[..., 0]
+
+    unit = jnp.eye(problem.rate.size, dtype=problem.rate.dtype).reshape(problem.matrix.shape)
+    x = jnp.zeros_like(problem.rate)
+    if len(x) <= DENSE:
+        x = within_cones(cones_of(*problem), misfit, polish, problem.tolerance)
+    if problem.complementary:
+        x = _projected(problem, x, misfit, polish)
+    status = jnp.where(misfit(x) <= problem.tolerance, CODE["ok"], CODE["max_steps"])
+    return _modes_at(problem, x), x, status
+
+
+def _projected(
+    problem: _FrictionProblem,
+    x: jax.Array,
+    misfit: Callable[[jax.Array], jax.Array],
+    polish: Callable[[jax.Array], jax.Array],
+) -> jax.Array:
+    """x (m, b) where it satisfies the law; elsewhere what projections and Newton's method make of
+    it."""
+
+    def improve(state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        """The impulses that projections lead to."""
+        solution = solve_many(
+            lambda x: jnp.sum(problem.matrix * x[None, None], axis=(2, 3)),
+            jnp.ones_like(problem.rate),
             problem.rate,
             problem.friction,
-            lambda x: _misfit(problem, x[..., None])[0],
+            state[0],
+            jnp.ones((), x.dtype),
             problem.tolerance,
+            _PROJECTIONS,
+            problem.load,
         )
-    eps = float(jnp.finfo(x.dtype).eps)
+        swept = solution.impulse
+        refined = fori_loop(0, _POLISHES, lambda _, x: polish(x), swept)
+        better = misfit(refined) < misfit(swept)
+        return jnp.where(better, refined, swept), jnp.asarray(True)
 
-    def refine(state: _Searched) -> _Searched:
-        """Sweeps at the next tolerance, then Newton's method on their modes."""
-        level = (state.level // 2).astype(x.dtype)
-        tolerance = jnp.maximum(_COARSEST * _FINER**level, 4 * eps)
-        skip = started & (state.level < 0)
-        swept = _sweeps(problem, state.x, tolerance, skip)
-        margin = tolerance * jnp.where(state.level % 2 == 0, _NEAR_ZERO, _SLOW_NEAR_ZERO)
-        margin = jnp.where(skip, problem.tolerance, margin)
-        modes, better = _newton(problem, _at_rest(problem, swept, margin))
-        good = _misfit(problem, better)[0] <= problem.tolerance
-        # redundant contacts near their cones: x is allowed, the least impulses are not
-        allowed = _misfit(problem, swept[..., None])[0] <= problem.tolerance
-        chosen = jnp.where(good, better[..., 0], swept)
-        return _Searched(chosen, modes, good | allowed, state.level + 1)
+    def unsolved(state: tuple[jax.Array, jax.Array]) -> jax.Array:
+        """Whether the law is not satisfied yet."""
+        return ~state[1] & ~(misfit(state[0]) <= problem.tolerance)
 
-    first = jnp.asarray(-1 if started else 0)
-    blank = _at_rest(problem, x, jnp.zeros((), x.dtype))
-    none = code == CODE["infeasible"]
-    end = while_loop(
-        lambda s: ~s.done & ~none & (s.level < _LEVELS),
-        refine,
-        _Searched(x, blank, jnp.asarray(False), first),
-    )
-    status = jnp.where(none, code, CODE["max_steps"])
-    return end.modes, end.x, jnp.where(end.done, CODE["ok"], status)
-
-
-def _by_lemke(problem: _FrictionProblem) -> tuple[jax.Array, jax.Array]:
-    """x from the complementarity problem of (p, p_t+, p_t-, lambda); lambda is |s| where sliding.
-
-    Source: Anitescu and Potra, Nonlinear Dynamics 14 (1997) 231-247.
-    """
-    m, a = len(problem.friction), problem.matrix
-    nn, nt, tn, tt = a[:, 0, :, 0], a[:, 0, :, 1], a[:, 1, :, 0], a[:, 1, :, 1]
-    unit, none = jnp.eye(m, dtype=a.dtype), jnp.zeros((m, m), a.dtype)
-    whole = jnp.block(
-        [
-            [nn, nt, -nt, none],
-            [tn, tt, -tt, unit],
-            [-tn, -tt, tt, unit],
-            [jnp.diag(problem.friction), -unit, -unit, none],
-        ]
-    )
-    r, s = problem.rate.T
-    bound = jnp.zeros_like(r) if problem.load is None else problem.friction * problem.load
-    solution = solve_lcp(whole, jnp.concatenate([r, s, -s, bound]), symmetric=False)
-    z = solution.z.reshape(4, m)
-    return jnp.stack([z[0], z[1] - z[2]], axis=1), solution.code
-
-
-def _sweeps(
-    problem: _FrictionProblem, x: jax.Array, tolerance: jax.Array, skip: jax.Array
-) -> jax.Array:
-    """Projected Gauss-Seidel sweeps until x changes by less than `tolerance`, in its size."""
-    m = len(problem.friction)
-    own = problem.matrix[jnp.arange(m), :, jnp.arange(m)]
-    stiffest = jnp.linalg.norm(own[:, 1:, 1:], axis=(1, 2))
-    stiffest = jnp.where(stiffest > 0, stiffest, 1.0)
-
-    def contact(i: jax.Array, x: jax.Array) -> jax.Array:
-        """The impulses of contact i so that it satisfies the law, all others given."""
-        rate = problem.rate[i] + jnp.sum(problem.matrix[i] * x[None], axis=(1, 2))
-        p = x[i, 0] - rate[0] / own[i, 0, 0]
-        p = jnp.maximum(p, 0.0) if problem.complementary else p
-        rate = rate[1:] + own[i, 1:, 0] * (p - x[i, 0])
-        bound = (
-            jnp.maximum(p, 0.0) if problem.load is None else jnp.maximum(p, 0.0) + problem.load[i]
-        )
-        bound = problem.friction[i] * bound
-        side = (x[i, 1:] - rate / stiffest[i])[None, :, None]
-        side = in_disc(side, bound[None, None])[0, :, 0]
-        return x.at[i].set(jnp.concatenate([p[None], side]))
-
-    State = tuple[jax.Array, jax.Array, jax.Array]
-
-    def going(state: State) -> jax.Array:
-        """Whether a sweep still changes something."""
-        x, change, count = state
-        return (change > tolerance * _size(x[..., None])[0]) & (count < _SWEEPS)
-
-    def sweep(state: State) -> State:
-        """All contacts once."""
-        x, _, count = state
-        new = fori_loop(0, m, contact, x)
-        return new, jnp.abs(new - x).max(), count + 1
-
-    change = jnp.where(skip, 0.0, jnp.inf).astype(x.dtype)
-    return while_loop(going, sweep, (x, change, jnp.asarray(0)))[0]
+    return while_loop(unsolved, improve, (x, jnp.asarray(False)))[0]
 
 
 # ------------------------------------------------------------------- known normal forces

@@ -63,6 +63,7 @@ def solve_many(
     inverse_step_size: jax.Array,
     tolerance: float,
     most: int,
+    load: jax.Array | None = None,
 ) -> Many:
     """Impulses x (m, b) of contacts with Coulomb friction, normals first (b = 1, 2, 3).
 
@@ -75,6 +76,7 @@ def solve_many(
         inverse_step_size: estimate of the largest eigenvalue of A, scaled to a diagonal of 1.
         tolerance: misfit at which it ends, of the largest of `rate`.
         most: iterations.
+        load: (m,) normal impulses in addition to p, which friction includes; None: 0.
 
     Source: Nesterov (1983), O'Donoghue and Candes (2015) for the restart; Mazhar, Heyn, Negrut and
     Tasora, ACM Trans. Graph. 34 (2015) for granular media (there the cone is convexified, which
@@ -91,6 +93,7 @@ def solve_many(
     # discs stay discs: all tangents of a contact have one scale
     slope = friction * scale[:, 0] / scale[:, -1]
     goal = rate * scale
+    carried = None if load is None else load / scale[:, 0]
     size = jnp.max(jnp.abs(goal))
 
     def times(x: jax.Array) -> jax.Array:
@@ -103,10 +106,10 @@ def solve_many(
 
     def iterate(at: _At) -> _At:
         """One step against the rates, projected, and the momentum of the next one."""
-        x = _projected(at.y - (at.ay + goal) / at.inverse_step_size, slope)
+        x = _projected(at.y - (at.ay + goal) / at.inverse_step_size, slope, carried)
         return _with_momentum(at, x, times(x), most)
 
-    x = _projected(start / scale, slope) + 0 * size  # NaN where a rate is not finite
+    x = _projected(start / scale, slope, carried) + 0 * size  # NaN where a rate is not finite
     ax = times(x)
     unit = jnp.ones((), x.dtype)
     inverse_step_size = jnp.maximum(RELAX * inverse_step_size, unit)
@@ -126,10 +129,10 @@ def _scale(diagonal: jax.Array) -> jax.Array:
     return 1 / jnp.sqrt(squares[:, jnp.minimum(jnp.arange(diagonal.shape[1]), 1)])
 
 
-def _projected(x: jax.Array, slope: jax.Array) -> jax.Array:
+def _projected(x: jax.Array, slope: jax.Array, load: jax.Array | None) -> jax.Array:
     """The nearest normal impulses >= 0, and tangential ones (m, b - 1) in their discs."""
     p = jnp.maximum(x[:, :1], 0.0)
-    side, bound = x[:, 1:], slope[:, None] * p
+    side, bound = x[:, 1:], slope[:, None] * (p if load is None else p + load[:, None])
     length = jnp.sqrt(jnp.sum(side**2, axis=1, keepdims=True))
     shrink = jnp.where(length <= bound, 1.0, bound / jnp.where(length > 0, length, 1.0))
     return jnp.concatenate([p, side * shrink], axis=1)

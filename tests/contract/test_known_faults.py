@@ -62,7 +62,6 @@ def row_of_points(heights, columns):
 
 
 @pytest.mark.parametrize("law", [ji.Moreau, ji.Poisson])
-@fault(FRICTION)
 def test_many_planar_contacts_with_friction(law):
     scene = row_of_points(2, (-0.1, 0.1, -0.07, 0.06))
     v = np.array([0.5, -1.0, 0.2, -1.0, -1.0])
@@ -81,7 +80,6 @@ THROWN = np.array([0.3, 0.2, -1, 1.2, -0.4, 0.7])
 @pytest.mark.parametrize(
     "law", [ji.LZB(0.7, [1.0, 1.7]), ji.Compliant(ji.HuntCrossley([1e4, 1.7e4], 0.4))]
 )
-@fault(FRICTION)
 def test_tangents_without_friction_change_nothing(law):
     plain = ji.impact(law, ji.Scene(BRICK, N_EDGE), THROWN).velocity
     scene = ji.Scene(BRICK, N_EDGE, H_EDGE)
@@ -89,7 +87,6 @@ def test_tangents_without_friction_change_nothing(law):
     jax.hessian(lambda s: ji.impact(law, scene, s * THROWN).velocity[2])(1.0)
 
 
-@fault(FRICTION)
 def test_an_elastic_impact_on_four_corners_without_friction():
     """v+ = -v-: in closed form."""
     box = ji.Box([0.75] * 3, 3.0, [0.5] * 3)
@@ -99,7 +96,6 @@ def test_an_elastic_impact_on_four_corners_without_friction():
     assert "VIOLATED" not in ji.summary(out, scene, v)
 
 
-@fault(FRICTION)
 def test_damped_forces_with_friction_keep_their_tolerance():
     scene = ji.Scene(BRICK, N_EDGE, H_EDGE)
     force, rtol = ji.HuntCrossley([1e4, 1.7e4], 0.4), 1e-6
@@ -110,7 +106,6 @@ def test_damped_forces_with_friction_keep_their_tolerance():
     assert error < 10 * rtol
 
 
-@fault(FRICTION)
 def test_one_outcome_is_not_several():
     """A ball between the nose of a cushion and the cloth: 40 starts of an independent iteration agree."""
     m, r, up = 0.14, 0.026, 0.4
@@ -130,7 +125,6 @@ def test_one_outcome_is_not_several():
     assert status_of(out) == "ok"
 
 
-@fault(FRICTION)
 def test_elastic_samples_at_a_coarse_tolerance_are_no_failures():
     law = ji.Compliant(ji.Hertz(1e9), rtol=1e-4)
     with warnings.catch_warnings():
@@ -141,13 +135,11 @@ def test_elastic_samples_at_a_coarse_tolerance_are_no_failures():
     assert result.statuses == {"ok": 256}
 
 
-@fault(FRICTION)
 def test_restitution_of_a_force_whose_parameters_are_one_array():
     force = ji.UserForce(lambda x, rate, p: p[0] * x + p[1] * rate, jnp.array([1.0, 0.2]))
     assert float(ji.measured_restitution(force, 1.0, 1.0)) == pytest.approx(0.74408, abs=1e-5)
 
 
-@fault(FRICTION)
 def test_gaps_of_a_law_that_ignores_them_are_refused():
     with pytest.raises(ValueError, match="Compliant"):
         ji.monte_carlo(
@@ -159,7 +151,6 @@ def test_gaps_of_a_law_that_ignores_them_are_refused():
     ("make", "word"),
     [(lambda: ji.Compliant(stiffness=1e9), "force"), (lambda: ji.LZB(e=0.9), "restitution")],
 )
-@fault(FRICTION)
 def test_arguments_that_a_law_does_not_take(make, word):
     with pytest.raises(TypeError, match=f"takes .*`{word}`"):
         make()

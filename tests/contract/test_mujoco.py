@@ -200,11 +200,27 @@ def test_what_is_left_out_is_named():
         warnings.simplefilter("always")
         world = ji.from_mujoco(model, data)
     said = " ".join(str(w.message) for w in record)
-    assert "'floor, sunk' overlaps by 0.06 m" in said
-    assert "friction 0.3 and 0.6" in said
-    assert "torsional or rolling" in said
-    assert "Joint 'knee' is at its limit" in said
-    np.testing.assert_array_equal(world.friction, [0.3])
+    assert "'floor, sunk' by 0.06 m" in said
+    assert "'floor, sunk': 0.3 and 0.6" in said
+    assert "Torsional or rolling" in said
+    assert len(record) == 3  # one for each kind
+    np.testing.assert_array_equal(world.friction, [0.3, 0.0])
+
+
+def test_limits_of_joints_are_contacts():
+    """A pendulum of length .5 m that swings into its limit with e = .5, and one near its limit."""
+    hinge = '<joint name="{}" type="hinge" axis="0 1 0" pos="0 0 .5" limited="true" range="0 90"/>'
+    ball = 'type="sphere" size=".1" mass="2"'
+    bodies = body("0 0 2", ball, hinge.format("knee")) + body("3 0 2", ball, hinge.format("hip"))
+    model, data = load(bodies)
+    data.qpos[1] = 0.01
+    data.qvel[:] = -2.0, -1.0
+    world = ji.from_mujoco(model, data, margin=0.02)
+    assert world.names == ("limit of joint knee", "limit of joint hip")
+    np.testing.assert_allclose(world.scene.gaps, [0.0, 0.01], atol=1e-12)
+    assert world.friction is None
+    out = ji.impact(ji.Moreau(0.5), world.scene, world.velocity)
+    np.testing.assert_allclose(out.velocity, [1.0, -1.0], atol=1e-12)
 
 
 def test_contacts_without_friction_have_none():
