@@ -10,7 +10,7 @@ be continued.
 
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias
 
 import equinox as eqx
 import jax
@@ -33,7 +33,9 @@ STOP_GAIN = {"float64": 1e-10, "float32": 1e-6}
 STOP_EXACT = {"float64": 1e-18, "float32": 1e-11}
 
 _DAMPING = 1e-2  # first Levenberg-Marquardt damping, relative to the curvatures
-_LESS, _MORE = 0.2, 4.0  # factors of the damping after a good and a bad step
+# Nielsen (1999): the damping falls by this factor at most after a step that gains what it promised,
+# and grows by a factor that doubles with each step that does not.
+_LEAST_FACTOR, _FIRST_GROWTH = 1 / 3, 2.0
 _LEAST = {"float64": 1e-10, "float32": 1e-5}  # smallest damping: keeps the matrix positive
 _STUCK = 1e6  # above this damping a kink of the law lets nothing pass
 _FLAT = 1e-10  # curvatures below this share of the largest are damped as if they had it
@@ -109,6 +111,27 @@ class SolverState(eqx.Module):
     done: jax.Array
 
 
+class Damping(NamedTuple):
+    """The damping of Levenberg-Marquardt, its next growth, and what the last step promised."""
+
+    value: jax.Array
+    growth: jax.Array
+    promised: jax.Array
+
+    def after(self, gain: jax.Array) -> "Damping":
+        """Nielsen's rule after a step that gained so much.
+
+        Equation: `value max(1/3, 1 - (2 gain / promised - 1)^3)` after a gain, else
+        `value growth`, and the growth doubles.
+        """
+        better = gain > 0
+        ratio = jnp.where(jnp.isfinite(gain), gain / self.promised, 1.0)
+        less = jnp.maximum(_LEAST_FACTOR, 1 - (2 * ratio - 1) ** 3)
+        floor = _LEAST[str(self.value.dtype)]
+        value = jnp.maximum(self.value * jnp.where(better, less, self.growth), floor)
+        return Damping(value, jnp.where(better, _FIRST_GROWTH, 2 * self.growth), self.promised)
+
+
 def check_method(method: Any) -> None:
     """Raise a ValueError unless `method` is a known name or an optax transformation."""
     if isinstance(method, str) and method in DEFAULT_STEPS:
@@ -131,7 +154,7 @@ def begin(y: jax.Array, first: tuple[Any, Any, Any], method: Method, max_steps: 
     """State before the first pass from y (P,); `first` is shaped like what `evaluate` returns."""
     infinite = jnp.asarray(jnp.inf, y.dtype)
     if method == "levenberg-marquardt":
-        memory: Any = jnp.asarray(_DAMPING, y.dtype)
+        memory: Any = Damping(*jnp.asarray([_DAMPING, _FIRST_GROWTH, jnp.inf], y.dtype))
     else:
         memory = _transformation(method, max_steps).init(y)
     steps, done = jnp.asarray(0), jnp.asarray(False)
@@ -160,11 +183,13 @@ def advance(
         y, r, jac, aux, least = best
         floor = jnp.asarray(_LEAST[str(y.dtype)], y.dtype)
         if method == "levenberg-marquardt":
-            memory = jnp.maximum(state.memory * jnp.where(better, _LESS, _MORE), floor)
+            memory = state.memory.after(state.cost - cost)
             step = partial(region.step, y, r, jac)
-            moves, gains = jax.vmap(step)(jnp.stack([floor, memory]))  # compiled once
-            gain, trial = gains[0], y + moves[1]
-            stuck = memory > _STUCK
+            moves, gains = jax.vmap(step)(jnp.stack([floor, memory.value]))  # compiled once
+            gain, trial = gains[0], region.retract(y + moves[1])
+            change = jac @ (trial - y)
+            memory = memory._replace(promised=-(r @ change) - 0.5 * jnp.sum(change**2))
+            stuck = memory.value > _STUCK
         else:
             gain = region.step(y, r, jac, floor)[1]
             gradient = region.free_gradient(state.trial, jacobian.T @ residual)
@@ -178,9 +203,8 @@ def advance(
                     grad=gradient,
                     value_fn=lambda y: _cost(evaluate, region.retract(y)),
                 )
-            trial = state.trial + move
+            trial = region.retract(state.trial + move)
             stuck = jnp.asarray(False)
-        trial = region.retract(trial)
         dtype = str(y.dtype)
         done = stuck | (gain <= STOP_GAIN[dtype] * least + STOP_EXACT[dtype])
         return SolverState(y, r, jac, aux, least, gain, trial, memory, state.steps + 1, done)
