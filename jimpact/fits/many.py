@@ -14,23 +14,13 @@ from jimpact.fits.adequacy import unusable
 from jimpact.fits.experiments import Experiments
 from jimpact.fits.fitting import Fit, as_fit, fit
 from jimpact.fits.intervals import check_level
-from jimpact.fits.least_squares import DEFAULT_STEPS, SolverState
-from jimpact.fits.multistart import (
-    SearchResult,
-    at_minimum,
-    ends,
-    repeated,
-    run,
-    settled,
-    start_points,
-)
 from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw
 from jimpact.fits.problem import FitProblem, Residuals, filled_up, of_shots
 from jimpact.fits.result import check_squares
+from jimpact.fits.search import SearchResult, ends, repeated, settled, stacked, start_points
+from jimpact.fits.solve import DEFAULT_STEPS, Search, SolverState, minimize
 from jimpact.progress import progress_bar
 from jimpact.scene import Scene
-
-_METHOD = "levenberg-marquardt"
 
 
 def fit_many(
@@ -44,7 +34,7 @@ def fit_many(
     ties: Mapping[str, Any] | None = None,
     starts: int = 1,
     seed: int = 0,
-    max_steps: int = DEFAULT_STEPS[_METHOD],
+    max_steps: int = DEFAULT_STEPS["levenberg-marquardt"],
     progress: float | None = None,
 ) -> list[Fit[AnyLaw]]:
     """`fit` of one law to each of many data sets, side by side in one compiled program.
@@ -90,34 +80,24 @@ def fit_many(
         for group in groups.values():
             rng = np.random.default_rng(seed)
             points = np.concatenate([start_points(problems[k], starts, rng) for k in group])
-            stacked = jax.tree.map(
-                lambda *x: np.repeat(np.stack([np.asarray(each) for each in x]), starts, axis=0),
-                *(filled[k] for k in group),
-            )
-            group_problems = [problems[k] for k in group]
-            states = run(stacked, points, _METHOD, max_steps, show, rivals=False)
-            searches = _searches(group_problems, states)
-            if stacked.mixing is not None:
-                best = np.array([search.y for search in searches])
-                group_problems, states = settled(
-                    group_problems,
-                    best,
-                    _METHOD,
-                    max_steps,
-                    show,
-                    slopes=[search.slopes for search in searches],
-                )
-                searches = _searches(group_problems, states)
-            for k, problem, search in zip(group, group_problems, searches):
-                if unusable(problem, search).any():  # what is left is another problem
+            chosen = [problems[k] for k in group]
+            all_starts = stacked([problem for problem in chosen for _ in range(starts)])
+            search = Search(max_steps=max_steps, show=show)
+            ended = _ends_of(chosen, minimize(all_starts, points, search))
+            if all_starts.mixing is not None:
+                best, slopes = (np.array([x.y for x in ended]), [x.slopes for x in ended])
+                chosen, states = settled(chosen, best, search, slopes=slopes)
+                ended = _ends_of(chosen, states)
+            for k, problem, solution in zip(group, chosen, ended):
+                if unusable(problem, solution).any():  # what is left is another problem
                     options: dict[str, Any] = {"starts": starts, "seed": seed, "profiles": False}
                     fits[k] = fit(problems[k], max_steps=max_steps, progress=False, **options)
                 else:
-                    fits[k] = as_fit(problem, search, _METHOD)
+                    fits[k] = as_fit(problem, solution, search.method)
     return [fits[k] for k in range(len(problems))]
 
 
-def _searches(problems: list[FitProblem], states: SolverState) -> list[SearchResult]:
+def _ends_of(problems: list[FitProblem], states: SolverState) -> list[SearchResult]:
     """The ends of each problem, all of which have equally many starts."""
     each = len(states.y) // len(problems)
     rows = [slice(i * each, (i + 1) * each) for i in range(len(problems))]
@@ -242,8 +222,8 @@ def _refits(
     """Minima of these problems next to a fit."""
     points = np.tile(fit.problem.point(fit.value), (len(problems), 1))
     with progress_bar(progress) as show:
-        _, states = settled(problems, points, _METHOD, DEFAULT_STEPS[_METHOD], show, many)
+        _, states = settled(problems, points, Search(show=show), many)
     value = fit.problem.values_at(np.asarray(states.y, float))
     predicted = np.asarray(states.aux[0], float)
     predicted = predicted[:, : len(fit.predicted)] if fit.predicted.ndim else predicted
-    return Refits(fit.names, value, predicted, at_minimum(states))
+    return Refits(fit.names, value, predicted, states.converged)

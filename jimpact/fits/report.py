@@ -8,7 +8,6 @@ from jimpact.fits.intervals import in_words
 from jimpact.fits.parameters import value_of
 from jimpact.fits.prediction import tied_values
 from jimpact.fits.result import FitResult
-from jimpact.fits.scatter import SURE, shown_scatter
 from jimpact.status import STATUS
 
 _VELOCITIES_SHOWN = 24  # in the table of shots
@@ -32,7 +31,6 @@ def report_blocks(fit: FitResult) -> dict[str, list[str]]:
         "quality": _quality(fit),
         "undetermined": _section("What the data do not determine", fit.identifiability),
         "minima": _minima(fit),
-        "scatter": _scatter(fit),
         "warnings": _section("Warnings", fit.warnings),
         "shots": _shots(fit),
     }
@@ -40,17 +38,10 @@ def report_blocks(fit: FitResult) -> dict[str, list[str]]:
 
 def verdict(fit: FitResult) -> str:
     """One sentence: values with errors, what they assume, what is undetermined, what is wrong."""
-    law, data = type(fit.law).__name__, _data_name(fit)
+    law = type(fit.law).__name__
     if not fit.converged:
         return f"No answer: the search for the parameters of {law} has not converged."
-    scatter, reserved = shown_scatter(fit), joined_words(fit.reservations)
-    if scatter is not None and scatter.explains:
-        text = f"{law} fits {data} if {scatter}".rstrip(".")
-        return f"{text}; but {reserved}." if reserved else f"{text}."
-    sentence = _values_in_words(fit)
-    if scatter is not None:
-        sentence += f"; {scatter.name} scatters by {scatter.value:.2g} from shot to shot"
-        sentence += f", which accounts for {100 * scatter.share:.2g} % of chi^2"
+    reserved, sentence = joined_words(fit.reservations), _values_in_words(fit)
     against = _objection(fit)
     if against:
         nearest = f"it comes nearest with {sentence}" if fit.determined.any() else sentence
@@ -263,22 +254,6 @@ def _sigma_sources(fit: FitResult) -> list[str]:
 def _section(title: str, lines: tuple[str, ...]) -> list[str]:
     """A list below its title; no lines if it is empty."""
     return [title, *(f"  - {line}" for line in lines)] if lines else []
-
-
-def _scatter(fit: FitResult) -> list[str]:
-    """The scatter of a parameter from shot to shot, where it explains the residuals."""
-    scatter = shown_scatter(fit)
-    if scatter is None:
-        return []
-    lines = ["Scatter from shot to shot", f"  - {scatter}"]
-    assert fit.experiments is not None
-    speed = fit.experiments.approach_speed(fit.problem.scene)
-    chance = scatter.trend(np.log(np.where(speed > 0, speed, 1.0)))
-    if chance < SURE:
-        lines.append(
-            f"  - It depends on the speed (p-value {chance:.1g}): see `ji.VelocityDependent`."
-        )
-    return lines
 
 
 def _minima(fit: FitResult) -> list[str]:

@@ -8,8 +8,9 @@ from jimpact.fits.defects import find_defects
 from jimpact.fits.experiments import kept_by_corrections
 from jimpact.fits.findings import Finding
 from jimpact.fits.matrix_fit import boundary, encloses
-from jimpact.fits.multistart import SearchResult
-from jimpact.fits.problem import EXACT, FitProblem
+from jimpact.fits.problem import FitProblem
+from jimpact.fits.search import SearchResult
+from jimpact.fits.solve import EXACT
 from jimpact.fits.uncertainty import Uncertainty
 from jimpact.laws.kinematic import RestitutionMatrix
 from jimpact.status import STATUS

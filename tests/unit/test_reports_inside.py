@@ -119,25 +119,6 @@ def test_values_that_the_data_do_not_determine_are_marked():
     assert not canned(4, profiles=(flat, flat)).determined.any()
 
 
-def test_page_of_a_fit(tmp_path):
-    """One file: nothing is loaded from elsewhere."""
-    found = canned(4)
-    text = found.report(tmp_path / "fit.html", profiles=False).read_text(encoding="utf-8")
-    for words in (
-        "The data gain energy.",
-        "undetermined",
-        "seed 0",
-        "jimpact",
-        "cannot be determined",
-    ):
-        assert words in text, words
-    assert text.count("<img") == text.count('src="data:image/') == 3
-    for tag in ("<script", "<link", "@import", 'src="http'):
-        assert tag not in text, tag
-    with pytest.raises(ValueError, match=r"`path` must end in \.html"):
-        found.report(tmp_path / "fit.pdf")
-
-
 def test_tables_of_a_fit(monkeypatch):
     found = canned(4)
     pytest.importorskip("pandas")

@@ -1,13 +1,12 @@
-"""Nonlinear least squares in a region: Levenberg-Marquardt, or gradient descent with optax.
+"""Nonlinear least squares in a region, from many starts or of many problems at once.
 
-Minimize `|r(y)|^2 / 2` for y in a `Region`, mostly the `BoxRegion` `low <= y <= high`. Steps are
-cut at the box, and a variable on a bound whose gradient points outward is left out of the step, so
-minima on a bound are found exactly. (Smooth maps of the box onto the real line put them at
-infinity: Levenberg-Marquardt then still crawled after 100 steps, every start ending elsewhere.) One
-pass evaluates residual and Jacobian together once, so that the impact is compiled once; a solve can
-be continued.
+Minimize `|r(y)|^2 / 2` for y in a `Region`, mostly the `BoxRegion` `low <= y <= high`, by
+Levenberg-Marquardt or by gradient descent with optax. Steps are cut at the box, and a variable on a
+bound whose gradient points outward is left out of the step, so minima on a bound are found exactly.
+One pass evaluates residual and Jacobian together, so that an impact is compiled once.
 """
 
+import time
 from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias
@@ -15,6 +14,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+
+from jimpact.compiling import quick_jit
+from jimpact.progress import Show
 
 if TYPE_CHECKING:
     import optax  # which takes long to import
@@ -26,20 +29,39 @@ Method: TypeAlias = "str | optax.GradientTransformation"
 # Steps of one start before the solver gives up: more only costs time.
 DEFAULT_STEPS = {"levenberg-marquardt": 100, "lbfgs": 100, "adam": 500, "sgd": 1000}
 
-# Done when an undamped Gauss-Newton step promises less than this share of the sum of squares:
-# the distance to the minimum is then its root, a hundred-thousandth of the standard error.
-STOP_GAIN = {"float64": 1e-10, "float32": 1e-6}
-# ... or less than this: residuals are of order 1, and impacts are good to 1e-8 (1e-5).
-STOP_EXACT = {"float64": 1e-18, "float32": 1e-11}
+# What an undamped Gauss-Newton step still promises, in variances of one residual (|r|^2 / R): the
+# distance to the minimum is its root, in standard errors. A solve is done at FINE, or at ROUNDING
+# where no lower point is found: sums of squares are right to so much; one of many starts at COARSE,
+# which is enough to tell minima apart; and the answer stands below CONVERGED, a tenth of a
+# standard error.
+FINE = {"float64": 1e-17, "float32": 1e-4}
+ROUNDING = {"float64": 1e-6, "float32": 1e-3}
+COARSE, CONVERGED = 1e-3, 1e-2
+# ... or less than this: residuals are of order 1, and impacts are good to 1e-8 (1e-5), which
+# counts where no lower point is found.
+STOP_EXACT = {"float64": 1e-24, "float32": 1e-12}
+ROUNDING_EXACT = {"float64": 1e-18, "float32": 1e-11}
+# Mean squares (relative to the velocities) below this are a perfect fit: rounding and the
+# tolerance of the impact.
+EXACT = {"float64": 1e-14, "float32": 1e-8}
 
 _DAMPING = 1e-2  # first Levenberg-Marquardt damping, relative to the curvatures
 # Nielsen (1999): the damping falls by this factor at most after a step that gains what it promised,
 # and grows by a factor that doubles with each step that does not.
 _LEAST_FACTOR, _FIRST_GROWTH = 1 / 3, 2.0
 _LEAST = {"float64": 1e-10, "float32": 1e-5}  # smallest damping: keeps the matrix positive
-_STUCK = 1e6  # above this damping a kink of the law lets nothing pass
+_STUCK = 1e6  # above this damping no step, however small, lowers the sum of squares
 _FLAT = 1e-10  # curvatures below this share of the largest are damped as if they had it
 _ADAM_RATE, _SGD_RATE, _SGD_MOMENTUM = 0.1, 0.3, 0.9  # in y, where ranges are of order 1
+
+PASSES = 4  # of a program, between two looks at the clock
+# A start whose sum of squares is so many times the best, and falls by less than this factor in
+# PASSES passes, is given up.
+BEHIND, FALLS = 10.0, 0.5
+
+
+def quiet(step: str, done: float, total: float | None) -> None:
+    """No progress is shown."""
 
 
 class Region(Protocol):
@@ -96,21 +118,6 @@ class BoxRegion(eqx.Module):
         return move, -(gradient @ move) - 0.5 * jnp.sum((jacobian @ move) ** 2)
 
 
-class SolverState(eqx.Module):
-    """The best point so far, what the next pass tries, and the method's memory."""
-
-    y: jax.Array
-    residual: jax.Array
-    jacobian: jax.Array
-    aux: Any
-    cost: jax.Array
-    gain: jax.Array  # what a Gauss-Newton step from the best point still promises
-    trial: jax.Array
-    memory: Any
-    steps: jax.Array
-    done: jax.Array
-
-
 class Damping(NamedTuple):
     """The damping of Levenberg-Marquardt, its next growth, and what the last step promised."""
 
@@ -132,6 +139,34 @@ class Damping(NamedTuple):
         return Damping(value, jnp.where(better, _FIRST_GROWTH, 2 * self.growth), self.promised)
 
 
+class SolverState(eqx.Module):
+    """The best point so far, what the next pass tries, and the method's memory."""
+
+    y: jax.Array
+    residual: jax.Array
+    jacobian: jax.Array
+    aux: Any
+    cost: jax.Array
+    gain: jax.Array  # what a Gauss-Newton step from the best point still promises
+    trial: jax.Array
+    memory: Any
+    steps: jax.Array
+    done: jax.Array
+    stuck: jax.Array  # no step lowers the cost
+
+    @property
+    def squares(self) -> np.ndarray:
+        """`|r|^2` at the best points (S,), on the host."""
+        return 2 * np.asarray(self.cost, float)
+
+    @property
+    def converged(self) -> np.ndarray:
+        """Which of the points (S,) are so close to a minimum that they stand, on the host."""
+        promised, squares = 2 * np.asarray(self.gain, float), self.squares
+        small = promised <= CONVERGED * squares / self.residual.shape[-1]
+        return small | (squares <= EXACT[str(self.y.dtype)]) | np.asarray(self.stuck)
+
+
 def check_method(method: Any) -> None:
     """Raise a ValueError unless `method` is a known name or an optax transformation."""
     if isinstance(method, str) and method in DEFAULT_STEPS:
@@ -150,15 +185,22 @@ def default_steps(method: Method) -> int:
     return DEFAULT_STEPS[method if isinstance(method, str) else "adam"]
 
 
-def begin(y: jax.Array, first: tuple[Any, Any, Any], method: Method, max_steps: int) -> SolverState:
-    """State before the first pass from y (P,); `first` is shaped like what `evaluate` returns."""
-    infinite = jnp.asarray(jnp.inf, y.dtype)
+def begin(y: Any, first: tuple[Any, Any, Any], method: Method, max_steps: int) -> SolverState:
+    """States before the first pass from y (S, P); `first`: arrays like what `evaluate` returns."""
+    count, dtype = len(y), y.dtype
+
+    def all_are(value: Any, dtype: Any = dtype) -> Any:
+        """The value of every state."""
+        return np.full(count, value, dtype)
+
     if method == "levenberg-marquardt":
-        memory: Any = Damping(*jnp.asarray([_DAMPING, _FIRST_GROWTH, jnp.inf], y.dtype))
+        memory: Any = Damping(*map(all_are, (_DAMPING, _FIRST_GROWTH, np.inf)))
     else:
-        memory = _transformation(method, max_steps).init(y)
-    steps, done = jnp.asarray(0), jnp.asarray(False)
-    return SolverState(y, *first, infinite, infinite, y, memory, steps, done)
+        memory = jax.device_get(jax.vmap(_transformation(method, max_steps).init)(y))
+    costs = all_are(np.inf), all_are(np.inf)
+    ends = all_are(0, int), all_are(False, bool), all_are(False, bool)
+    # copies: states are written in place
+    return jax.tree.map(np.array, SolverState(y, *first, *costs, y, memory, *ends))
 
 
 def advance(
@@ -168,9 +210,11 @@ def advance(
     max_steps: int,
     state: SolverState,
     passes: int,
+    stop: Any,
 ) -> SolverState:
-    """Up to `passes` passes more, fewer if done or at the step limit."""
+    """Up to `passes` passes more, fewer if done or at the step limit; `stop`: see `FINE`."""
     last = jnp.minimum(state.steps + passes, max_steps)
+    state = eqx.tree_at(lambda s: s.trial, state, region.retract(state.trial))
 
     def one(state: SolverState) -> SolverState:
         """One pass."""
@@ -181,7 +225,8 @@ def advance(
         best = (state.y, state.residual, state.jacobian, state.aux, state.cost)
         best = jax.tree.map(lambda a, b: jnp.where(better, a, b), here, best)
         y, r, jac, aux, least = best
-        floor = jnp.asarray(_LEAST[str(y.dtype)], y.dtype)
+        dtype = str(y.dtype)
+        floor = jnp.asarray(_LEAST[dtype], y.dtype)
         if method == "levenberg-marquardt":
             memory = state.memory.after(state.cost - cost)
             step = partial(region.step, y, r, jac)
@@ -205,9 +250,12 @@ def advance(
                 )
             trial = region.retract(state.trial + move)
             stuck = jnp.asarray(False)
-        dtype = str(y.dtype)
-        done = stuck | (gain <= STOP_GAIN[dtype] * least + STOP_EXACT[dtype])
-        return SolverState(y, r, jac, aux, least, gain, trial, memory, state.steps + 1, done)
+        finest = stop * least / residual.shape[0] + STOP_EXACT[dtype]
+        rounding = ROUNDING[dtype] * least / residual.shape[0] + ROUNDING_EXACT[dtype]
+        small = gain <= jnp.where(better, finest, jnp.maximum(finest, rounding))
+        return SolverState(
+            y, r, jac, aux, least, gain, trial, memory, state.steps + 1, small | stuck, stuck
+        )
 
     return jax.lax.while_loop(lambda s: ~s.done & (s.steps < last), one, state)
 
@@ -221,8 +269,11 @@ def nearest(region: Region, y: jax.Array) -> jax.Array:
         """From y, and its Jacobian."""
         return at - y, identity, ()
 
-    state = begin(region.retract(y), (y, identity, ()), method, steps)
-    return advance(distance, region, method, steps, state, steps).y
+    infinite, no = jnp.asarray(jnp.inf, y.dtype), jnp.asarray(False)
+    memory = Damping(*jnp.asarray([_DAMPING, _FIRST_GROWTH, jnp.inf], y.dtype))
+    first = (region.retract(y), y, identity, (), infinite, infinite, y, memory)
+    state = SolverState(*first, jnp.asarray(0), no, no)
+    return advance(distance, region, method, steps, state, steps, FINE[str(y.dtype)]).y
 
 
 def _cost(evaluate: Evaluate, y: jax.Array) -> jax.Array:
@@ -253,3 +304,73 @@ def _transformation(method: Method, max_steps: int) -> "optax.GradientTransforma
     elif method == "lbfgs":
         method = optax.lbfgs()
     return optax.with_extra_args_support(method)
+
+
+# ------------------------------------------------------------------------ many at once
+
+
+class Search(NamedTuple):
+    """How minima are searched for: the method, its steps, and how it is watched."""
+
+    method: Method = "levenberg-marquardt"
+    max_steps: int = DEFAULT_STEPS["levenberg-marquardt"]
+    show: Show = quiet
+    deadline: float = np.inf  # of `time.monotonic`, after which no pass is begun
+
+
+def minimize(
+    problems: Any,
+    points: np.ndarray,
+    search: Search,
+    stop: float = 0.0,
+    rivals: bool = False,
+    what: str = "fits",
+) -> SolverState:
+    """Minima of S problems (`Residuals` with a leading axis) from y (S, Q), on the host.
+
+    As many as `problems.lanes(S)` are solved side by side; those that are done make room for
+    others. `stop`: see `FINE`, which it is at least. `rivals`: all are starts of one problem, and
+    those that will not become the best are given up. Progress counts `what`.
+    """
+    dtype, count = problems.offset.dtype, len(points)
+    limit: Any = search.max_steps
+    if search.method == "levenberg-marquardt":
+        limit = np.asarray(limit)  # one program serves all limits
+    rule: Any = (search.method, limit, np.asarray(max(FINE[str(dtype)], stop), dtype))
+    points = points.astype(dtype)
+    states = begin(points, problems.blank(points), search.method, search.max_steps)
+    active, lanes = np.arange(count), problems.lanes(count)
+    while len(active) and time.monotonic() < search.deadline:
+        before = states.cost.copy()
+        for first in range(0, len(active), lanes):
+            rows = active[np.minimum(np.arange(first, first + lanes), len(active) - 1)]
+            some = advance_all(_rows(problems, rows), _rows(states, rows), *rule)
+            for leaf, value in zip(jax.tree.leaves(states), jax.tree.leaves(some)):
+                leaf[rows] = value
+        ended = states.done | (states.steps >= search.max_steps)
+        if rivals:
+            far = states.cost > BEHIND * np.nanmin(states.cost)
+            ended |= far & (states.cost > FALLS * before)
+        active = active[~ended[active]]
+        done, steps = count - len(active), int(states.steps.max())
+        search.show(f"fit: {done} of {count} {what} done, step {steps}", done, count)
+    return states
+
+
+@quick_jit
+def advance_all(
+    problems: Any, states: SolverState, method: Method, max_steps: int, stop: jax.Array
+) -> SolverState:
+    """Up to `PASSES` passes more of every problem."""
+
+    def one(problem: Any, state: SolverState) -> SolverState:
+        """One problem."""
+        region, evaluate = problem.region, problem.evaluate
+        return advance(evaluate, region, method, max_steps, state, PASSES, stop)
+
+    return eqx.filter_vmap(one)(problems, states)
+
+
+def _rows(tree: Any, rows: np.ndarray) -> Any:
+    """These rows of all arrays."""
+    return jax.tree.map(lambda leaf: leaf[rows] if eqx.is_array(leaf) else leaf, tree)
