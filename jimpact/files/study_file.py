@@ -14,7 +14,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from jimpact._checks import as_whole, check_choice, check_values, suggestion
+from jimpact._checks import ABBREVIATIONS, as_whole, check_choice, check_values, suggestion
 from jimpact.files.shots_file import read_positions, read_shots
 
 STUDY = "study.toml"  # in a folder that `jimpact new` has made
@@ -153,11 +153,28 @@ def from_file(path: str | Path, table: str, build: Callable[[dict[str, Any], Pat
     try:
         tables = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: the study must be a TOML file, but {error}.") from None
+        if path.suffix == ".csv":
+            raise ValueError(
+                f"{path}: a study must be a TOML file, but this is a CSV file. `jimpact new fit "
+                "my_fit` writes a study; name this file under [data] in it."
+            ) from None
+        raise ValueError(f"{path}: the study must be a TOML file: {_position(error)}.") from None
     try:
         return build(tables, path)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None
+
+
+def _position(error: Exception) -> str:
+    """Where a file is not TOML, and why.
+
+    >>> from jimpact.files.study_file import _position
+    >>> _position(ValueError("Expected ']' (at line 9, column 7)"))
+    "line 9, column 7: expected ']'"
+    """
+    reason, _, place = str(error).rstrip(")").partition(" (at ")
+    reason = reason[:1].lower() + reason[1:]
+    return f"{place}: {reason}" if place else reason
 
 
 def located(path: Path, table: str) -> Path:
@@ -330,9 +347,9 @@ def check_law(
         for parameter in free:
             if _field(parameter) not in (*declared["free"], *OF_A_SCENE):
                 raise ValueError(
-                    f"`free` in [fit] must name parameters of {name}, "
-                    f"{', '.join(declared['free'])}, but has {parameter!r}."
-                    f"{suggestion(parameter, declared['free'])}"
+                    f"`free` in [fit] must name parameters of {name}, which has no {parameter!r}; "
+                    f"it has {', '.join(declared['free'])}."
+                    f"{suggestion(parameter, declared['free'], ABBREVIATIONS)}"
                 )
     return LawTable(name, arguments, **known), free
 

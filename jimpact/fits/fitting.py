@@ -4,7 +4,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,11 +24,14 @@ from jimpact.fits.saved import read_fit, write_fit
 from jimpact.fits.scene_parameters import plain_law
 from jimpact.fits.search import Minimum, SearchResult, ends, find_minima, settled
 from jimpact.fits.solve import Method, Search, check_method, default_steps
-from jimpact.fits.tables import as_dict, dataset, parameters_frame
+from jimpact.fits.tables import as_dict, dataset, parameters_frame, write_parameters
 from jimpact.fits.uncertainty import RANK_TOLERANCE, Uncertainty, uncertainty
 from jimpact.fits.verdicts import fit_warnings
 from jimpact.progress import progress_bar
 from jimpact.scene import Scene
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure  # which takes long to import
 
 # A minimum gets standard errors up to a sum of squares this many noise standard deviations above
 # the best: intervals of all levels end before. With ten times more, only time is lost.
@@ -94,6 +97,23 @@ class Fit(FitResult[AnyLaw]):
             ValueError: a fit of something else than shots, or with ties: functions cannot be saved.
         """
         return write_fit(self, Path(path))
+
+    def plot(self) -> "Figure":
+        """The picture of `ji.plot.fit`: measured and fitted velocities, and the residuals."""
+        from jimpact import plot
+
+        return plot.fit(self)
+
+    def to_csv(self, path: str | Path) -> Path:
+        """Write a row a parameter: value, standard error, ends of its 95 % interval, whether seen.
+
+        Args:
+            path: the file; an existing file is replaced.
+
+        Returns:
+            The path.
+        """
+        return write_parameters(self, Path(path))
 
     def to_pandas(self) -> Any:
         """The parameters as a `pandas.DataFrame`, which must be installed."""
