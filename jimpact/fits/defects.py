@@ -111,7 +111,7 @@ def find_defects(
 def _units(measured: "_Balances") -> list[Finding]:
     """Whether velocities after are those before but for a factor that a wrong unit leaves.
 
-    By the momentum that is conserved; where none is, by the root of the ratio of energies that grow.
+    By the momentum that is conserved; where none is, by the energy where it grows.
     """
     ratios = [d.ratio for each in measured.momenta.values() for _, d in each]
     gains = [np.sqrt(d.ratio) for _, d in measured.energies if d.ratio > 1]

@@ -783,6 +783,11 @@ def from_scaled(scaled: np.ndarray, scale: np.ndarray, log: np.ndarray) -> np.nd
     return np.where(log, np.exp(np.where(log, scaled, 0.0)), scaled * scale)
 
 
+def filled_count(count: int) -> int:
+    """How many shots a program has that serves so many."""
+    return FEWEST if count <= FEWEST else 2 ** math.ceil(math.log2(count))
+
+
 def filled_up(residuals: Residuals) -> Residuals:
     """With copies of the last shot, of no weight, up to a number that other fits have, too."""
     if not isinstance(residuals.observe, Shots):

@@ -12,11 +12,11 @@ from jimpact.fits.solve import COARSE, EXACT, BoxRegion, Search, SolverState, mi
 
 # Random starts: a stiffness within this factor of the user's, a parameter without two bounds
 # within this many natural scales of the user's.
-START_FACTOR = 20.0
+START_FACTOR = 5.0
 START_SCALES = 2.0
 # Random coefficients of restitution start above this: below, contacts of a chain re-close many
 # times, which takes ten times as long and hardly occurs in hard bodies. (Fits do go there.)
-START_RESTITUTION = 0.3
+START_RESTITUTION = 0.5
 # Ends are one minimum if their sums of squares differ by less than this many variances of a
 # residual, and their values by less than this share of a standard error, or of a natural scale
 # where the data do not determine them. What starts leave is a tenth of that.

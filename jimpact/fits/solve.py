@@ -35,7 +35,7 @@ DEFAULT_STEPS = {"levenberg-marquardt": 100, "lbfgs": 100, "adam": 500, "sgd": 1
 # which is enough to tell minima apart; and the answer stands below CONVERGED, a tenth of a
 # standard error.
 FINE = {"float64": 1e-17, "float32": 1e-4}
-ROUNDING = {"float64": 1e-6, "float32": 1e-3}
+ROUNDING = {"float64": 1e-7, "float32": 1e-3}
 COARSE, CONVERGED = 1e-3, 1e-2
 # ... or less than this: residuals are of order 1, and impacts are good to 1e-8 (1e-5), which
 # counts where no lower point is found.
