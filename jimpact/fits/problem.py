@@ -53,9 +53,9 @@ PENALTY = 1e3  # times the largest measured value
 # Shots are filled up to 4, 8, 16, ... of them: a program serves all numbers in between, and the
 # copies that fill up cost far less than compiling another one.
 FEWEST, FEW = 4, 64
-# Problems that a program solves side by side: of few shots, of many, and of many problems. With
+# Problems that a program solves side by side: starts of one, and many problems. With ten times
 # more of them, all wait for the one whose impacts take longest.
-LANES, LANES_OF_MANY_SHOTS, LANES_OF_MANY = 8, 4, 64
+LANES, LANES_OF_MANY = 4, 64
 
 
 class Prediction(NamedTuple):
@@ -203,7 +203,7 @@ class Residuals(eqx.Module):
         listed = isinstance(self.observe, Shots) or self.measured.ndim == 2
         if listed and self.measured.shape[1] <= FEW:
             return LANES if count <= LANES_OF_MANY else LANES_OF_MANY
-        return LANES_OF_MANY_SHOTS if count > 1 else 1
+        return LANES if count > 1 else 1
 
     def shifted(self, shift: jax.Array) -> "Residuals":
         """With this change (n,) of the velocities before all shots."""

@@ -25,6 +25,8 @@ FLAT = 1e-6  # share of the largest singular value below which data do not deter
 # Starts up to so many variances above the best are solved to their ends, the others only to
 # where minima can be told apart: intervals of all levels end before.
 HARDLY_WORSE = 100.0
+NEAR_SPREAD = 2.0  # of starts around the best, in standard errors
+NEAR_RCOND = 1e-10  # directions that the data do not determine are not searched
 SETTLED, SETTLING = 1e-5, 10  # change (natural scales) and rounds, where errors of v- are passed on
 
 
@@ -58,13 +60,21 @@ class SearchResult(NamedTuple):
 
 
 def find_minima(problem: FitProblem, starts: int, seed: int, search: Search) -> SearchResult:
-    """All starts to where their minima can be told apart, and the best of these to their ends."""
-    residuals = filled_up(problem.residuals)
-    points = start_points(problem, starts, np.random.default_rng(seed))
-    stop = COARSE if starts > 1 else 0.0
-    states = minimize(repeated(residuals, starts), points, search, stop, starts > 1, "starts")
+    """All starts to where their minima can be told apart, and the best of these to their ends.
+
+    The first half of the starts are those of `start_points`. The law is only piecewise smooth, so
+    that the sum of squares has side minima close to a minimum: the others begin around the best.
+    """
+    residuals, rng = filled_up(problem.residuals), np.random.default_rng(seed)
     if starts == 1:
-        return ends(problem, states)
+        points = start_points(problem, 1, rng)
+        return ends(problem, minimize(repeated(residuals, 1), points, search, what="starts"))
+    far = (starts + 1) // 2
+    points = start_points(problem, far, rng)
+    states = minimize(repeated(residuals, far), points, search, COARSE, True, "starts")
+    points = _near(residuals, states, starts - far, rng)
+    more = minimize(repeated(residuals, len(points)), points, search, COARSE, True, "starts")
+    states = jax.tree.map(lambda a, b: np.concatenate([a, b]), states, more)
     groups = _groups(states, len(problem.names))
     firsts = np.array([group[0] for group in groups])
     variance = states.squares[firsts[0]] / states.residual.shape[1]
@@ -87,6 +97,20 @@ def find_minima(problem: FitProblem, starts: int, seed: int, search: Search) -> 
     lost = starts - int(counts[kept].sum())
     states = jax.tree.map(lambda x: x[kept], states)
     return ends(problem, states, counts[kept], lost)._replace(steps=int(steps))
+
+
+def _near(
+    residuals: Residuals, states: SolverState, count: int, rng: np.random.Generator
+) -> np.ndarray:
+    """Points (count, Q) around the best, as far off as its standard errors, inside the bounds."""
+    best = int(np.nanargmin(states.cost))
+    jacobian = np.nan_to_num(np.asarray(states.jacobian[best], float))
+    measured = int(np.sum(np.asarray(residuals.weight) > 0))
+    inverse = np.linalg.pinv(jacobian.T @ jacobian, rcond=NEAR_RCOND, hermitian=True)
+    spread = NEAR_SPREAD * np.sqrt(states.squares[best] / measured * np.diag(inverse))
+    y = np.asarray(states.y[best], float)
+    points = y + np.minimum(spread, START_SCALES) * rng.normal(size=(count, len(y)))
+    return np.clip(points, np.asarray(residuals.low), np.asarray(residuals.high))
 
 
 def find_near(problem: FitProblem, y: np.ndarray, search: Search) -> SearchResult:

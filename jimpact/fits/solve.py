@@ -55,9 +55,10 @@ _FLAT = 1e-10  # curvatures below this share of the largest are damped as if the
 _ADAM_RATE, _SGD_RATE, _SGD_MOMENTUM = 0.1, 0.3, 0.9  # in y, where ranges are of order 1
 
 PASSES = 4  # of a program, between two looks at the clock
-# A start whose sum of squares is so many times the best, and falls by less than this factor in
-# PASSES passes, is given up.
-BEHIND, FALLS = 10.0, 0.5
+# A solve that lowers its sum of squares by less than this share in PASSES passes, although its
+# derivatives promise more, creeps along a kink of the law, where the sequence of contacts changes,
+# and is given up; one of several starts sooner, and the more if it is BEHIND times above the best.
+CREEPS, START_CREEPS, BEHIND, FALLS = 1e-3, 0.01, 10.0, 0.5
 
 
 def quiet(step: str, done: float, total: float | None) -> None:
@@ -330,7 +331,7 @@ def minimize(
 
     As many as `problems.lanes(S)` are solved side by side; those that are done make room for
     others. `stop`: see `FINE`, which it is at least. `rivals`: all are starts of one problem, and
-    those that will not become the best are given up. Progress counts `what`.
+    those that creep or will not become the best are given up. Progress counts `what`.
     """
     dtype, count = problems.offset.dtype, len(points)
     limit: Any = search.max_steps
@@ -348,9 +349,10 @@ def minimize(
             for leaf, value in zip(jax.tree.leaves(states), jax.tree.leaves(some)):
                 leaf[rows] = value
         ended = states.done | (states.steps >= search.max_steps)
-        if rivals:
-            far = states.cost > BEHIND * np.nanmin(states.cost)
-            ended |= far & (states.cost > FALLS * before)
+        if search.method == "levenberg-marquardt":
+            far = states.cost > (BEHIND if rivals else np.inf) * np.nanmin(states.cost)
+            least = np.where(far, FALLS, 1 - (START_CREEPS if rivals else CREEPS))
+            ended |= (states.cost > least * before) & ~states.converged
         active = active[~ended[active]]
         done, steps = count - len(active), int(states.steps.max())
         search.show(f"fit: {done} of {count} {what} done, step {steps}", done, count)
