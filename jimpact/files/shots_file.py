@@ -101,7 +101,8 @@ def _read(
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(
-            f"Data file '{Path(path).absolute()}' does not exist or is not a file."
+            f"Data file '{path}' does not exist or is not a file (looked for in "
+            f"{Path(path).absolute().parent})."
         )
     try:
         text = path.read_text(encoding="utf-8-sig")

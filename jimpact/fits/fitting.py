@@ -166,7 +166,7 @@ def fit(
     ties: Mapping[str, Any] | None = None,
     method: Method = "levenberg-marquardt",
     loss: str = "squares",
-    starts: int = 8,
+    starts: int | None = None,
     seed: int = 0,
     max_steps: int | None = None,
     profiles: bool | None = None,
@@ -208,7 +208,9 @@ def fit(
         loss: 'squares'; or one that outliers move little: 'huber' (beyond 1.345 sigma the absolute
             value), 'student' (the density of Student's t, 4 degrees of freedom). Where sigma is
             not known, it is taken from the median of the residuals.
-        starts: number of starts, the first from the law's values, the others random.
+        starts: number of starts: the first from the law's values, then random ones, the second half
+            around the best of these. None: 8, and further ones around the best as long as they
+            lower the sum of squares by more than the noise of a value.
         seed: of the random starts.
         max_steps: iterations per start.
         profiles: whether intervals are those of `profile`; None: where standard errors cannot be
@@ -240,7 +242,9 @@ def fit(
     """
     check_method(method)
     steps = default_steps(method) if max_steps is None else max_steps
-    for name, count, least in (("starts", starts, 1), ("max_steps", steps, 1), ("seed", seed, 0)):
+    if starts is not None:
+        as_whole("starts", starts, 1)
+    for name, count, least in (("max_steps", steps, 1), ("seed", seed, 0)):
         as_whole(name, count, least)
     check_choice("loss", loss, ("squares", *LOSSES))
     if isinstance(law, FitProblem):

@@ -25,6 +25,7 @@ FLAT = 1e-6  # share of the largest singular value below which data do not deter
 # Starts up to so many variances above the best are solved to their ends, the others only to
 # where minima can be told apart: intervals of all levels end before.
 HARDLY_WORSE = 100.0
+STARTS, ROUNDS = 8, 6  # by default, and how often others around the best follow
 NEAR_SPREAD = 2.0  # of starts around the best, in standard errors
 NEAR_RCOND = 1e-10  # directions that the data do not determine are not searched
 SETTLED, SETTLING = 1e-5, 10  # change (natural scales) and rounds, where errors of v- are passed on
@@ -59,12 +60,14 @@ class SearchResult(NamedTuple):
     lost: int  # starts that did not converge
 
 
-def find_minima(problem: FitProblem, starts: int, seed: int, search: Search) -> SearchResult:
+def find_minima(problem: FitProblem, starts: int | None, seed: int, search: Search) -> SearchResult:
     """All starts to where their minima can be told apart, and the best of these to their ends.
 
     The first half of the starts are those of `start_points`. The law is only piecewise smooth, so
     that the sum of squares has side minima close to a minimum: the others begin around the best.
+    None: STARTS, and further ones around the best as long as they lower it.
     """
+    rounds, starts = (ROUNDS, STARTS) if starts is None else (1, starts)
     residuals, rng = filled_up(problem.residuals), np.random.default_rng(seed)
     if starts == 1:
         points = start_points(problem, 1, rng)
@@ -72,9 +75,14 @@ def find_minima(problem: FitProblem, starts: int, seed: int, search: Search) -> 
     far = (starts + 1) // 2
     points = start_points(problem, far, rng)
     states = minimize(repeated(residuals, far), points, search, COARSE, True, "starts")
-    points = _near(residuals, states, starts - far, rng)
-    more = minimize(repeated(residuals, len(points)), points, search, COARSE, True, "starts")
-    states = jax.tree.map(lambda a, b: np.concatenate([a, b]), states, more)
+    for _ in range(rounds):
+        least = np.nanmin(states.squares)
+        points = _near(residuals, states, starts - far, rng)
+        more = minimize(repeated(residuals, len(points)), points, search, COARSE, True, "starts")
+        states = jax.tree.map(lambda a, b: np.concatenate([a, b]), states, more)
+        if not np.nanmin(more.squares) < least * (1 - 1 / states.residual.shape[1]):
+            break
+    starts = len(states.y)
     groups = _groups(states, len(problem.names))
     firsts = np.array([group[0] for group in groups])
     variance = states.squares[firsts[0]] / states.residual.shape[1]
@@ -168,10 +176,15 @@ def settled(
         states = minimize(many, points, search)
         before, points = points, np.asarray(states.y, float)
         moved = np.abs(points - before).max(axis=1) > SETTLED
-        if many.mixing is None or not moved.any():
+        if many.mixing is None:
             return problems, states
         best = np.nanargmin(states.cost.reshape(-1, each), axis=1)
-        slopes = list(states.aux[-1][np.arange(0, len(points), each) + best])
+        last = list(states.aux[-1][np.arange(0, len(points), each) + best])
+        if not moved.any():
+            if slopes is not None:
+                problems = [p.with_errors_before(slope) for p, slope in zip(problems, last)]
+            return problems, states
+        slopes = last
     return problems, eqx.tree_at(lambda s: s.gain, states, np.where(moved, np.inf, states.gain))
 
 

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.compiling import quick_jit
+from jimpact.compiling import full_precision, quick_jit
 from jimpact.progress import Show
 
 if TYPE_CHECKING:
@@ -51,6 +51,7 @@ _DAMPING = 1e-2  # first Levenberg-Marquardt damping, relative to the curvatures
 _LEAST_FACTOR, _FIRST_GROWTH = 1 / 3, 2.0
 _LEAST = {"float64": 1e-10, "float32": 1e-5}  # smallest damping: keeps the matrix positive
 _STUCK = 1e6  # above this damping no step, however small, lowers the sum of squares
+_SHORT = 10.0  # damping from which on steps shorten, perhaps towards a kink that is the minimum
 _FLAT = 1e-10  # curvatures below this share of the largest are damped as if they had it
 _ADAM_RATE, _SGD_RATE, _SGD_MOMENTUM = 0.1, 0.3, 0.9  # in y, where ranges are of order 1
 
@@ -261,6 +262,7 @@ def advance(
     return jax.lax.while_loop(lambda s: ~s.done & (s.steps < last), one, state)
 
 
+@full_precision
 def nearest(region: Region, y: jax.Array) -> jax.Array:
     """The point of a region nearest to y: least squares of the distance."""
     identity, method = jnp.eye(y.shape[0], dtype=y.dtype), "levenberg-marquardt"
@@ -341,7 +343,7 @@ def minimize(
     points = points.astype(dtype)
     states = begin(points, problems.blank(points), search.method, search.max_steps)
     active, lanes = np.arange(count), problems.lanes(count)
-    while len(active) and time.monotonic() < search.deadline:
+    while len(active):
         before = states.cost.copy()
         for first in range(0, len(active), lanes):
             rows = active[np.minimum(np.arange(first, first + lanes), len(active) - 1)]
@@ -352,10 +354,13 @@ def minimize(
         if search.method == "levenberg-marquardt":
             far = states.cost > (BEHIND if rivals else np.inf) * np.nanmin(states.cost)
             least = np.where(far, FALLS, 1 - (START_CREEPS if rivals else CREEPS))
-            ended |= (states.cost > least * before) & ~states.converged
+            slow = (states.cost > least * before) & (states.memory.value < _SHORT)
+            ended |= slow & ~states.converged
         active = active[~ended[active]]
         done, steps = count - len(active), int(states.steps.max())
         search.show(f"fit: {done} of {count} {what} done, step {steps}", done, count)
+        if time.monotonic() > search.deadline:
+            break
     return states
 
 

@@ -373,7 +373,7 @@ def test_carts_that_stick_end_at_the_bound():
         found = ji.fit(law, ji.chain([0.34175, 0.15449]), data)
         assert float(found.law.restitution) == 0.0
         assert found.at_bound[0]
-        assert "restitution ends at its bound 0" in " ".join(found.warnings)
+        assert "restitution is at its lower bound 0" in " ".join(found.warnings)
         assert "The data violate conservation of momentum" in found.warnings[0]
         assert found.confidence_interval()[0, 0] == 0.0
 

@@ -31,8 +31,8 @@ def in_its_own_folder(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_fit_as_a_user_runs_it(tmp_path, monkeypatch):
-    """The bundled three balls: one e; corrected; all free; the other laws; a picture."""
-    command = [sys.executable, "-m", "jimpact.cli", "fit", "--json"]
+    """The bundled three balls: one e; corrected; all free, since asked for; a picture."""
+    command = [sys.executable, "-m", "jimpact.cli", "fit", "--json", "--all-free"]
     monkeypatch.delenv("COLUMNS", raising=False)
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
     assert all(len(line) <= 80 for line in done.stderr.splitlines())
@@ -42,7 +42,6 @@ def test_fit_as_a_user_runs_it(tmp_path, monkeypatch):
         np.testing.assert_allclose(fits[name]["rms"], rms, atol=5e-5)
     assert fits["all free"]["rank"] == 2
     assert len(fits["all free"]["parameters"]) == 3
-    np.testing.assert_allclose(fits["Newton"]["parameters"][0]["value"], 0.61185, atol=1e-5)
     assert "1.0422" in fits["as measured"]["warnings"][0]
     assert "1.0103" in fits["as measured"]["warnings"][1]
     assert (tmp_path / "jimpact-fit.png").stat().st_size > 10_000
@@ -175,11 +174,9 @@ def test_figure(tmp_path, capsys):
     [
         ["fit", "--out", "file/a.png"],
         ["fit", "--out", "file/deep/a.png"],
-        ["fit", "--report", "file/a.html"],
         ["simulate", "--gif", "file/a.gif"],
         ["simulate", "--portrait", "file/a.png"],
         ["montecarlo", "--folder", "file/chunks"],
-        ["fit", "--report", "folder.html"],
     ],
 )
 def test_unwritable_places_are_refused_before_anything_is_computed(

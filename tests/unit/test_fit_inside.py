@@ -12,6 +12,7 @@ from jimpact.fits.parameters import bounds_of, free_parameters
 from jimpact.fits.prediction import placed_fit
 from jimpact.fits.saved import write_fit
 from jimpact.fits.scene_parameters import LawInScene
+from jimpact.fits.solve import Damping
 from jimpact.fits.ties import tied
 
 
@@ -135,3 +136,37 @@ def test_masks_groups_and_held_contacts():
     masked = ji.fit(law, BALLS, data, {"restitution": [True, False]})
     assert masked.names == ("restitution[1]",)
     np.testing.assert_allclose(masked.law.restitution, [0.7, 0.9], rtol=1e-9)
+
+
+def test_damping_follows_the_gain_ratio():
+    """Nielsen: times 1/3 where all that was promised is gained, 1 at half of it; 2, 4, ... after."""
+    damping = Damping(*jnp.asarray([0.3, 2.0, 1.0]))
+    np.testing.assert_allclose(damping.after(jnp.asarray(1.0)).value, 0.1)
+    np.testing.assert_allclose(damping.after(jnp.asarray(0.5)).value, 0.3)
+    twice = damping.after(jnp.asarray(-1.0)).after(jnp.asarray(-1.0))
+    np.testing.assert_allclose([twice.value, twice.growth], [0.3 * 2 * 4, 8.0])
+
+
+def test_a_kink_is_a_minimum_but_not_a_standard_error():
+    """|x| + x / 2 falls nowhere from 0, although the derivative on each side promises more."""
+
+    def bend(law):
+        x = law.restitution - 0.4
+        return jnp.stack([jnp.abs(x) + 0.5 * x + 1.0, 1.0 + 0 * x])
+
+    problem = ji.FitProblem.from_observable(ji.Newton(0.5), bend, [0.0, 1.0], 0.1)
+    found = ji.fit(problem, starts=1, profiles=False)
+    np.testing.assert_allclose(found.value, 0.4, atol=1e-3)
+    assert "minimum is a kink of the law" in " ".join(found.warnings)
+
+
+def test_a_time_limit_ends_a_search():
+    data = ji.Experiments(SHOTS, simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.02))
+    stopped = ji.fit(ji.Newton(0.9), PAIR, data, method="adam", limit=0.0, profiles=False)
+    assert stopped.verdict.startswith("No answer")
+    assert stopped.steps <= 8
+
+
+def test_as_many_starts_as_stated():
+    data = ji.Experiments(SHOTS, simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.02))
+    assert [ji.fit(ji.Newton(0.9), PAIR, data, starts=n).start_count for n in (1, 3)] == [1, 3]

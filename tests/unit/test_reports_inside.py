@@ -107,7 +107,7 @@ def replace_law(residuals, law):
 def test_values_that_the_data_do_not_determine_are_marked():
     found = canned(4)
     lines = str(found).splitlines()
-    assert any(line.endswith("a start: the data do not determine it") for line in lines)
+    assert any(line.endswith("start value; not determined by the data") for line in lines)
     assert any("restitution[1] 0.4, stiffness[1] (2)" in line for line in lines)
     every = LawFits({"lzb": LawFit("lzb", found, 0.01, np.nan, "fits", "fits")})
     table = str(every)
