@@ -150,14 +150,14 @@ class FitCommand(DrawingCommand):
     """Fit a law to measured velocities or a motion: what the study says, nothing else."""
 
     # Study file, its folder, or a bundled one (three_balls.toml, air_track.toml, tossed_cube.toml,
-    # bead_column.toml, ...); also the study of a motion with [data].
+    # ...); also the study of a motion with [data].
     study: StudyFile = Path("three_balls.toml")
     law: Name = None
     """Law in the place of the study's (see `jimpact laws`), or all: every law, side by side."""
     method: Annotated[str | None, _option("METHOD", str)] = None
     """levenberg-marquardt (the default), adam, sgd or lbfgs, in the place of the study's."""
     starts: Count = None
-    """Number of starts; default: the study's, or 8."""
+    """Number of starts; default: the study's, or 12 and more around the best."""
     seed: Count = None
     """Seed of the random starts."""
     all_free: Flag = False

@@ -208,8 +208,8 @@ def fit(
         loss: 'squares'; or one that outliers move little: 'huber' (beyond 1.345 sigma the absolute
             value), 'student' (the density of Student's t, 4 degrees of freedom). Where sigma is
             not known, it is taken from the median of the residuals.
-        starts: number of starts: the first from the law's values, then random ones, the second half
-            around the best of these. None: 8, and further ones around the best as long as they
+        starts: number of starts: the first from the law's values, then random ones, the last third
+            around the best of these. None: 12, and further ones around the best as long as they
             lower the sum of squares by more than the noise of a value.
         seed: of the random starts.
         max_steps: iterations per start.

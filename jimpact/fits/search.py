@@ -25,7 +25,7 @@ FLAT = 1e-6  # share of the largest singular value below which data do not deter
 # Starts up to so many variances above the best are solved to their ends, the others only to
 # where minima can be told apart: intervals of all levels end before.
 HARDLY_WORSE = 100.0
-STARTS, ROUNDS = 8, 6  # by default, and how often others around the best follow
+STARTS, ROUNDS = 12, 6  # by default, and how often others around the best follow
 NEAR_SPREAD = 2.0  # of starts around the best, in standard errors
 NEAR_RCOND = 1e-10  # directions that the data do not determine are not searched
 SETTLED, SETTLING = 1e-5, 10  # change (natural scales) and rounds, where errors of v- are passed on
@@ -63,7 +63,7 @@ class SearchResult(NamedTuple):
 def find_minima(problem: FitProblem, starts: int | None, seed: int, search: Search) -> SearchResult:
     """All starts to where their minima can be told apart, and the best of these to their ends.
 
-    The first half of the starts are those of `start_points`. The law is only piecewise smooth, so
+    Two thirds of the starts are those of `start_points`. The law is only piecewise smooth, so
     that the sum of squares has side minima close to a minimum: the others begin around the best.
     None: STARTS, and further ones around the best as long as they lower it.
     """
@@ -72,10 +72,10 @@ def find_minima(problem: FitProblem, starts: int | None, seed: int, search: Sear
     if starts == 1:
         points = start_points(problem, 1, rng)
         return ends(problem, minimize(repeated(residuals, 1), points, search, what="starts"))
-    far = (starts + 1) // 2
+    far = starts - starts // 3
     points = start_points(problem, far, rng)
     states = minimize(repeated(residuals, far), points, search, COARSE, True, "starts")
-    for _ in range(rounds):
+    for _ in range(rounds if starts > far else 0):
         least = np.nanmin(states.squares)
         points = _near(residuals, states, starts - far, rng)
         more = minimize(repeated(residuals, len(points)), points, search, COARSE, True, "starts")
