@@ -26,7 +26,7 @@ API = {  # a page, and the modules whose public names it holds: the longest matc
     "Impacts": ("impacts", "audits", "laws.histories", "methods.comparison", "status"),
     "Scenes and bodies": ("scene", "bodies", "contact"),
     "Laws": ("law", "registry", "laws"),
-    "Contact forces": ("laws.forces", "laws.calibration", "laws.materials", "methods.rheologies"),
+    "Contact forces": ("laws.forces", "laws.calibration", "laws.materials"),
     "Shots and fits": ("fits", "cli.study", "files"),
     "Monte Carlo": ("montecarlo",),
     "Motions": ("motion", "cli.study_motion"),

@@ -113,16 +113,9 @@ from .methods.comparison import (
     energy_dispersion as energy_dispersion,
     energy_ratio as energy_ratio,
 )
-from .methods.rheologies import compare_rheologies as compare_rheologies
 from .methods.scene_advice import simplest_scene as simplest_scene
 from .methods.stability import stability_map as stability_map
 from .methods.validity import validity_map as validity_map
-from .methods.waves import (
-    Pulses as Pulses,
-    Trains as Trains,
-    colliding_trains as colliding_trains,
-    pulses as pulses,
-)
 from .montecarlo.distributions import Normal as Normal, RandomLaw as RandomLaw, Uniform as Uniform
 from .montecarlo.gaps import (
     crossover as crossover,

@@ -46,8 +46,7 @@ def full_precision(function: Function) -> Function:
 
 def precise_jit(function: Function) -> Function:
     """`eqx.filter_jit(function)` in full precision."""
-    compiled: Function = full_precision(eqx.filter_jit(function))
-    return compiled
+    return full_precision(eqx.filter_jit(function))  # type: ignore[return-value]
 
 
 @contextmanager

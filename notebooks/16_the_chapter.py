@@ -28,12 +28,13 @@ import jax
 
 jax.config.update("jax_enable_x64", True)
 
+import chapter_figures
 import numpy as np
 
 import jimpact as ji
 
 three, hit = ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0]
-ji.plot.chapter_figure("6.4")
+chapter_figures.draw("6.4")
 
 # %% [markdown]
 # ## Momentum and energy are not sufficient (6.1.1.3)
@@ -44,7 +45,7 @@ ji.plot.chapter_figure("6.4")
 # %%
 ends = ji.theory.admissible_set(three, hit).conserving_arc(2)
 print("A and B:", ends.round(4).tolist())
-ji.plot.chapter_figure("6.3b")
+chapter_figures.draw("6.3b")
 
 # %% [markdown]
 # ## Laws differ by how they spread the energy (6.3.3)
@@ -71,7 +72,7 @@ ji.plot.energy_plane(result, "Three equal balls, e = 0.5")
 # the contacts. Figure 6.9: binary collisions on the left, Moreau's law on the right.
 
 # %%
-ji.plot.chapter_figure("6.9")
+chapter_figures.draw("6.9")
 
 # %% [markdown]
 # ## The force at a wall does not grow with the column (6.1.1)
@@ -80,7 +81,7 @@ ji.plot.chapter_figure("6.9")
 # the column, and the wall feels only its first part.
 
 # %%
-ji.plot.chapter_figure("6.2")
+chapter_figures.draw("6.2")
 
 # %% [markdown]
 # ## Inside a contact (6.3.1)
@@ -89,7 +90,7 @@ ji.plot.chapter_figure("6.2")
 # takes; B is the indentation that remains.
 
 # %%
-ji.plot.chapter_figure("6.6")
+chapter_figures.draw("6.6")
 
 # %% [markdown]
 # ## The rocking block (6.3.2.2)
@@ -98,7 +99,7 @@ ji.plot.chapter_figure("6.6")
 # friction: where a curve touches zero, the other corner is left alone, for every restitution.
 
 # %%
-ji.plot.chapter_figure("6.8b")
+chapter_figures.draw("6.8b")
 
 # %% [markdown]
 # ## Waves (6.1.1.4, Remark 6.4)
@@ -107,7 +108,13 @@ ji.plot.chapter_figure("6.8b")
 # trains would do something else.
 
 # %%
-print(ji.colliding_trains(10))
+for m in range(1, 7):
+    before = np.arange(10) < m
+    out = ji.impact(ji.LZB(1.0, np.ones(9)), ji.chain(np.ones(10)), before.astype(float))
+    forward = np.asarray(out.velocity)[np.asarray(out.velocity) > 0]
+    print(
+        f"{m} hit {10 - m}: {len(forward)} move forward, with {sum(forward**2) / m:.1%} of the energy"
+    )
 
 # %% [markdown]
 # And there are chains that disperse nothing: the last ball takes the whole blow.
@@ -120,6 +127,14 @@ print("stiffness", np.round(stiffness, 4))
 print("v+       ", np.round(out.velocity, 6) + 0.0)
 
 # %% [markdown]
-# The figures are also commands: `jimpact figure` lists them, `jimpact figure 6.9` draws one.
-#
+# The file `chapter_figures.py` beside this notebook draws every figure with public functions of
+# jimpact. The others: the systems as the chapter draws them, and what laws can reach.
+
+# %%
+from IPython.display import display
+
+for number in ("5.5", "6.1", "6.3a", "6.5", "6.7a", "6.7b", "6.8a"):
+    display(chapter_figures.draw(number))
+
+# %% [markdown]
 # *Next: [measured drops](17_measured_drops.ipynb).*

@@ -3,7 +3,8 @@
 The suite spends most of its time on compiling. So tests compile with little optimization, in half
 the time; `programs.values`, the held values and tests marked `long_run` compile with all of it. A
 session reports the tests with the largest programs; the whole default suite fails if it compiles
-more than BUDGET programs, and a test whose programs have products below the highest precision.
+more than BUDGET programs, and a test fails in which the package multiplies matrices with less than
+the highest precision.
 """
 
 import hashlib
@@ -20,6 +21,8 @@ import matplotlib
 import numpy as np
 import programs as programs_of_laws
 import pytest
+
+import jimpact
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -65,7 +68,7 @@ DEAR = (  # groups that take longest begin first, so that no process is left alo
 )
 
 operations = {}  # of each program that counts, by its test and the hash of its text
-coarse = []  # products of the test that runs that ask for less than the highest precision
+coarse = []  # lines of the package with products that ask for less than the highest precision
 running = ["imports"]  # the test that runs in this process
 uncounted = [0]  # compilations of this process since it last counted its maps
 texts = tempfile.TemporaryDirectory(prefix="jimpact-programs-")  # where JAX writes programs down
@@ -83,7 +86,26 @@ def compiled(event, duration, **_):
         name = hashlib.sha256(text).hexdigest()
         if count >= COUNTS_FROM and name not in operations:
             operations[name] = running[0], count
-            coarse.extend(programs_of_laws.below_highest(text.decode()))
+
+
+def watch_products():
+    """Take note of products of matrices that the package makes without `full_precision`."""
+    bind, package = jax.lax.dot_general_p.bind, str(Path(jimpact.__file__).parent)
+    highest = jax.lax.Precision.HIGHEST
+
+    def watched(*args, **options):
+        if options["precision"] not in (highest, (highest, highest)):
+            frame = sys._getframe(1)
+            while frame and is_a_library(frame.f_code.co_filename):
+                frame = frame.f_back
+            if frame and frame.f_code.co_filename.startswith(package):
+                coarse.append(f"{frame.f_code.co_filename}:{frame.f_lineno}")
+        return bind(*args, **options)
+
+    def is_a_library(path):
+        return "site-packages" in path and not path.startswith(package)
+
+    jax.lax.dot_general_p.bind = watched
 
 
 def optimize(fully):
@@ -104,6 +126,7 @@ def pytest_configure(config):
     jax.config.update("jax_dump_ir_to", texts.name)
     jax.config.update("jax_include_debug_info_in_dumps", False)
     jax.monitoring.register_event_duration_secs_listener(compiled)
+    watch_products()
     optimize(False)
     if hasattr(config, "workerinput"):
         return
@@ -195,7 +218,9 @@ def each_test(request):
     optimize(request.node.get_closest_marker("long_run") is not None)
     coarse.clear()
     yield
-    assert not coarse, "products below the highest precision (`full_precision`): " + coarse[0]
+    # what tests in unit/ call is not public: it need not ask for the precision by itself
+    asked = "tests/contract/" not in request.node.nodeid or not coarse
+    assert asked, f"products without `full_precision`: {sorted(set(coarse))}"
     maps = Path("/proc/self/maps")
     if uncounted[0] < COUNT_MAPS_AFTER or not maps.exists():
         return

@@ -117,7 +117,6 @@ MUTATIONS = [
     Mutation("rebound of the last contact without e", "ContactFlow.at_work", "self.restitution * jnp.sqrt(jnp.where(works, energy, 1.0))", "jnp.sqrt(jnp.where(works, energy, 1.0))", FLOW),
     Mutation("audit forgets stored energy", "audit", "change - out.initial_energy", "change", ("test_consistency.py::test_stored_energy_is_not_an_energy_gain",)),
     Mutation("the median deviation taken for sigma", "", "MEDIAN = 1.4826", "MEDIAN = 1.0", ("test_fit.py::test_the_scale_of_robust_losses_is_that_of_normal_errors",)),
-    Mutation("5/4 becomes 3/2 in the indentation of Hertz", "forces_of_equal_restitution", "1.25 * mass", "1.5 * mass", ("test_compliant.py::test_linear_forces_reach_the_indentation_of_hertz",)),
     Mutation("a hundred times the rounding of velocities", "", "ROUNDINGS = 4", "ROUNDINGS = 400", ("test_seams.py::test_ten_times_the_rounding_is_an_impact",)),
     Mutation("degrees of freedom of the F test swapped", "nested_test", "fdtrc(more, rest, ratio)", "fdtrc(rest, more, ratio)", ("test_selection.py::test_the_need_of_a_dependence_on_speed_is_tested",)),
     Mutation("moments of inertia of a box with 1/10", "Box.__init__", "(jnp.sum(square) - square) / 12", "(jnp.sum(square) - square) / 10", ("test_bodies.py::test_moments_of_inertia_of_homogeneous_solids",)),

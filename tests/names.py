@@ -9,7 +9,6 @@ from jimpact.fits.fitting import LOSSES
 from jimpact.fits.solve import DEFAULT_STEPS
 from jimpact.methods.contenders import METHODS
 from jimpact.motion.simulate import METHODS as MOTION_METHODS
-from jimpact.plot.chapter.figures import CAPTIONS
 
 PATH = Path(ji.__file__).parent / "data" / "names.json"
 
@@ -36,7 +35,6 @@ def names():
         "fit_methods": list(DEFAULT_STEPS),
         "losses": ["squares", *LOSSES],
         "motion_methods": list(MOTION_METHODS),
-        "figures": CAPTIONS,
     }
 
 

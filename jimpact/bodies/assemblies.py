@@ -24,6 +24,7 @@ from jimpact.bodies.base import (
     planar_weight,
 )
 from jimpact.bodies.polygons import Cornered, Disc
+from jimpact.compiling import full_precision
 
 # [rad] Direction between two polygons, of which one has an odd number of sides, at which their two
 # contacts change places, see `_all_sides`: none of the usual slopes.
@@ -127,6 +128,7 @@ class PlanarBodies(Body):
         """`V = g sum m_i y_i`."""
         return planar_weight(self.mass, acceleration)
 
+    @full_precision
     def contacts(self, q: jax.Array) -> ContactPoints:
         """Gaps, points and normals at q (3 b,); `between` says of which bodies."""
         places, parts = self._places(q), []
@@ -164,6 +166,7 @@ class PlanarBodies(Body):
         moves = moving(self.between, len(self.bodies))[..., None]
         return (jnp.asarray(moves, q.dtype) * rows).reshape(len(moves), -1).T
 
+    @full_precision
     def valid(self, q: jax.Array) -> jax.Array:
         """The least of the margins () [m], see the class."""
         places, margins = self._places(q), [super().valid(q)[None]]
@@ -370,6 +373,7 @@ def _off_cut(places: _Places, i: int, j: int) -> jax.Array:
     return jnp.maximum(off, apart - _TOUCHING)
 
 
+@full_precision
 def facing_now(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Sides () of two polygons that face each other, and the normal (2,) from a to b.
 

@@ -32,7 +32,7 @@ from jimpact.bodies.base import (
     with_block,
 )
 from jimpact.bodies.neighbours import Candidates, all_pairs, crowd_of, near_pairs
-from jimpact.compiling import precise_jit
+from jimpact.compiling import full_precision, precise_jit
 from jimpact.scene import Scene
 
 # Contacts per body that may be closed by default, by dimension: equal discs have 3, equal spheres
@@ -158,6 +158,7 @@ class Pile(Body):
         squares = sum((x[first] - x[second]) ** 2 for x in columns)
         return jnp.sqrt(squares) - self.radii[first] - self.radii[second]
 
+    @full_precision
     def _wall_gaps(self, q: jax.Array) -> jax.Array:
         """Gaps (k, w) of each body with every wall."""
         d = self.dimension
@@ -445,6 +446,7 @@ class Discs(InPlane):
 
     inertia_factor = 0.5
 
+    @full_precision
     def tangent_function(self, q: jax.Array) -> jax.Array:
         """Ways that the discs slide on each other and along the walls."""
         at = q.reshape(-1, 3)

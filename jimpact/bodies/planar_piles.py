@@ -29,6 +29,7 @@ from jimpact.bodies.base import (
 )
 from jimpact.bodies.piles import InPlane, chosen_rows
 from jimpact.bodies.polygons import Cornered, Disc
+from jimpact.compiling import full_precision
 
 _SLOTS = 2  # contacts of a pair: at both ends of the sides that face each other
 # Contacts, and pairs whose circles around them meet, of each body by default. Ten times more takes
@@ -157,6 +158,7 @@ class PlanarPile(InPlane):
         ]
         return ContactPoints(*chosen)
 
+    @full_precision
     def _wall_gaps(self, q: jax.Array) -> jax.Array:
         """Gaps (k, w, K) of all corners; infinite of those that only fill a row."""
         x = self._placed(q, np.arange(self.count))

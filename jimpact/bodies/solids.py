@@ -210,6 +210,7 @@ class Solid(Body):
         """None: outlines have a shadow on the plane instead."""
         return ()
 
+    @full_precision
     def _drawn(self, q: np.ndarray, curve: np.ndarray) -> list[np.ndarray]:
         """A curve (k, 3) of the body in projection, and its shadow."""
         placed = q[:3] + curve @ np.asarray(rotation(jnp.asarray(q))).T
@@ -339,6 +340,7 @@ class Sphere(Solid):
         """The radius."""
         return self.radius
 
+    @full_precision
     def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
         """Its silhouette, and two great circles of the body with their shadow, in projection."""
         flat = np.insert(CIRCLE, 2, 0.0, axis=1)
@@ -421,6 +423,7 @@ class Coin(Solid):
         """Corners, or the lowest points (2, 3) of round rims."""
         return self.points if self.corners else self._rims(lengths(down[None, :2])[1])
 
+    @full_precision
     def valid(self, q: jax.Array) -> jax.Array:
         """As of `Solid`; of round coins also the tilt beyond `FLAT`."""
         length = super().valid(q)

@@ -19,6 +19,7 @@ from jimpact.bodies.base import (
     numbered,
 )
 from jimpact.bodies.solids import Box, Solid, Sphere, cross, rotation
+from jimpact.compiling import full_precision
 
 # Tangents begin with the direction nearest to this one. No axis: contacts with a normal along it
 # have no first tangent, and normals along axes are frequent.
@@ -159,10 +160,12 @@ class SpatialBodies(Body):
             parts.append(_sphere_on_box(places, *np.array(self.pairs.boxes).T))
         return ContactPoints(*(jnp.concatenate(rows) for rows in zip(*parts)))
 
+    @full_precision
     def gap_function(self, q: jax.Array) -> jax.Array:
         """Gaps f(q) (m,) [m]."""
         return self.contacts(q).gap
 
+    @full_precision
     def gaps_and_normals(self, q: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Gaps (m,) and N (n, m)."""
         contacts = self.contacts(q)
@@ -221,6 +224,7 @@ class SpatialBodies(Body):
         gap, normal = height - places.rim[owner][None], jnp.broadcast_to(n, point.shape)
         return ContactPoints(gap.reshape(-1), point.reshape(-1, 3), normal.reshape(-1, 3))
 
+    @full_precision
     def _along(self, q: jax.Array, point: jax.Array, ways: jax.Array) -> jax.Array:
         """(6 b, m k): speeds along k directions (m, k, 3) of body 1 from body 2 at m points."""
         at, moves = q.reshape(-1, 7), moving(self.between, len(self.bodies))

@@ -527,23 +527,7 @@ def _failure(motion: "ji.Motion") -> str:
     return ""
 
 
-# ----------------------------------------------------------------------------------------- figure
-
-
-def figure(command: options.FigureCommand, steps: Steps) -> CommandResult:
-    """A figure of the source chapter."""
-    from jimpact.plot.chapter.figures import CAPTIONS
-
-    assert command.number is not None  # `FigureCommand.light`
-    caption = CAPTIONS[command.number]
-    with waiting(f"drawing figure {command.number}", steps.patience):
-        picture = ji.plot.chapter_figure(command.number)
-    data = {"number": command.number, "caption": caption}
-    title, table = f"Figure {command.number}: {caption}", (list(data), [list(data.values())])
-    return CommandResult(title, data, picture, table, "")
-
-
 _COMMANDS: dict[str, Callable[[Any, Steps], CommandResult]] = {
     command.__name__: command
-    for command in (fit, compare, montecarlo, chart, stability, advise, simulate, figure)
+    for command in (fit, compare, montecarlo, chart, stability, advise, simulate)
 }

@@ -34,7 +34,6 @@ jimpact: differentiable laws for impacts with several contacts.
   jimpact advise       the simplest law and method that an impact needs
   jimpact chart        how exact and how fast the methods are
   jimpact stability    where the methods fail
-  jimpact figure       the figures of the chapter that the laws are from
   jimpact laws         what each law assumes, and when it is right
 
 Your own data: `jimpact new fit` writes a study, a CSV file and a notebook to

@@ -317,40 +317,6 @@ class SimulateCommand(DrawingCommand):
 
 
 @dataclasses.dataclass(frozen=True)
-class FigureCommand(DrawingCommand):
-    """Draw a figure of the source chapter anew (6.2, 6.9, ...); without a number: list them."""
-
-    number: Annotated[str | None, tyro.conf.Positional, _option("[NUMBER]", str)] = None
-    """Number of the figure, as in Brogliato, Nonsmooth Mechanics (2016)."""
-
-    @property
-    def light(self) -> bool:  # type: ignore[override]
-        """Whether it only lists them."""
-        return self.number is None
-
-    def check(self) -> None:
-        """Also the number."""
-        super().check()
-        if self.number is not None:
-            check_choice("number", self.number, study_file.names()["figures"])
-
-    def subject(self) -> str:
-        """The number."""
-        return self.number or ""
-
-    def run(self) -> int:
-        """List the figures."""
-        figures = study_file.names()["figures"]
-        if self.json:
-            print(json.dumps(figures, indent=2))
-        elif self.csv:
-            print(starting.as_csv(["number", "caption"], [list(x) for x in figures.items()]))
-        else:
-            print("\n".join(f"{number:5s} {caption}" for number, caption in figures.items()))
-        return 0
-
-
-@dataclasses.dataclass(frozen=True)
 class LawsCommand(Command):
     """List the laws: what they assume, when they are right and when they fail."""
 
@@ -426,7 +392,6 @@ COMMANDS: tuple[type[Command] | type[NewCommand], ...] = (
     StabilityCommand,
     AdviseCommand,
     SimulateCommand,
-    FigureCommand,
     LawsCommand,
     NewCommand,
 )

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_concrete, check_kind, check_values
-from jimpact.compiling import quick_jit
+from jimpact.compiling import full_precision, quick_jit
 from jimpact.files.study_file import OF_A_SCENE
 from jimpact.fits.experiments import Experiments, kept_by_corrections
 from jimpact.fits.matrix_fit import matrix_region
@@ -129,6 +129,7 @@ class Residuals(eqx.Module):
     mixing: jax.Array | None = None  # (K, n, n): makes correlated errors of a shot independent
     ties: Ties = eqx.field(static=True, default=())
 
+    @full_precision
     def entries_at(self, y: jax.Array) -> jax.Array:
         """The entries (Q,) of scaled parameters y, before those that are tied follow."""
         scaled = self.offset + self.mix @ y
@@ -156,6 +157,7 @@ class Residuals(eqx.Module):
         error = jnp.where(self.weight > 0, error, 0.0)  # its derivatives may be NaN
         return self.mixed(error * self.weight).reshape(-1), prediction
 
+    @full_precision
     def mixed(self, weighted: Any) -> Any:
         """Weighted errors, shaped like what was measured, as independent ones."""
         if self.mixing is None:

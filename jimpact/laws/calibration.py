@@ -1,7 +1,7 @@
 """Requested against measured restitution: the damping that gives a pair its coefficient.
 
 A pair's coefficient of restitution does not determine what a chain does: forces with the same e at
-the same speed spread an impact differently. `compare_rheologies` shows it.
+the same speed spread an impact differently (docs/compliant.md).
 """
 
 from typing import Any
@@ -9,7 +9,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optimistix as optx
 
 from jimpact._checks import as_float_array, check_values
 from jimpact.compiling import precise_jit
@@ -115,18 +114,27 @@ def _integrated(force: Force, mass: jax.Array, speed: jax.Array) -> jax.Array:
 def _damping(force: Force, mass: jax.Array, speed: jax.Array, e: jax.Array) -> jax.Array:
     """The damping with which one pair has the restitution e, all arguments scalars."""
     unit = force.damping_scale(mass, speed)
+    assert unit is not None  # `calibrate` has looked
 
-    def excess(s: jax.Array, args: Any) -> jax.Array:
+    def excess(s: jax.Array) -> jax.Array:
         """e less that of the damping `unit s / (1 - s)`: from 0 on, s from 0 to 1."""
-        force, mass, speed, e, unit = args
         damped = with_parameter(force, "damping", unit * s / (1 - s))
         known = damped.pair_restitution(mass, speed)
         return e - (_integrated(damped, mass, speed) if known is None else known)
 
-    solver = optx.Bisection(rtol=0.0, atol=float(jnp.finfo(e.dtype).eps), flip=False)
-    ends = {"lower": jnp.zeros_like(e), "upper": jnp.full_like(e, STRONGEST)}
-    args = (force, mass, speed, e, unit)
-    s = optx.root_find(
-        excess, solver, 0.1 * jnp.ones_like(e), args, ends, max_steps=BISECTIONS, throw=False
-    ).value
+    def halved(f: Any, guess: jax.Array) -> jax.Array:
+        """The root of an increasing function between 0 and `STRONGEST`."""
+
+        def half(_: Any, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+            """The half of an interval in which the sign changes."""
+            low, high = ends
+            middle = (low + high) / 2
+            below = f(middle) < 0
+            return jnp.where(below, middle, low), jnp.where(below, high, middle)
+
+        ends = jnp.zeros_like(guess), jnp.full_like(guess, STRONGEST)
+        low, high = jax.lax.fori_loop(0, BISECTIONS, half, ends)
+        return (low + high) / 2
+
+    s = jax.lax.custom_root(excess, jnp.zeros_like(e), halved, lambda g, y: y / g(jnp.ones_like(y)))
     return unit * s / (1 - s)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_whole, check_per_contact, check_shape, check_values
-from jimpact.compiling import precise_jit
+from jimpact.compiling import full_precision, precise_jit
 from jimpact.contact import components, kinetic_angles
 from jimpact.fits.parameters import with_entries
 from jimpact.impacts import impact
@@ -370,6 +370,7 @@ def blocks_of(
     return tuple(blocks)
 
 
+@full_precision
 def _largest_cosines(scene: Scene, friction: bool) -> np.ndarray:
     """Largest |cosine| (m, m) between normals of two contacts, with friction tangents, too."""
     if not friction:

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from jimpact._checks import as_float_array, check_shape, check_values
-from jimpact.compiling import quick_jit
+from jimpact.compiling import full_precision, quick_jit
 from jimpact.motion.dynamics import free_acceleration, mass_at, user_force
 from jimpact.motion.persistent_contact import contacts_at
 from jimpact.motion.system import System
@@ -32,6 +32,7 @@ class QuasiLagrange(NamedTuple):
     norm: jax.Array
     bilateral: int
 
+    @full_precision
     def bilateral_forces(self, force: Any = 0.0) -> jax.Array:
         """lambda_b (b,) that hold the constraints while contacts push with `force` (m,) [N].
 
@@ -42,6 +43,7 @@ class QuasiLagrange(NamedTuple):
         rest = self.normal[:b] - self.matrix[:b, b:] @ push
         return jnp.linalg.solve(self.matrix[:b, :b], rest) / self.norm[:b]
 
+    @full_precision
     def rates(self, force: Any = 0.0) -> tuple[jax.Array, jax.Array]:
         """qn' (b + m,) and qt' while contacts push with `force` (m,) [N], constraints kept."""
         push = as_float_array("force", force) * jnp.ones_like(self.norm[self.bilateral :])

@@ -1,6 +1,5 @@
 """Public names of `ji.plot` and where they live."""
 
-from .chapter.figures import chapter_figure as chapter_figure
 from .charts import (
     advice as advice,
     stability_map as stability_map,
@@ -22,7 +21,6 @@ from .laws import (
     energy_plane as energy_plane,
     forces as forces,
     history as history,
-    rheologies as rheologies,
 )
 from .montecarlo import monte_carlo as monte_carlo
 from .motions import motion as motion, phase_portrait as phase_portrait

@@ -1,15 +1,14 @@
 """Motions as films in real time: GIF, MP4, or a page that plays them."""
 
-import json
 from collections.abc import Callable
 from functools import partial
-from html import escape
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.animation import FFMpegWriter, FuncAnimation, PillowWriter
 from matplotlib.figure import Figure
 
@@ -39,8 +38,8 @@ _GIF_CLOCK, _GIF_LEAST = 100.0, 2.0  # a GIF counts in 1/100 s; viewers do not s
 # GIF; a thousand times more would slow films down.
 _CUT_OFF = 1e-6
 _PLACE = (0.12, 0.08, 0.84, 0.8)  # of the axes in a film, for all frames
-_GRID = 2000  # points along a side of the page's picture, on which curves are drawn
-_RATES = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)  # at which the page can play, of the film's speed
+# [MB] Largest page with its frames. matplotlib's own limit, 20, leaves out the end of a long film.
+_LARGEST_PAGE = 1000
 
 
 def animation(
@@ -58,7 +57,8 @@ def animation(
     Frames are equally spaced in time, whatever the samples are: between the states of the record,
     those at events included, positions follow cubics with the velocities of the record. Bodies in
     space are shown in parallel projection, with their shadows. What moves with the base moves in
-    the picture. The page needs nothing else and no network; it has a slider and a speed.
+    the picture. The page holds all frames and has a slider; only the icons of its buttons come
+    from the network.
 
     Args:
         system: that moved.
@@ -100,11 +100,7 @@ def animation(
     film = _film(system, motion, title, speed, frames_per_second)
     path.parent.mkdir(parents=True, exist_ok=True)
     with counting_bar(len(film.time), "frames", progress) as advance:
-        if path.suffix == ".html":
-            path.write_text(_page(film), encoding="utf-8")
-            advance(len(film.time))
-        else:
-            _save(film, path, advance)
+        _write(film, path, advance)
     return path
 
 
@@ -199,17 +195,13 @@ def _grounds(system: System, time: np.ndarray) -> np.ndarray:
     return np.insert(path, 0, 0.0, axis=1) if path.shape[1] == 1 else path
 
 
-def _colour(i: int) -> str:
-    """Of curve i."""
-    return COLOURS[i // 2 % len(COLOURS)]
-
-
-def _save(film: _Film, path: Path, advance: Callable[[int], None]) -> None:
+def _write(film: _Film, path: Path, advance: Callable[[int], None]) -> None:
     """Frame by frame, by matplotlib."""
     figure = Figure(figsize=(4.8, 4.8), dpi=80)
     axes = figure.add_axes(_PLACE)
     set_limits(axes, film.curves, film.ground, film.floors)
-    lines = [axes.plot([], [], color=_colour(i))[0] for i in range(len(film.curves[0]))]
+    colours = [COLOURS[i // 2 % len(COLOURS)] for i in range(len(film.curves[0]))]
+    lines = [axes.plot([], [], color=colour)[0] for colour in colours]
     drawn = [axes.plot([], [], color=GREY, lw=2)[0] for _ in film.floors]
     view = np.array([axes.get_xlim(), axes.get_ylim()])
 
@@ -223,85 +215,11 @@ def _save(film: _Film, path: Path, advance: Callable[[int], None]) -> None:
         return [*lines, *drawn]
 
     frames = FuncAnimation(figure, draw, frames=len(film.time))
+    if path.suffix == ".html":
+        with rc_context({"animation.embed_limit": _LARGEST_PAGE}):
+            path.write_text(frames.to_jshtml(fps=round(film.rate)), encoding="utf-8")
+        advance(len(film.time))
+        return
     kind: Any = PillowWriter if path.suffix == ".gif" else FFMpegWriter  # both take fractions
     writer = kind(fps=1 / (1 / film.rate + _CUT_OFF))
     frames.save(path, writer=writer, progress_callback=lambda i, n: advance(1))
-
-
-def _page(film: _Film) -> str:
-    """HTML that draws the curves on a canvas, with everything in it."""
-    axes = Figure().subplots()
-    set_limits(axes, film.curves, film.ground, film.floors)
-    view = np.array([axes.get_xlim(), axes.get_ylim()])
-    low, width = view[:, 0], np.ptp(view[0])
-
-    def on_grid(points: np.ndarray) -> list[int]:
-        """x, y, x, y, .. from the upper left corner."""
-        share = (points - low) / width
-        at = np.stack([share[:, 0], 1 - share[:, 1]], axis=1)
-        return [int(x) for x in np.round(_GRID * at).ravel()]
-
-    def frame(k: int) -> dict[str, Any]:
-        floors = [stretch_of(n, d, view, film.ground[k]).T for n, d in film.floors]
-        curves = [on_grid(points) for points in film.curves[k]]
-        return {"time": film.caption(k), "floors": list(map(on_grid, floors)), "curves": curves}
-
-    content = {
-        "grid": _GRID,
-        "rate": film.rate,
-        "grey": GREY,
-        "colours": [_colour(i) for i in range(len(film.curves[0]))],
-        "frames": [frame(k) for k in range(len(film.time))],
-    }
-    rates = "".join(
-        f'<option value="{x:g}"{" selected" * (x == 1)}>{x:g} x</option>' for x in _RATES
-    )
-    title = escape(film.title or "Motion")
-    data = json.dumps(content, separators=(",", ":"))
-    return _PAGE.replace("TITLE", title).replace("RATES", rates).replace("DATA", data)
-
-
-_PAGE = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><title>TITLE</title><style>
-body { font: 16px/1.5 system-ui, sans-serif; margin: 1rem auto; max-width: 40rem; padding: 0 1rem; }
-canvas { width: 100%; aspect-ratio: 1; border: 1px solid #ddd; background: white; }
-.controls { display: flex; gap: .6rem; align-items: center; } input { flex: 1; }
-</style></head><body>
-<h1 style="font-size: 1.2rem">TITLE</h1>
-<canvas id="view" width="1200" height="1200"></canvas>
-<p class="controls"><button id="play">Pause</button>
-<input id="place" type="range" min="0" value="0" aria-label="frame">
-<select id="speed" aria-label="speed">RATES</select><span id="time"></span></p>
-<script>
-"use strict";
-const film = DATA;
-const [view, play, place, speed, time] =
-  ["view", "play", "place", "speed", "time"].map(name => document.getElementById(name));
-const pen = view.getContext("2d"), scale = view.width / film.grid;
-let at = 0, last = null, plays = true;
-place.max = film.frames.length - 1;
-function stroke(points, colour, width) {
-  pen.beginPath();
-  for (let i = 0; i < points.length; i += 2) pen.lineTo(points[i] * scale, points[i + 1] * scale);
-  pen.strokeStyle = colour; pen.lineWidth = width; pen.stroke();
-}
-function draw() {
-  const frame = film.frames[Math.floor(at)];
-  pen.clearRect(0, 0, view.width, view.height);
-  frame.floors.forEach(points => stroke(points, film.grey, 5));
-  frame.curves.forEach((points, i) => stroke(points, film.colours[i], 3));
-  place.value = Math.floor(at); time.textContent = frame.time;
-}
-function tick(now) {
-  if (plays && last !== null) {
-    at = (at + (now - last) / 1000 * film.rate * speed.value) % film.frames.length;
-    draw();
-  }
-  last = now; requestAnimationFrame(tick);
-}
-function toggle(on) { plays = on; play.textContent = on ? "Pause" : "Play"; }
-play.onclick = () => toggle(!plays);
-place.oninput = () => { toggle(false); at = +place.value; draw(); };
-draw(); requestAnimationFrame(tick);
-</script></body></html>
-"""

@@ -8,12 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from scipy.integrate import solve_ivp
 
 from jimpact._checks import check_kind
-from jimpact.contact import delassus_matrix
 from jimpact.files.records import readable_unit
-from jimpact.laws.forces import Force
 from jimpact.laws.histories import History
 from jimpact.methods.comparison import Comparison, energy_dispersion, energy_ratio
 from jimpact.plot.style import (
@@ -31,8 +28,6 @@ from jimpact.plot.style import (
     wrapped,
     write,
 )
-from jimpact.scene import gap_velocity
-from jimpact.solvers.tridiagonal import diagonal
 from jimpact.theory.admissible import admissible_set
 
 _SAMPLES = 120  # points of a force-indentation loop
@@ -176,55 +171,6 @@ def _kept_and_spread(result: Comparison, after: np.ndarray) -> tuple[np.ndarray,
     return np.asarray(kept), np.asarray(jax.vmap(lambda x: energy_dispersion(scene, x))(v))
 
 
-def rheologies(result: Comparison, title: str = "") -> Figure:
-    """Force-indentation loops of contact 1 alone, and what each force makes of the scene.
-
-    Args:
-        result: of `compare_rheologies`, or of `compare` with laws that have a `contact_force`.
-        title: above the picture.
-
-    Returns:
-        A matplotlib figure: `.savefig(path)` writes it.
-
-    Raises:
-        TypeError: a law without a `contact_force`.
-
-    >>> import jimpact as ji
-    >>> laws = {"Hertz": ji.Compliant(ji.Bistiffness(1.0, 1.5, 0.8))}
-    >>> result = ji.compare(ji.chain([1.0, 1.0]), [1.0, 0.0], laws)
-    >>> len(ji.plot.rheologies(result).axes)
-    2
-    """
-    forces = {name: e.law.contact_force for name, e in result.entries.items()}
-    without = [name for name, force in forces.items() if force is None]
-    if without:
-        raise TypeError(
-            "Argument `result` must hold laws with a `contact_force` only, but "
-            f"{without[0]} does not have one."
-        )
-    mass = 1 / float(diagonal(delassus_matrix(result.scene))[0])
-    speed = float(np.max(-np.asarray(gap_velocity(result.scene, result.velocity))))
-    figure = new_figure(6.8)
-    loops, outcome = figure.subplots(2, 1)
-    for (name, force), colour in zip(forces.items(), COLOURS):
-        first = jax.tree.map(lambda leaf: leaf.ravel()[0], force)
-        x, f = _loop(first, mass, speed)
-        loops.plot(x, f, color=colour, label=name, lw=1.4)
-    loops.set_xlabel("indentation [m]")
-    loops.set_ylabel("force [N]")
-    loops.set_title("contact 1 alone", loc="left", fontsize="medium")
-    legend_within(loops)
-    heading(figure, title)
-    _dots(outcome, result, "body")
-    _laws_axis(outcome, list(result.entries))
-    outcome.set_ylabel("velocity after the impact [m/s]")
-    outcome.set_xlabel("force")
-    outcome.set_title("all contacts together", loc="left", fontsize="medium")
-    legend_within(outcome, max(1, len(result.velocity) // 6))
-    finish(loops, outcome)
-    return figure
-
-
 def forces(histories: Mapping[str, History], contact: int = -1) -> Figure:
     """Force at one contact over impact time, one line a history.
 
@@ -347,45 +293,3 @@ def history(result: History, title: str = "") -> Figure:
     legend_below(figure, handles[: len(COLOURS)], 5)
     heading(figure, title)
     return figure
-
-
-def _loop(force: Force, mass: float, speed: float) -> tuple[np.ndarray, np.ndarray]:
-    """Indentation and force of one pair's collision."""
-    loop = force.bistiffness
-    if loop is not None:
-        k, eta = float(loop.stiffness), float(np.asarray(loop.exponent))
-        deepest = ((eta + 1) * mass * speed**2 / (2 * k)) ** (1 / (eta + 1))
-        part = np.linspace(0, 1, _SAMPLES)
-        residual = (1 - float(loop.restitution) ** 2) * deepest
-        plastic = 0.0
-        if force.bound is not None:
-            bound = float(force.bound)
-            elastic = min(deepest, (bound / k) ** (1 / eta))
-            plastic = (0.5 * mass * speed**2 - k * elastic ** (eta + 1) / (eta + 1)) / bound
-            deepest = elastic
-        loading = part * deepest
-        unloading = plastic + residual + part[::-1] * (deepest - residual)
-        f = k * deepest**eta * part**eta
-        return np.concatenate([loading, unloading]), np.concatenate([f, f[::-1]])
-
-    def push(x: float, rate: float) -> float:
-        """The force at an indentation and its rate."""
-        return float(force.force(jnp.asarray(max(x, 0.0)), jnp.asarray(rate)))
-
-    def slack(_: float, y: np.ndarray) -> float:
-        """Zero where the force vanishes as the pair separates."""
-        return push(y[0], y[1]) if y[1] < 0 else 1.0
-
-    slack.terminal = True  # type: ignore[attr-defined]
-    horizon = 1e3 * float(force.indentation_scale(jnp.asarray(0.5 * mass * speed**2))) / speed
-    done = solve_ivp(
-        lambda _, y: [y[1], -max(push(y[0], y[1]), 0.0) / mass],
-        (0, horizon),
-        [0.0, speed],
-        events=slack,
-        rtol=1e-6,
-        atol=1e-12 * horizon * speed,
-        dense_output=True,
-    )
-    y = done.sol(np.linspace(0, done.t[-1], 2 * _SAMPLES))
-    return y[0], np.array([max(push(*row), 0.0) for row in y.T])

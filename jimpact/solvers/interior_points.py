@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jimpact.compiling import full_precision
 from jimpact.loops import while_loop
 
 # Iterations of an attempt; 10 to 30 are usual. Ten times more: what diverges takes longer.
@@ -57,6 +58,7 @@ class _Iterate(NamedTuple):
     tries: jax.Array
 
 
+@full_precision
 def within_cones(
     matrix: jax.Array,
     rate: jax.Array,

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jimpact.compiling import full_precision
 from jimpact.loops import while_loop
 
 # Factors of the inverse step size, the estimate of the largest eigenvalue: where a step shows that
@@ -52,6 +53,7 @@ class _At(NamedTuple):
     tries: jax.Array
 
 
+@full_precision
 def solve_many(
     product: Callable[[jax.Array], jax.Array],
     diagonal: jax.Array,

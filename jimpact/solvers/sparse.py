@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jimpact.compiling import full_precision
 from jimpact.loops import while_loop
 
 # Residual over the right side at which conjugate gradients end, in roundings, and the one from
@@ -99,6 +100,7 @@ def neighbour_sum(entries: jax.Array, vector: jax.Array, neighbours: Neighbours)
     return jnp.sum(entries * vector[neighbours.of_contacts], axis=1)
 
 
+@full_precision
 def conjugate_gradients(product: Callable[[jax.Array], jax.Array], right: jax.Array) -> jax.Array:
     """`A^-1 right` (m,) by products with A symmetric, positive semidefinite, of diagonal 1.
 

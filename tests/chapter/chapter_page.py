@@ -17,7 +17,7 @@ wrong, the last column says what is used; [Equations](equations.md) has all erra
 ```python
 {before}```
 
-`ji.plot.chapter_figure("6.9")` is the figure that `jimpact figure 6.9` draws.
+`chapter_figures` is the file `notebooks/chapter_figures.py`; the notebook `16_the_chapter` draws all figures.
 """
 
 
@@ -55,7 +55,7 @@ def page(sections, before):
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
-    sys.path.insert(0, str(Path(__file__).parent))
+    sys.path[:0] = [str(Path(__file__).parent), str(PAGE.parents[1] / "notebooks")]
     import chapter_rows as rows
 
     made = {

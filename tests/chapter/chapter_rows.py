@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+from chapter_figures import FIGURES
 from scipy.special import gamma
-
-from jimpact.plot.chapter.figures import CAPTIONS
 
 THIRD, TWO_THIRDS = 1 / 3, 2 / 3
 # A bead at the wall, in closed form: deepest indentation, time to it, and back e times faster. The
@@ -57,8 +56,8 @@ class Figure:
 
     @property
     def cells(self):
-        command = f"`jimpact figure {self.number}`"
-        return [f"Fig. {self.number}", CAPTIONS[self.number], command, "", "drawn", ""]
+        command = f'`chapter_figures.draw("{self.number}")`'
+        return [f"Fig. {self.number}", FIGURES[self.number][0], command, "", "drawn", ""]
 
 
 @cache
@@ -147,7 +146,7 @@ SECTIONS = {
         Row(
             "6.1.1.4",
             "2 balls hit 8: balls that move forward",
-            "int(ji.colliding_trains(10, 2).forward[0])",
+            "sum(ji.impact(ji.LZB(1.0, np.ones(9)), ji.chain(np.ones(10)), np.r_[1.0, 1.0, np.zeros(8)]).velocity > 0).item()",
             "M + 2",
             4,
             "so for M <= 6 of ten balls; 13 of 20 at M = 9",

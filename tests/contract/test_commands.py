@@ -3,8 +3,10 @@
 import csv
 import json
 import re
+import signal
 import subprocess
 import sys
+import time
 from importlib.resources import files
 from pathlib import Path
 
@@ -383,7 +385,7 @@ def test_stability(tmp_path, capsys):
 def test_bare_call_greets(capsys):
     code, said = call(capsys)
     assert code == 0
-    for verb in (*VERBS, "figure", "new", "laws"):
+    for verb in (*VERBS, "new", "laws"):
         assert f"{verb}" in said.out
     assert max(map(len, said.out.splitlines())) <= 80
 
@@ -470,8 +472,6 @@ def test_laws(capsys, tmp_path, monkeypatch):
         (["chart", "--methods", "magic"], "`methods` must be one of"),
         (["chart", "--shot", "2"], "--shot must lie in [1, 1], but is 2"),
         (["chart", "three_balls_gaps.toml"], "--velocity must be given"),
-        (["figure", "6.10"], "`number` must be one of 5.5, 6.1, 6.2, 6.3a"),
-        (["figure", "6.4", "--out", "6.9"], "--out must end in .png"),
         (["stability", "--methods", "rk5"], "`methods` must be one of"),
     ],
 )
@@ -568,3 +568,100 @@ def test_typos_are_reported_before_jax_is_imported(tmp_path):
     assert lines[-1] == "[]"
     assert lines[-len(calls) + 1 : -1] == ["2"] * (len(calls) - 2)
     assert done.stderr.count("\n") == len(calls) - 2
+
+
+# ------------------------------------------------------------------------------- processes
+
+
+def interrupted(arguments, folder, moment):
+    """Exit code and stderr of a command that gets ctrl-C once `moment(process)` is true.
+
+    The exit code is None if the command ended before.
+    """
+    command = [sys.executable, "-m", "jimpact.cli", *arguments]
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # an ignored one would be inherited
+    process = subprocess.Popen(
+        command,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=folder,
+    )
+    try:
+        while process.poll() is None and not moment(process):
+            time.sleep(0.02)
+        ended = process.poll() is not None
+        process.send_signal(signal.SIGINT)
+        message = process.communicate()[1]
+    finally:
+        process.kill()
+    return None if ended else process.returncode, message
+
+
+@pytest.mark.slow
+def test_ctrl_c_keeps_finished_chunks(tmp_path):
+    path = written(tmp_path, SAMPLED.replace("samples = 600", "samples = 100_000_000"))
+    run = tmp_path / "run"
+    options = ["montecarlo", path, "--folder", "run"]
+    code, message = interrupted(options, tmp_path, lambda _: list(run.glob("chunk-*.npz")))
+    assert code == 130
+    assert "Finished chunks are in 'run': the same command continues from there." in message
+    assert "Traceback" not in message
+
+
+def after_jax(seconds):
+    """A moment while a command computes: so long after its process has begun to import JAX."""
+    begun = []
+
+    def moment(process):
+        if not begun and "jaxlib" in Path(f"/proc/{process.pid}/maps").read_text():
+            begun.append(time.monotonic())
+        return begun and time.monotonic() - begun[0] >= seconds
+
+    return moment
+
+
+@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="it needs /proc")
+@pytest.mark.parametrize(
+    "verb",
+    [
+        pytest.param(x, marks=pytest.mark.slow if x == "simulate" else pytest.mark.release)
+        for x in VERBS
+    ],
+)
+def test_ctrl_c_while_importing_and_compiling(verb, tmp_path, monkeypatch):
+    """One line and exit code 130, whatever the command is doing then."""
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")  # so that there is something to compile
+    monkeypatch.setenv("JIMPACT_CACHE", "")
+    for seconds in (0.0, 1.0, 3.0):
+        code, message = interrupted([verb], tmp_path, after_jax(seconds))
+        if code is None:
+            break  # this machine had done it all before ctrl-C
+        assert code == 130
+        assert message.splitlines()[-1].startswith("jimpact")
+        assert "Traceback" not in message
+
+
+@pytest.mark.slow
+def test_fit_as_a_user_runs_it(tmp_path, monkeypatch):
+    """The bundled three balls: one e; corrected; all free, since asked for; a picture."""
+    command = [sys.executable, "-m", "jimpact.cli", "fit", "--json", "--all-free"]
+    monkeypatch.delenv("COLUMNS", raising=False)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert all(len(line) <= 80 for line in done.stderr.splitlines())
+    fits = json.loads(done.stdout)["fits"]
+    for name, rms in (("as measured", 0.0166), ("momentum corrected", 0.0089)):
+        np.testing.assert_allclose(fits[name]["parameters"][0]["value"], 0.9911, atol=1e-4)
+        np.testing.assert_allclose(fits[name]["rms"], rms, atol=5e-5)
+    assert fits["all free"]["rank"] == 2
+    assert len(fits["all free"]["parameters"]) == 3
+    assert "1.0422" in fits["as measured"]["warnings"][0]
+    assert "1.0103" in fits["as measured"]["warnings"][1]
+    assert (tmp_path / "jimpact-fit.png").stat().st_size > 10_000
+
+
+def test_the_module_ends_with_the_exit_code_of_the_command():
+    command = [sys.executable, "-m", "jimpact.cli", "fti"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "Did you mean fit?" in done.stderr

@@ -1,19 +1,13 @@
 """One end-to-end call a command; what is refused is one line on stderr and exit code 2."""
 
 import inspect
-import json
-import math
 import os
-import signal
-import subprocess
-import sys
-import time
 import tomllib
 from pathlib import Path
 
 import numpy as np
 import pytest
-from commands_cases import BODIES, SAMPLED, SHOTS, STUDY, VERBS, call, written
+from commands_cases import BODIES, SHOTS, STUDY, call, written
 
 import jimpact as ji
 from jimpact import HarmonicBase
@@ -21,30 +15,11 @@ from jimpact.cli.commands import _per_contact
 from jimpact.cli.main import keep_programs
 from jimpact.cli.study import SAMPLING_ARGUMENTS, body_of
 from jimpact.files import study_file
-from jimpact.plot.chapter.figures import CAPTIONS
 
 
 @pytest.fixture(autouse=True)
 def in_its_own_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-
-
-@pytest.mark.slow
-def test_fit_as_a_user_runs_it(tmp_path, monkeypatch):
-    """The bundled three balls: one e; corrected; all free, since asked for; a picture."""
-    command = [sys.executable, "-m", "jimpact.cli", "fit", "--json", "--all-free"]
-    monkeypatch.delenv("COLUMNS", raising=False)
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert all(len(line) <= 80 for line in done.stderr.splitlines())
-    fits = json.loads(done.stdout)["fits"]
-    for name, rms in (("as measured", 0.0166), ("momentum corrected", 0.0089)):
-        np.testing.assert_allclose(fits[name]["parameters"][0]["value"], 0.9911, atol=1e-4)
-        np.testing.assert_allclose(fits[name]["rms"], rms, atol=5e-5)
-    assert fits["all free"]["rank"] == 2
-    assert len(fits["all free"]["parameters"]) == 3
-    assert "1.0422" in fits["as measured"]["warnings"][0]
-    assert "1.0103" in fits["as measured"]["warnings"][1]
-    assert (tmp_path / "jimpact-fit.png").stat().st_size > 10_000
 
 
 def test_a_fit_with_one_value_per_contact_keeps_the_options_of_its_law(tmp_path):
@@ -55,71 +30,6 @@ def test_a_fit_with_one_value_per_contact_keeps_the_options_of_its_law(tmp_path)
     assert (study.law.rtol, all_free.law.rtol) == (1e-5, 1e-5)
     np.testing.assert_array_equal(study.law.restitution, [0.9, 0.9])
     np.testing.assert_array_equal(study.free["restitution"], [1, 1])
-
-
-def interrupted(arguments, folder, moment):
-    """Exit code and stderr of a command that gets ctrl-C at a moment: seconds, or a condition.
-
-    The exit code is None if the command ended before that moment.
-    """
-    command = [sys.executable, "-m", "jimpact.cli", *arguments]
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # an ignored one would be inherited
-    process = subprocess.Popen(
-        command,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-        cwd=folder,
-    )
-    try:
-        end = time.monotonic() + (math.inf if callable(moment) else moment)
-        while time.monotonic() < end and process.poll() is None:
-            if callable(moment) and moment():
-                break
-            time.sleep(0.02)
-        ended = process.poll() is not None
-        process.send_signal(signal.SIGINT)
-        message = process.communicate()[1]
-    finally:
-        process.kill()
-    return None if ended else process.returncode, message
-
-
-@pytest.mark.slow
-def test_ctrl_c_keeps_finished_chunks(tmp_path):
-    path = written(tmp_path, SAMPLED.replace("samples = 600", "samples = 100_000_000"))
-    run = tmp_path / "run"
-    options = ["montecarlo", path, "--folder", "run"]
-    code, message = interrupted(options, tmp_path, lambda: list(run.glob("chunk-*.npz")))
-    assert code == 130
-    assert "Finished chunks are in 'run': the same command continues from there." in message
-    assert "Traceback" not in message
-
-
-@pytest.mark.parametrize(
-    "verb",
-    [
-        pytest.param(x, marks=pytest.mark.slow if x == "simulate" else pytest.mark.release)
-        for x in VERBS
-    ],
-)
-def test_ctrl_c_while_importing_and_compiling(verb, tmp_path, monkeypatch):
-    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")  # so that there is something to compile
-    monkeypatch.setenv("JIMPACT_CACHE", "")
-    for moment in (0.7, 1.5, 3.0, 4.5):
-        code, message = interrupted([verb], tmp_path, moment)
-        if code is None:
-            break  # this machine had done it all before ctrl-C
-        assert code == 130
-        assert message.splitlines()[-1].startswith("jimpact")
-        assert "Traceback" not in message
-
-
-def test_the_module_ends_with_the_exit_code_of_the_command():
-    command = [sys.executable, "-m", "jimpact.cli", "fti"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert "Did you mean fit?" in done.stderr
 
 
 def test_where_programs_are_kept(tmp_path, monkeypatch):
@@ -155,18 +65,6 @@ def test_every_body_has_a_table(kind):
     assert len(body.names) == (body.coordinates or velocities)
     assert len(body.velocity_names) == velocities
     assert all(name.endswith("]") for name in (*body.names, *body.velocity_names))
-
-
-def test_figure(tmp_path, capsys):
-    listed = call(capsys, "figure")[1].out
-    numbers = [line.split()[0] for line in listed.splitlines()]
-    assert numbers == list(CAPTIONS)
-    assert json.loads(call(capsys, "figure", "--json")[1].out) == CAPTIONS
-    assert len(call(capsys, "figure", "--csv")[1].out.splitlines()) == 1 + len(CAPTIONS)
-    code, said = call(capsys, "figure", "6.3a", "--out", str(tmp_path))
-    assert code == 0
-    assert said.out.startswith("Figure 6.3a: ")
-    assert (tmp_path / "jimpact-figure-6.3a.png").stat().st_size > 10_000
 
 
 @pytest.mark.parametrize(

@@ -70,7 +70,7 @@ print(*[digest(run(Devices(jax.devices()[:count]))) for count in (1, 2, 4)])
 """
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_one_two_and_four_devices(wanted):
     flags = {"XLA_FLAGS": "--xla_force_host_platform_device_count=4"}
     done = subprocess.run(
@@ -102,7 +102,7 @@ def test_dask_in_this_process(wanted, tmp_path):
         assert digest(run(dask_executor(client.scheduler.address))) == wanted
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_killed_dask_worker_changes_nothing(wanted, tmp_path):
     distributed = pytest.importorskip("distributed")
     cluster = distributed.LocalCluster(

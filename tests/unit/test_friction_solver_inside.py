@@ -127,7 +127,7 @@ def outcomes(a, normal, slip, mu, complementary):
     return found
 
 
-@pytest.mark.parametrize("complementary", [pytest.param(True, marks=pytest.mark.slow), False])
+@pytest.mark.parametrize("complementary", [pytest.param(True, marks=pytest.mark.release), False])
 def test_planar_outcomes_are_those_of_brute_force(complementary):
     seen = {"several_outcomes": 0, "ok": 0, "infeasible": 0}
     rng = np.random.default_rng(2)
@@ -159,7 +159,7 @@ def misfit(lanes, found, rows, complementary):
     return np.maximum(np.maximum(normal, outside), power).max(axis=1) / (1 + np.abs(x).max(axis=1))
 
 
-@pytest.mark.parametrize("complementary", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("complementary", [True, pytest.param(False, marks=pytest.mark.release)])
 def test_spatial_outcomes_satisfy_the_law(complementary):
     lanes = random_scenes(2)
     found = ASK[2, complementary](*lanes)
@@ -269,7 +269,7 @@ def along(rows):
     return jax.jit(jax.vmap(one))
 
 
-@pytest.mark.parametrize("rows", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("rows", [1, pytest.param(2, marks=pytest.mark.release)])
 def test_derivatives(rows):
     rng = np.random.default_rng(7)
     lanes = random_scenes(rows, seed=8)

@@ -41,7 +41,7 @@ def test_an_admissible_matrix_to_start_from(scene):
     assert min(slacks(admissible_start([scene])[among], np.linalg.inv(g))) > -1e-9
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_the_admissible_least_squares_solution_is_found():
     """Noisy data that gain energy: the constrained minimum, against scipy."""
     data = shots(np.array([[0.1, 0.2], [0.95, 0.1]]), noise=0.1, seed=4)
@@ -89,7 +89,7 @@ class Watched(RestitutionMatrix):
         return super().impulses(contact)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize("method", ["levenberg-marquardt", "adam"])
 def test_every_iterate_is_admissible(method):
     """... and gradient descent ends where Levenberg-Marquardt does."""

@@ -16,7 +16,7 @@ from jimpact.motion.simulate import CHUNK
 from jimpact.motion.transitions import impact_jump
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_runs_of_the_program_follow_each_other():
     dropped = 0.97, [0.1, 0.101, 0.102], [0.0] * 3, 5.0
     motion = stack(*dropped)

@@ -13,7 +13,7 @@ from jimpact.bodies.solids import rotation
 CUBE = Path(__file__).parents[1] / "data" / "cube_pairs.csv"
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_free_brick_keeps_its_momentum():
     """Far from the plane: a ball falls, and the angular momentum in space stays; order 2."""
     brick, spin = ji.Box([0.1, 0.06, 0.04]), jnp.array([3.0, 12.0, 5.0])
@@ -33,7 +33,7 @@ def test_a_free_brick_keeps_its_momentum():
     assert 3.5 < wrong[0] / wrong[1] < 4.5
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_tossed_cube_makes_its_second_impact_where_it_was_measured():
     """From the measured state at one impact to the next; e and mu are medians over all tosses."""
     rows = list(csv.DictReader(CUBE.open()))

@@ -1,11 +1,9 @@
 """Pictures of every kind, on small records made by hand: nothing overlaps, every axis is labelled.
 
-Nothing is simulated here but some figures of the chapter (slow), so that the layout of all pictures
-costs seconds.
+Nothing is simulated here, so that the layout of all pictures costs seconds.
 """
 
 import dataclasses
-import functools
 import itertools
 
 import jax
@@ -24,7 +22,6 @@ from jimpact.methods.chart import Point, Reference, Timing, WorkPrecision
 from jimpact.methods.comparison import Comparison, Entry
 from jimpact.methods.stability import Confirmation, Slice, StabilityMap
 from jimpact.methods.validity import ValidityMap
-from jimpact.plot.chapter.figures import CAPTIONS
 from jimpact.plot.charts import _styles
 from jimpact.plot.style import SMALL, WIDTH
 
@@ -81,11 +78,6 @@ def energy_plane():
         for name, v in rows.items()
     }
     return ji.plot.energy_plane(Comparison(BALLS, STRIKE, entries), "three balls")
-
-
-def rheologies():
-    names = ("Hertz, bistiffness", "linear, bistiffness", "Kelvin-Voigt", "Hunt-Crossley")
-    return ji.plot.rheologies(Comparison(BALLS, STRIKE, {x: entry(HERTZ) for x in names}), "forces")
 
 
 def chart(gradients):
@@ -209,9 +201,6 @@ def valley(name):
 BLOCK = ji.Block(width=0.2, height=0.6)
 
 
-COMPUTED = ("5.5", "6.2", "6.3b", "6.6", "6.8b", "6.9")  # figures of impacts, which are compiled
-
-
 PICTURES = {
     "advice": advice,
     "comparison": comparison,
@@ -226,7 +215,6 @@ PICTURES = {
     "contact_loop": lambda: ji.plot.contact_loop(impact_history(), title="a loop"),
     "history": lambda: ji.plot.history(impact_history(), "three balls"),
     "energy_plane": energy_plane,
-    "rheologies": rheologies,
     "stability_map": lambda: ji.plot.stability_map(stability(), "where methods fail"),
     "stability_pairs": lambda: ji.plot.stability_pairs(stability(), "rk4"),
     "validity_map": validity,
@@ -246,10 +234,7 @@ PICTURES = {
     "system, a chain": lambda: ji.plot.system(ji.chain([1.0, 4.0, 0.1], "right", [0, 1, 0]), STRIKE),
     "system, a block": lambda: ji.plot.system(BLOCK, BLOCK.touching(0.2), "a block"),
     "force_chains": lambda: force_chains(),
-} | {f"chapter_figure {x}": functools.partial(ji.plot.chapter_figure, x) for x in CAPTIONS}  # fmt: skip
-
-
-SLOW = [f"chapter_figure {number}" for number in COMPUTED]
+}  # fmt: skip
 
 
 def texts(figure):
@@ -275,9 +260,7 @@ def labelled(label):
     return has_unit or label in COUNTED or any(word in label for word in DIMENSIONLESS)
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(x, marks=[pytest.mark.slow] if x in SLOW else []) for x in PICTURES]
-)
+@pytest.mark.parametrize("name", PICTURES)
 def test_layout(name):
     figure = PICTURES[name]()
     FigureCanvasAgg(figure).draw()
@@ -304,17 +287,6 @@ def test_layout(name):
             silent = not any(tick.get_text() and tick.get_visible() for tick in ticks)
             categories = name == "correlation" or (axis == "y" and name == "stability_map")
             assert silent or categories or labelled(label), (axis, label, place)
-
-
-def test_a_loop_encloses_the_energy_lost():
-    """(1 - e^2) m v^2 / 2 of a pair of two balls of 1 kg, m = 1/2; k x^2.5 / 2.5 = m v^2 / 2."""
-    law = ji.Compliant(ji.Bistiffness(3.0, 1.5, 0.6))
-    comparison = Comparison(ji.chain([1.0, 1.0]), np.array([2.0, 0.0]), {"plastic": entry(law)})
-    x, force = ji.plot.rheologies(comparison).axes[0].lines[0].get_data()
-    deepest = (2.5 / 3.0) ** 0.4
-    assert x.max() == pytest.approx(deepest)
-    assert force.max() == pytest.approx(3.0 * deepest**1.5)
-    assert np.trapezoid(force, x) == pytest.approx((1 - 0.6**2) * 1.0, rel=1e-3)
 
 
 def test_laws_stand_at_their_energy_and_dispersion():

@@ -81,7 +81,7 @@ def test_other_static_arguments_and_shapes_are_other_programs(tmp_path, compiled
     assert len(compiled) == len(list(tmp_path.iterdir())) == 6
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_programs_of_a_users_own_law_are_not_stored(tmp_path, compiled):
     same(outcome(tmp_path, Softened(0.5)).velocity, outcome(None).velocity)
     assert not compiled

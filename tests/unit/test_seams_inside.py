@@ -72,7 +72,7 @@ def test_a_padded_chain_contains_itself(wall):
     assert (np.delete(padded.scene.gaps, np.r_[: padded.scene.contacts][padded.contacts]) > 0).all()
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_groups_with_friction_and_open_contacts():
     normals, tangents = np.zeros((6, 3)), np.zeros((6, 3))
     for j in range(3):

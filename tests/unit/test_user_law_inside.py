@@ -101,7 +101,7 @@ def test_declared_domains(law):
     assert ji.REGISTRY["sluggish"].required == ("restitution",)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_study_fit_and_monte_carlo(folder):
     study = read_study(folder / "study.toml")
     found = study.run()
