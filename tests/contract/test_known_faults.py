@@ -21,7 +21,7 @@ def fault(issue, **options):
     return pytest.mark.xfail(strict=True, reason=f"issue '{issue}'", **options)
 
 
-FRICTION, ENGINE, FIT = "One friction", "One engine", "A fit"
+FRICTION, ENGINE = "One friction", "One engine"
 
 
 def status_of(out):
