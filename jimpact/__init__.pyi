@@ -33,7 +33,6 @@ from .contact import (
     normalized_gap_velocity as normalized_gap_velocity,
 )
 from .fits.contours import Contour as Contour, contour as contour
-from .fits.designs import Design as Design, design as design
 from .fits.experiments import Experiments as Experiments, read_experiments as read_experiments
 from .fits.fitting import Fit as Fit, fit as fit, load_fit as load_fit
 from .fits.many import (
@@ -50,12 +49,6 @@ from .fits.measured import (
 from .fits.posterior import posterior as posterior
 from .fits.problem import FitProblem as FitProblem
 from .fits.profiles import Profile as Profile, profile as profile
-from .fits.scatter import (
-    JointScatter as JointScatter,
-    Scatter as Scatter,
-    joint_scatter as joint_scatter,
-    scatter as scatter,
-)
 from .fits.selection import (
     LawFits as LawFits,
     NestedTest as NestedTest,

@@ -6,7 +6,7 @@ JAX is imported by those functions that need it: a study file is checked without
 import importlib
 import operator
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
@@ -114,13 +114,48 @@ def check_choice(name: str, value: Any, choices: Iterable[Any]) -> None:
         )
 
 
-def suggestion(word: Any, choices: Iterable[Any]) -> str:
+# What parameters are called in papers.
+ABBREVIATIONS = {"e": "restitution", "k": "stiffness", "mu": "friction", "eta": "exponent"}
+
+
+def suggestion(
+    word: Any, choices: Iterable[Any], abbreviations: Mapping[str, str] | None = None
+) -> str:
     """' Did you mean X?' for the choice that is spelled most like the word, '' if none is alike."""
     import difflib
 
     known = {str(x).lower(): x for x in choices}
+    full = (abbreviations or {}).get(str(word).lower())
+    if full in known:
+        return f" Did you mean {known[full]}?"
     close = difflib.get_close_matches(str(word).lower(), known, n=1)
     return f" Did you mean {known[close[0]]}?" if close else ""
+
+
+_MOST_NUMBERS = 8  # of an array that are printed
+_ROUNDING = 1e-12  # share of the largest that is printed as 0
+
+
+def in_numbers(values: Any) -> str:
+    """An array as people read it: its first numbers; of a traced one the shape.
+
+    >>> import numpy as np
+    >>> from jimpact._checks import in_numbers
+    >>> in_numbers(np.array([0.1, 2.0])), in_numbers(np.arange(20)), in_numbers(0.25)
+    ('(0.1, 2)', '(0, 1, 2, 3, 4, 5, 6, 7, ...; 20 in all)', '0.25')
+    """
+    try:
+        array = np.asarray(values)
+    except Exception:  # a tracer has no numbers
+        return f"shape {tuple(values.shape)}"
+    if array.ndim == 0:
+        return f"{array.item():.6g}"
+    if array.dtype.kind == "f" and array.size:
+        array = np.where(np.abs(array) <= _ROUNDING * np.nanmax(np.abs(array)), 0.0, array)
+    numbers = [f"{x:.6g}" for x in array.ravel()[:_MOST_NUMBERS].tolist()]
+    if array.size > _MOST_NUMBERS:
+        numbers.append(f"...; {array.size} in all")
+    return f"({', '.join(numbers)})"
 
 
 def check_kind(name: str, value: Any, kind: type) -> None:

@@ -14,6 +14,7 @@ from jimpact._checks import (
     check_shape,
     check_values,
     in_common_dtype,
+    in_numbers,
     is_traced,
 )
 from jimpact.compiling import full_precision, is_top_level_call, quick_jit
@@ -62,6 +63,18 @@ class Impact(eqx.Module):
     initial_energy: jax.Array
     status: jax.Array
     accuracy: jax.Array | float = 0.0
+
+    def __str__(self) -> str:
+        """Velocities, impulses, energy and status, in numbers."""
+        lines = [f"velocity        {in_numbers(self.velocity)} m/s"]
+        lines.append(f"impulse         {in_numbers(self.impulse)} N s")
+        if self.tangential_impulse.size:
+            lines.append(f"tangential      {in_numbers(self.tangential_impulse)} N s")
+        lines.append(f"energy change   {in_numbers(self.energy_change)} J")
+        status = in_numbers(self.status)
+        if self.status.ndim == 0 and status.isdigit():
+            status = STATUS[int(status)].name
+        return "\n".join([*lines, f"status          {status}"])
 
 
 @full_precision

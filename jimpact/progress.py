@@ -132,6 +132,8 @@ class Steps:
     def __init__(self, command: str):
         self.command, self.patience = command, Patience(LONG)
         self.done: list[str] = []
+        # prints and writes what is finished; None: nothing is that could be shown
+        self.show_finished: Callable[[], None] | None = None
 
     def __call__(self, step: str) -> None:
         """Record a step that is done."""

@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_shape, check_values, is_traced
+from jimpact._checks import as_float_array, check_shape, check_values, in_numbers, is_traced
 from jimpact.compiling import full_precision
 from jimpact.solvers.sparse import Neighbours, Sparse
 
@@ -142,6 +142,21 @@ class Scene(eqx.Module):
         )
         self.walls = None
         _check_scene(self)
+
+    def __str__(self) -> str:
+        """Sizes, masses and gaps, in numbers."""
+        kind = "scene"
+        if self.walls is not None:
+            walls = next(name for name, sides in WALLS.items() if sides == self.walls)
+            kind = "chain" + (f" (wall: {walls})" if any(self.walls) else "")
+        lines = [f"{kind} of {self.size} velocities and {self.contacts} contacts"]
+        mass = self.mass if self.mass.ndim == 1 else jnp.diagonal(self.mass, axis1=-2, axis2=-1)
+        lines.append(f"mass     {in_numbers(mass)}{'' if self.mass.ndim == 1 else ' (diagonal)'}")
+        if self.walls is None and self.pairs is None:
+            lines += [f"normal {j + 1} {in_numbers(n)}" for j, n in enumerate(self.normals.T[:6])]
+        if self.gaps is not None:
+            lines.append(f"gaps     {in_numbers(self.gaps)} m")
+        return "\n".join(lines)
 
     @property
     def size(self) -> int:

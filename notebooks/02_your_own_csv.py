@@ -25,6 +25,8 @@
 
 # %%
 # %matplotlib inline
+import html
+import io
 from pathlib import Path
 from tempfile import mkdtemp
 
@@ -133,8 +135,12 @@ print(laws)
 # %%
 print(laws.verdict)
 print(fit.verdict)
-report = fit.report(folder / "fit.html")
-print(report.name, report.stat().st_size // 1000, "kB")
+page = folder / "fit.html"
+picture = io.StringIO()
+ji.plot.fit(fit).savefig(picture, format="svg")
+text = f"<h1>{fit.verdict}</h1><pre>{html.escape(str(fit))}</pre>{picture.getvalue()}"
+page.write_text(f"<!DOCTYPE html><meta charset='utf-8'>{text}", encoding="utf-8")
+print(page.name, page.stat().st_size // 1000, "kB")
 
 # %% [markdown]
 # The command line does all of this, too: `jimpact new fit my_fit` creates a study and a CSV file,

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import jimpact as ji
 from jimpact.fits.fitting import LOSSES
-from jimpact.fits.least_squares import DEFAULT_STEPS
-from jimpact.fits.observables import QUANTITIES
+from jimpact.fits.solve import DEFAULT_STEPS
 from jimpact.methods.contenders import METHODS
 from jimpact.motion.simulate import METHODS as MOTION_METHODS
 
@@ -35,7 +34,6 @@ def names():
         "methods": {name: method.jax for name, method in METHODS.items()},
         "fit_methods": list(DEFAULT_STEPS),
         "losses": ["squares", *LOSSES],
-        "quantities": list(QUANTITIES),
         "motion_methods": list(MOTION_METHODS),
     }
 

@@ -5,7 +5,8 @@ Public names are taken from `jimpact` itself, so that a command imports no more 
 
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from io import BytesIO
@@ -72,6 +73,12 @@ def run(command: options.DrawingCommand, steps: Steps, folder: str | None = None
     jax.config.update("jax_enable_x64", True)  # the program's choice; the library sets none
     with stored_programs(folder):
         result = _COMMANDS[command.name()](command, steps)
+    _show(command, result, steps)
+    return result.failure
+
+
+def _show(command: options.DrawingCommand, result: CommandResult, steps: Steps) -> None:
+    """Write the pictures of a result and print it."""
     pictures: dict[Path, Any] = {command.picture(): result.picture, **result.more}
     replaced = [path for path in pictures if path.exists()]
     for path, picture in pictures.items():
@@ -90,7 +97,6 @@ def run(command: options.DrawingCommand, steps: Steps, folder: str | None = None
         print("\n".join(wrapped(line) for line in lines if line))
     for path in replaced:
         print(f"jimpact {command.name()}: {path} existed and was replaced.", file=sys.stderr)
-    return result.failure
 
 
 def _write_picture(path: Path, picture: "Figure | Callable[[Path], Any]") -> None:
@@ -133,26 +139,62 @@ def _titled(study: Study, before: np.ndarray) -> str:
 # -------------------------------------------------------------------------------------------- fit
 
 FRICTION_PARAMETERS = ("friction", "tangential_restitution")
-RAW, CORRECTED, YARDSTICK, ALL_FREE = "as measured", "momentum corrected", "Newton", "all free"
+RAW, CORRECTED, ALL_FREE = "as measured", "momentum corrected", "all free"
 
 
 def fit(command: options.FitCommand, steps: Steps) -> CommandResult:
-    """The study's fit and its yardsticks; or every law, side by side."""
+    """The study's fit, and what else was asked for; or every law, side by side."""
     if command.law == options.EVERY_LAW:
         return _fit_every_law(command, steps)
-    chosen = {"starts": command.starts, "seed": command.seed, "progress": steps.patience}
+    chosen: dict[str, Any] = {
+        "starts": command.starts,
+        "seed": command.seed,
+        "progress": steps.patience,
+    }
     study: Study | MotionStudy
+    fits: dict[str, ji.Fit] = {}
     if is_motion(command.study):
         from jimpact.cli.study_motion import read_motion_study
 
         study = read_motion_study(command.study, command.law)
-        fits = {RAW: study.fit(**chosen)}
+        fits[RAW] = study.fit(**chosen, limit=command.limit)
         steps(_fit_in_words(RAW, fits[RAW]))
-    else:
-        study = read_study(command.study, command.law)
-        fits = _fit_and_yardsticks(study, chosen | {"method": command.method}, steps)
-    others = {"Newton fitted": fits[YARDSTICK]} if YARDSTICK in fits else None
-    picture = ji.plot.fit(fits[RAW], others, study.title)
+        return _fits_result(study.title, fits)
+    study = read_study(command.study, command.law)
+    end = np.inf if command.limit is None else time.monotonic() + command.limit
+    chosen |= {"method": command.method}
+    for name, each in _fits_of(study, command.all_free, fits):
+        left = max(end - time.monotonic(), 0.0)
+        if name != RAW and left == 0.0:
+            steps(f"{name}: left out, the time limit is reached")
+            continue
+        profiles = None if name == RAW else False  # only the report of this fit shows them
+        limit = None if command.limit is None else left
+        fits[name] = each.run(**chosen, profiles=profiles, limit=limit)
+        steps(_fit_in_words(name, fits[name]))
+        steps.show_finished = lambda: _show(command, _fits_result(study.title, fits), steps)
+    steps.show_finished = None
+    return _fits_result(study.title, fits)
+
+
+def _fits_of(
+    study: Study, all_free: bool, fits: Mapping[str, "ji.Fit"]
+) -> Iterator[tuple[str, Study]]:
+    """The studies to fit, by name: as it is; its momentum corrected where it must be; all free."""
+    with_all_free = None
+    if all_free:  # fits of one law share one compiled program
+        study, with_all_free = _per_contact(study)
+    yield RAW, study
+    if any("conservation of momentum" in line for line in fits[RAW].warnings):
+        assert study.experiments is not None  # it was fitted
+        data = study.experiments.momentum_corrected(study.scene)
+        yield CORRECTED, replace(study, experiments=data)
+    if with_all_free is not None:
+        yield ALL_FREE, with_all_free
+
+
+def _fits_result(title: str, fits: dict[str, "ji.Fit"]) -> CommandResult:
+    """All fits as text, table and picture."""
     text = "\n".join([str(fits[RAW]), "", *_fits_table(fits), ""])
     heads = ["fit", "law", "parameter", "value", "standard_error", "rms_m_per_s", "rank"]
     rows = [
@@ -160,18 +202,17 @@ def fit(command: options.FitCommand, steps: Steps) -> CommandResult:
         for name, x in fits.items()
         for i, parameter in enumerate(x.names)
     ]
-    page = {} if command.report is None else {command.report: fits[RAW].report}
-    return CommandResult(study.title, {"fits": fits}, picture, (heads, rows), text, page)
+    picture = ji.plot.fit(fits[RAW], None, title)
+    return CommandResult(title, {"fits": dict(fits)}, picture, (heads, rows), text)
 
 
 def _fit_every_law(command: options.FitCommand, steps: Steps) -> CommandResult:
-    """All laws on the study's data; picture and page are those of the first one."""
+    """All laws on the study's data; the picture is that of the first one."""
     study = read_study(command.study)
     fits = _laws_fitted(study, steps, starts=command.starts, seed=command.seed)
     best = fits.best
     picture = ji.plot.fit(best.fit, None, f"{study.title}: {best.name}")
-    page = {} if command.report is None else {command.report: best.fit.report}
-    return CommandResult(study.title, fits, picture, fits.rows(), more=page)
+    return CommandResult(study.title, fits, picture, fits.rows())
 
 
 def _laws_fitted(study: Study, steps: Steps, **chosen: int | None) -> "ji.LawFits":
@@ -196,35 +237,6 @@ def _laws_fitted(study: Study, steps: Steps, **chosen: int | None) -> "ji.LawFit
         done=done,
         **(values | searches | without_none(chosen)),
     )
-
-
-def _fit_and_yardsticks(study: Study, chosen: dict[str, Any], steps: Steps) -> dict[str, "ji.Fit"]:
-    """The study's fit and its yardsticks; fits of one law share one compiled program."""
-    study, all_free = _per_contact(study)
-    fits: dict[str, ji.Fit] = {}
-
-    def run(name: str, study: Study) -> None:
-        """Fit, and count it as a step."""
-        profiles = None if name == RAW else False  # only the report of this fit shows them
-        fits[name] = study.run(**chosen, profiles=profiles)
-        steps(_fit_in_words(name, fits[name]))
-
-    run(RAW, study)
-    if study.measured is not None:  # the other laws know no forces and no times
-        return fits
-    if any("conservation of momentum" in line for line in fits[RAW].warnings):
-        assert study.experiments is not None  # it was fitted
-        data = study.experiments.momentum_corrected(study.scene)
-        run(CORRECTED, replace(study, experiments=data))
-    if not isinstance(study.law, ji.Newton):
-        friction = getattr(study.law, "friction", None)
-        shared = [name for name in ("restitution", "friction") if name in study.free]
-        free: dict[str, Any] = dict.fromkeys(shared or ["restitution"], True)
-        alone: dict[str, Any] = {"free": free, "bounds": {}, "priors": {}}
-        run(YARDSTICK, replace(study, law=ji.Newton(0.5, friction), **alone))
-    if all_free is not None:
-        run(ALL_FREE, all_free)
-    return fits
 
 
 def _per_contact(study: Study) -> tuple[Study, Study | None]:

@@ -61,6 +61,10 @@ class Call:
         """What ctrl-C leaves behind."""
         done = f" after: {'; '.join(self.steps.done)}" if self.steps and self.steps.done else ""
         remains = "" if self.command is None else self.command.remains()
+        if self.steps is not None and self.steps.show_finished is not None:
+            self.steps.show_finished()
+            sys.stdout.flush()
+            remains = "What was finished is printed and drawn."
         return f"{self.name}: stopped{done}. {remains}".rstrip()
 
     def warn(self, message: Any, *_: Any) -> None:

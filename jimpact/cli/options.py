@@ -30,6 +30,7 @@ Flag = Annotated[bool, tyro.conf.arg(help_behavior_hint="")]
 File = Annotated[Path | None, _option("FILE", Path)]
 Folder = Annotated[Path | None, _option("DIR", Path)]
 Count = Annotated[int | None, _option("N", int)]
+Seconds = Annotated[float | None, _option("SECONDS", float)]
 Name = Annotated[str | None, _option("NAME", str)]
 Names = Annotated[tuple[str, ...], _option("NAME ...")]
 
@@ -146,33 +147,35 @@ class ShotCommand(DrawingCommand):
 
 @dataclasses.dataclass(frozen=True)
 class FitCommand(DrawingCommand):
-    """Fit a law to measured velocities, forces, times or a motion."""
+    """Fit a law to measured velocities or a motion: what the study says, nothing else."""
 
     # Study file, its folder, or a bundled one (three_balls.toml, air_track.toml, tossed_cube.toml,
-    # bead_column.toml, ...); also the study of a motion with [data].
+    # ...); also the study of a motion with [data].
     study: StudyFile = Path("three_balls.toml")
     law: Name = None
     """Law in the place of the study's (see `jimpact laws`), or all: every law, side by side."""
     method: Annotated[str | None, _option("METHOD", str)] = None
     """levenberg-marquardt (the default), adam, sgd or lbfgs, in the place of the study's."""
     starts: Count = None
-    """Number of starts; default: the study's, or 8."""
+    """Number of starts; default: the study's, or 12 and more around the best."""
     seed: Count = None
     """Seed of the random starts."""
-    report: File = None
-    """One page (.html) with all of the fit: intervals, profiles, pictures, versions."""
+    all_free: Flag = False
+    """Fit a second time, every restitution and stiffness ratio free."""
+    limit: Seconds = None
+    """Seconds after which no further step is begun; default: no limit."""
 
     def check(self) -> None:
-        """Also the study, which must have data, and the report's kind."""
+        """Also the study, which must have data."""
         super().check()
-        if self.report is not None:
-            checked_file("--report", self.report, (".html", ".htm"))
+        if self.limit is not None and not self.limit > 0:
+            raise ValueError(f"--limit must be > 0 seconds, but is {self.limit:g}.")
         if self.method is not None:
             check_choice("method", self.method, study_file.names()["fit_methods"])
         law = None if self.law == EVERY_LAW else self.law
         if study_file.is_motion(self.study):
-            if self.method is not None or self.law == EVERY_LAW:
-                raise ValueError("--method and --law all must be left out for a motion.")
+            if self.method is not None or self.law == EVERY_LAW or self.all_free:
+                raise ValueError("--method, --law all, --all-free must be left out for a motion.")
             study = study_file.check_motion_study(self.study, law)
         else:
             study, shots = study_file.check_study(self.study, law)

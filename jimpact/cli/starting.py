@@ -106,7 +106,11 @@ def begin(kind: str, folder: Path, like: str | None = None) -> list[Path]:
     texts[folder / "study.ipynb"] = _notebook(template)
     existing = [str(path) for path in texts if path.exists()]
     if existing:
-        raise ValueError(f"{', '.join(existing)} must not exist yet: name another folder.")
+        other = folder.with_name(f"{folder.name}_2")
+        raise ValueError(
+            f"{', '.join(existing)} must not exist yet; name another folder: "
+            f"`jimpact new {kind} {other}`."
+        )
     folder.mkdir(parents=True, exist_ok=True)
     for path, text in texts.items():
         path.write_text(text, encoding="utf-8")

@@ -24,7 +24,6 @@ from jimpact.files.study_file import (
 from jimpact.fits.experiments import Experiments, read_experiments
 from jimpact.fits.fitting import Fit, fit
 from jimpact.fits.matrix_fit import admissible_start
-from jimpact.fits.observables import Measured, observations
 from jimpact.fits.parameters import OF_SPEED, default_free
 from jimpact.fits.problem import FitProblem, of_shots
 from jimpact.law import Law, free_parameters_of
@@ -52,7 +51,6 @@ class Study:
         parameters: the law's values as the file states them.
         options: of `fit`, by name.
         monte_carlo: arguments of `monte_carlo`, empty without `[monte_carlo]`.
-        measured: the values of `[[observe]]`, else None.
     """
 
     title: str
@@ -65,7 +63,6 @@ class Study:
     options: dict[str, Any] = field(default_factory=dict)
     priors: dict[str, Any] = field(default_factory=dict)
     monte_carlo: dict[str, Any] = field(default_factory=dict)
-    measured: Measured | None = None
 
     def run(self, **options: Any) -> Fit:
         """`fit` with the study's options, or with those that are passed and not None."""
@@ -74,15 +71,12 @@ class Study:
 
     @property
     def problem(self) -> FitProblem:
-        """The problem that `run` solves: of the shots, or of the observables."""
+        """The problem that `run` solves."""
         return self._problem(FitProblem.from_shots)
 
     def _problem(self, of_shots: Callable[..., FitProblem]) -> FitProblem:
         """The same, that of shots made by this function."""
         choice = self.free, self.bounds, self.priors
-        if self.measured is not None:
-            value, sigma, observe = self.measured
-            return FitProblem.from_observable(self.law, observe, value, sigma, *choice)
         if self.experiments is None:
             raise ValueError(NO_DATA)
         return of_shots(self.law, self.scene, self.experiments, *choice)
@@ -110,11 +104,6 @@ def read_study(path: str | Path, law: str | None = None) -> Study:
     - `[data]`: file (relative to the study, see `read_experiments`), momentum_corrected; of shots
       with scenes of their own near_m, contacts (only shots with that many). Without data a study
       can be compared, not fitted.
-    - `[[observe]]`, in the place of `[data]`: quantity (peak_force [N], arrival_time [s] of a
-      contact; duration [s] of a contact or of all; energy_ratio; bounce_height [m] of a body),
-      contact or body (from 1), value and sigma (numbers or lists; with relative = true divided by
-      the first value); velocity_m_per_s, one for each body, or drop_height_m; bodies (how many,
-      counted from the wall), a number or one for each value.
     - `[monte_carlo]`: velocity_m_per_s, gaps_m, law, samples, seed, chunk, bins; see
       `monte_carlo`.
 
@@ -150,7 +139,7 @@ def _build(checked: CheckedStudy) -> Study:
     law = row.build(**values)
     fittable = free_parameters_of(law)
     bounce = [name for name in ("restitution", *OF_SPEED) if name in fittable]
-    data, observed = tables.get("data"), tables.get("observe")
+    data = tables.get("data")
     return Study(
         checked.title,
         scene,
@@ -162,7 +151,6 @@ def _build(checked: CheckedStudy) -> Study:
         options=checked.fit_options,
         priors=checked.law.priors,
         monte_carlo=_sampling(tables["monte_carlo"], law, scene) if "monte_carlo" in tables else {},
-        measured=None if observed is None else observations(scene, observed),
     )
 
 

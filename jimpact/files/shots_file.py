@@ -100,7 +100,10 @@ def _read(
     """Place of the header, its columns, and the lines below with their places."""
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"Data file '{path}' does not exist or is not a file.")
+        raise FileNotFoundError(
+            f"Data file '{path}' does not exist or is not a file (looked for in "
+            f"{Path(path).absolute().parent})."
+        )
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:

@@ -14,7 +14,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from jimpact._checks import as_whole, check_choice, check_values, suggestion
+from jimpact._checks import ABBREVIATIONS, as_whole, check_choice, check_values, suggestion
 from jimpact.files.shots_file import read_positions, read_shots
 
 STUDY = "study.toml"  # in a folder that `jimpact new` has made
@@ -41,13 +41,6 @@ FIT = TableKeys(
 )
 DATA = TableKeys(
     ("file", "momentum_corrected", "near_m", "contacts"), ("file",), flags=("momentum_corrected",)
-)
-OBSERVE_SHOTS = ("velocity_m_per_s", "drop_height_m")  # one of them says what happens
-OBSERVE = TableKeys(
-    ("quantity", "value", "sigma", "relative", "contact", "body", "bodies", *OBSERVE_SHOTS),
-    ("quantity", "value"),
-    flags=("relative",),
-    words={"quantity": "quantities"},
 )
 SAMPLING = TableKeys(
     ("velocity_m_per_s", "gaps_m", "law", "samples", "seed", "chunk", "bins"),
@@ -94,7 +87,7 @@ _UNITS = {
     "inertia": "kg_m2",
     "angle": "rad",
 }
-NO_DATA = "a study must have a [data] table or [[observe]] to be fitted, but has none."
+NO_DATA = "a study must have a [data] table to be fitted, but has none."
 
 T = TypeVar("T")
 
@@ -133,7 +126,7 @@ class CheckedStudy(NamedTuple):
     @property
     def fitted(self) -> bool:
         """Whether there is something to fit."""
-        return "data" in self.tables or "observe" in self.tables
+        return "data" in self.tables
 
     @property
     def fit_options(self) -> dict[str, Any]:
@@ -160,11 +153,28 @@ def from_file(path: str | Path, table: str, build: Callable[[dict[str, Any], Pat
     try:
         tables = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: the study must be a TOML file, but {error}.") from None
+        if path.suffix == ".csv":
+            raise ValueError(
+                f"{path}: a study must be a TOML file, but this is a CSV file. `jimpact new fit "
+                "my_fit` writes a study; name this file under [data] in it."
+            ) from None
+        raise ValueError(f"{path}: the study must be a TOML file: {_position(error)}.") from None
     try:
         return build(tables, path)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None
+
+
+def _position(error: Exception) -> str:
+    """Where a file is not TOML, and why.
+
+    >>> from jimpact.files.study_file import _position
+    >>> _position(ValueError("Expected ']' (at line 9, column 7)"))
+    "line 9, column 7: expected ']'"
+    """
+    reason, _, place = str(error).rstrip(")").partition(" (at ")
+    reason = reason[:1].lower() + reason[1:]
+    return f"{place}: {reason}" if place else reason
 
 
 def located(path: Path, table: str) -> Path:
@@ -234,10 +244,8 @@ def check_impact_tables(
         modules: whether the module that a study names has been imported; else a law that may be
             registered there is not checked.
     """
-    check_tables(tables, ("scene", "law"), IMPACT_TABLES, ("observe",))
+    check_tables(tables, ("scene", "law"), IMPACT_TABLES)
     check_scene(tables["scene"])
-    if "observe" in tables:
-        check_observed(tables)
     if "monte_carlo" in tables:
         check_sampling(tables["monte_carlo"])
     return _with_law(tables, path, other_law, modules)
@@ -339,9 +347,9 @@ def check_law(
         for parameter in free:
             if _field(parameter) not in (*declared["free"], *OF_A_SCENE):
                 raise ValueError(
-                    f"`free` in [fit] must name parameters of {name}, "
-                    f"{', '.join(declared['free'])}, but has {parameter!r}."
-                    f"{suggestion(parameter, declared['free'])}"
+                    f"`free` in [fit] must name parameters of {name}, which has no {parameter!r}; "
+                    f"it has {', '.join(declared['free'])}."
+                    f"{suggestion(parameter, declared['free'], ABBREVIATIONS)}"
                 )
     return LawTable(name, arguments, **known), free
 
@@ -372,23 +380,6 @@ def masks(free: Any) -> dict[str, Any]:
     if isinstance(free, list) and all(isinstance(name, str) for name in free):
         return dict.fromkeys(free, True)
     raise ValueError(f"`free` must be a list of names or a table of masks, but is {free!r}.")
-
-
-def check_observed(tables: Mapping[str, Any]) -> None:
-    """Check the tables [[observe]] of a study."""
-    if "data" in tables:
-        raise ValueError("a study must have [data] or [[observe]], but has both.")
-    if not isinstance(tables["observe"], list):
-        raise ValueError("`observe` must be tables, each headed by [[observe]].")
-    for number, table in enumerate(tables["observe"]):
-        where = f"[[observe]] {number + 1}"
-        check_table(where, table, OBSERVE)
-        shots = [key for key in OBSERVE_SHOTS if key in table]
-        if len(shots) != 1:
-            raise ValueError(
-                f"{where} must have one of {', '.join(OBSERVE_SHOTS)}, "
-                f"but has {' and '.join(shots) or 'none'}."
-            )
 
 
 def check_sampling(table: Mapping[str, Any]) -> None:

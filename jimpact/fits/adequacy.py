@@ -11,8 +11,8 @@ import numpy as np
 from scipy.special import chdtrc, fdtrc
 
 from jimpact.fits.findings import Finding
-from jimpact.fits.multistart import Minimum, SearchResult
 from jimpact.fits.problem import UNUSABLE, FitProblem, Shots
+from jimpact.fits.search import Minimum, SearchResult
 from jimpact.status import STATUS
 
 NO_SHOT = -1  # the place of a shot where a value belongs to none: a prior

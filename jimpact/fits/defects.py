@@ -25,6 +25,10 @@ SEPARATION = 1e-9  # share of the velocities up to which an approach is rounding
 # Share of the velocities by which copies of a shot, scaled, may differ: rounding. Ten times more
 # would still be far below what is measured.
 COPIED = 1e-9
+# Factors that a wrong unit leaves in velocities: cm/s or mm/s for m/s, km/h, a decimal slip. A
+# median ratio of velocities within UNIT_NEAR of one (or of its inverse) is reported. Ten times
+# nearer, and noise of a percent would hide it.
+UNIT_FACTORS, UNIT_NEAR = {10.0: "a decimal point", 100.0: "cm/s", 1000.0: "mm/s", 3.6: "km/h"}, 0.1
 _LISTED = 6  # shots listed one by one with their ratios; of more, the range is reported
 
 
@@ -65,6 +69,7 @@ def find_defects(
     energy = _beyond_noise(measured.energies, DEFECT_LEVEL, gains=True)
     resting = [experiments.shots[k] for k in measured.resting]
     total, found = len(experiments.shots), []
+    found += _units(measured)
     if momentum:
         found.append(
             Finding(
@@ -101,6 +106,25 @@ def find_defects(
             )
         )
     return found
+
+
+def _units(measured: "_Balances") -> list[Finding]:
+    """Whether velocities after are those before but for a factor that a wrong unit leaves.
+
+    By the momentum that is conserved; where none is, by the energy where it grows.
+    """
+    ratios = [d.ratio for each in measured.momenta.values() for _, d in each]
+    gains = [np.sqrt(d.ratio) for _, d in measured.energies if d.ratio > 1]
+    what, values = ("momentum", ratios) if ratios else ("root of the energy", gains)
+    if not values or len(values) < 0.5 * max(len(ratios), len(measured.energies)):
+        return []
+    ratio = float(np.median(values))
+    for factor, unit in UNIT_FACTORS.items():
+        near = (factor, 1 / factor) if what == "momentum" else (factor,)
+        if any(abs(ratio / value - 1) < UNIT_NEAR for value in near):
+            text = f"Units? The {what} after is {ratio:.3g} times that before: {unit}"
+            return [Finding(f"{text} in one of the columns?", "the units are suspect")]
+    return []
 
 
 class _Balances(NamedTuple):

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_concrete, check_values
+from jimpact._checks import as_float_array, check_concrete, check_values, in_numbers
 from jimpact.bodies.base import CLOSED_BELOW, Body
 from jimpact.files.shots_file import ANGULAR, LINEAR, read_shots
 from jimpact.scene import WALLS, Scene, chain, dense_mass, stackable, with_gaps
@@ -19,6 +19,7 @@ from jimpact.scene import WALLS, Scene, chain, dense_mass, stackable, with_gaps
 # Share of the momentum up to which a corrected shot counts as conserving it: rounding, also in
 # files of ten digits. Ten times more would take measured shots for corrected ones no more often.
 CONSERVED = 1e-9
+_PRINTED = 4  # shots that `print` shows
 _RESOLUTION = operator.attrgetter("resolution")
 
 
@@ -35,8 +36,8 @@ class Experiments(eqx.Module):
         shots: K labels for tables and pictures; None: 1, 2, ...
         lost_freedom: independent values that a correction has removed from each shot, K numbers or
             one for all.
-        units: of each velocity, n times 'm/s' or 'rad/s'; None: all m/s. Without sigma, velocities
-            of different units weigh as much as others of the same kinetic energy.
+        units: of each velocity, n times 'm/s' or 'rad/s', or one for all; None: m/s. Without sigma,
+            velocities of different units weigh as much as others of the same kinetic energy.
         sigma_pre: standard error of each `pre` value, (K, n) or a scalar, >= 0 [m/s]; with it goes
             a `sigma`, or a `resolution`. `fit` passes it on to v+, see `FitProblem`.
         resolution: steps in which `post` was read, (K, n) or a scalar, > 0 [m/s]: readings rounded
@@ -110,12 +111,32 @@ class Experiments(eqx.Module):
             )
         self.lost = tuple(np.broadcast_to(lost_freedom, len(measured)).tolist())
         n = measured.shape[1]
-        self.units = (LINEAR,) * n if units is None else tuple(units)
+        units = LINEAR if units is None else units
+        self.units = (units,) * n if isinstance(units, str) else tuple(units)
         if len(self.units) != n or not set(self.units) <= {LINEAR, ANGULAR}:
             raise ValueError(
                 f"Argument `units` must have {n} entries, each '{LINEAR}' or '{ANGULAR}', "
-                f"but has value {self.units}."
+                f"but has value {units!r}: convert velocities to these (1 cm/s = 0.01 m/s)."
             )
+
+    def __str__(self) -> str:
+        """How many shots, what is known of their errors, and the first of them."""
+        count, n = self.pre.shape
+        missing = int((~self.measured).sum())
+        units = ", ".join(dict.fromkeys(self.units))
+        lines = [f"{count} shot{'s' * (count > 1)} of {n} velocities [{units}]"]
+        if missing:
+            lines.append(f"{missing} of {self.post.size} velocities after were not measured")
+        if self.sigma is None:
+            lines.append("sigma    not known")
+        else:
+            lines.append(f"sigma    {np.nanmin(self.sigma):.3g} to {np.nanmax(self.sigma):.3g}")
+        for k in range(min(count, _PRINTED)):
+            before, after = in_numbers(self.pre[k]), in_numbers(self.post[k])
+            lines.append(f"shot {self.shots[k]}: {before} -> {after}")
+        if count > _PRINTED:
+            lines.append(f"... and {count - _PRINTED} more")
+        return "\n".join(lines)
 
     @property
     def lost_freedom(self) -> int:

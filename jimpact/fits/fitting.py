@@ -1,9 +1,10 @@
 """`fit`: parameters of a law from measured velocities, with their errors."""
 
+import time
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,9 +13,6 @@ from jimpact.files.records import listed
 from jimpact.fits.adequacy import reproduced, stretch, unusable, weighted
 from jimpact.fits.experiments import Experiments
 from jimpact.fits.intervals import Profile
-from jimpact.fits.least_squares import Method, check_method, default_steps
-from jimpact.fits.multistart import Minimum, SearchResult, ends, search, settled
-from jimpact.fits.page import write_page
 from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw
 from jimpact.fits.prediction import Predicted, jacobian_of, predicted, tied_values
 from jimpact.fits.problem import FitProblem, of_shots
@@ -24,10 +22,16 @@ from jimpact.fits.result import FitMinimum, FitResult
 from jimpact.fits.robust import LOSSES, RobustSolution, robust_solution
 from jimpact.fits.saved import read_fit, write_fit
 from jimpact.fits.scene_parameters import plain_law
-from jimpact.fits.tables import as_dict, dataset, parameters_frame
+from jimpact.fits.search import Minimum, SearchResult, ends, find_minima, settled
+from jimpact.fits.solve import Method, Search, check_method, default_steps
+from jimpact.fits.tables import as_dict, dataset, parameters_frame, write_parameters
 from jimpact.fits.uncertainty import RANK_TOLERANCE, Uncertainty, uncertainty
 from jimpact.fits.verdicts import fit_warnings
+from jimpact.progress import progress_bar
 from jimpact.scene import Scene
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure  # which takes long to import
 
 # A minimum gets standard errors up to a sum of squares this many noise standard deviations above
 # the best: intervals of all levels end before. With ten times more, only time is lost.
@@ -94,21 +98,22 @@ class Fit(FitResult[AnyLaw]):
         """
         return write_fit(self, Path(path))
 
-    def report(self, path: str | Path, profiles: bool = True) -> Path:
-        """Write one self-contained page (HTML): everything of `print(fit)`, and the pictures.
+    def plot(self) -> "Figure":
+        """The picture of `ji.plot.fit`: measured and fitted velocities, and the residuals."""
+        from jimpact import plot
 
-        Parameters and intervals, profiles, correlations, residuals, what the data do not
-        determine, warnings, versions and seed.
+        return plot.fit(self)
+
+    def to_csv(self, path: str | Path) -> Path:
+        """Write a row a parameter: value, standard error, ends of its 95 % interval, whether seen.
 
         Args:
-            path: the file, ending in .html; an existing file is replaced.
-            profiles: compute the profile likelihoods, too, unless the fit has them or shows lack
-                of fit; some seconds.
+            path: the file; an existing file is replaced.
 
         Returns:
             The path.
         """
-        return write_page(self, Path(path), profiles)
+        return write_parameters(self, Path(path))
 
     def to_pandas(self) -> Any:
         """The parameters as a `pandas.DataFrame`, which must be installed."""
@@ -161,11 +166,12 @@ def fit(
     ties: Mapping[str, Any] | None = None,
     method: Method = "levenberg-marquardt",
     loss: str = "squares",
-    starts: int = 8,
+    starts: int | None = None,
     seed: int = 0,
     max_steps: int | None = None,
     profiles: bool | None = None,
     progress: float | None = None,
+    limit: float | None = None,
 ) -> Fit[AnyLaw]:
     """Fit parameters of a law to measured velocities by weighted least squares.
 
@@ -202,9 +208,9 @@ def fit(
         loss: 'squares'; or one that outliers move little: 'huber' (beyond 1.345 sigma the absolute
             value), 'student' (the density of Student's t, 4 degrees of freedom). Where sigma is
             not known, it is taken from the median of the residuals.
-        starts: number of starts, the first from the law's values, the others random; if
-            more than one, further ones around the best follow as long as they improve it, and for
-            up to 64 shots also a scan for other minima in log-fitted parameters.
+        starts: number of starts: the first from the law's values, then random ones, the last third
+            around the best of these. None: 12, and further ones around the best as long as they
+            lower the sum of squares by more than the noise of a value.
         seed: of the random starts.
         max_steps: iterations per start.
         profiles: whether intervals are those of `profile`; None: where standard errors cannot be
@@ -212,6 +218,7 @@ def fit(
             parameters) and the law fits, of up to 256 shots, with a single start of up to 64; else
             the report says how to get them.
         progress: bar on stderr; None: on a terminal, for fits longer than two seconds.
+        limit: seconds after which no further step of the search is begun; None: no limit.
 
     Returns:
         `Fit`; `print` gives its report, `ji.plot.fit` a picture.
@@ -235,7 +242,9 @@ def fit(
     """
     check_method(method)
     steps = default_steps(method) if max_steps is None else max_steps
-    for name, count, least in (("starts", starts, 1), ("max_steps", steps, 1), ("seed", seed, 0)):
+    if starts is not None:
+        as_whole("starts", starts, 1)
+    for name, count, least in (("max_steps", steps, 1), ("seed", seed, 0)):
         as_whole(name, count, least)
     check_choice("loss", loss, ("squares", *LOSSES))
     if isinstance(law, FitProblem):
@@ -247,19 +256,22 @@ def fit(
         problem = law
     else:
         problem = of_shots(law, scene, experiments, free, bounds, priors, ties)  # type: ignore[arg-type]
-    solution = search(problem, method, starts, seed, steps, progress)
-    while (lost := unusable(problem, solution)).any() and not lost.all():
-        problem = _without(problem, lost)
-        solution = search(problem, method, starts, seed, steps, progress)
-    _check_derivatives(problem, solution)
-    if problem.residuals.mixing is not None:
-        points = problem.point(np.array([minimum.value for minimum in solution.minima]))
-        (problem,), states = settled([problem], points, method, steps, slopes=[solution.slopes])
-        counts = np.array([minimum.starts for minimum in solution.minima])
-        solution = ends(problem, states, counts, solution.lost)
-    robust = None
-    if loss != "squares":
-        problem, robust = robust_solution(problem, solution, loss, method, steps)
+    deadline = np.inf if limit is None else time.monotonic() + limit
+    with progress_bar(progress) as show:
+        search = Search(method, steps, show, deadline)
+        solution = find_minima(problem, starts, seed, search)
+        while (lost := unusable(problem, solution)).any() and not lost.all():
+            problem = _without(problem, lost)
+            solution = find_minima(problem, starts, seed, search)
+        _check_derivatives(problem, solution)
+        if problem.residuals.mixing is not None:
+            points = problem.point(np.array([minimum.value for minimum in solution.minima]))
+            (problem,), states = settled([problem], points, search, slopes=[solution.slopes])
+            counts = np.array([minimum.starts for minimum in solution.minima])
+            solution = ends(problem, states, counts, solution.lost)
+        robust = None
+        if loss != "squares":
+            problem, robust = robust_solution(problem, solution, loss, search)
     result = replace(as_fit(problem, solution, method, robust), loss=loss, seed=seed)
     if profiles:
         return _with_profiles(result, profile(result, progress=progress))

@@ -1,36 +1,27 @@
 """Many fits side by side in the lanes of one program: data sets, bootstrap, shots left out."""
 
+import functools
 import operator
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import equinox as eqx
 import jax
 import numpy as np
 
-from jimpact._checks import as_whole
+from jimpact._checks import as_whole, check_kind
 from jimpact.fits.adequacy import unusable
 from jimpact.fits.experiments import Experiments
 from jimpact.fits.fitting import Fit, as_fit, fit
 from jimpact.fits.intervals import check_level
-from jimpact.fits.least_squares import DEFAULT_STEPS, SolverState
-from jimpact.fits.multistart import (
-    SearchResult,
-    at_minimum,
-    ends,
-    repeated,
-    run,
-    settled,
-    start_points,
-)
 from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw
-from jimpact.fits.problem import FitProblem, Residuals, filled_up, of_shots
+from jimpact.fits.problem import FitProblem, Residuals, filled_count, filled_up, of_shots
 from jimpact.fits.result import check_squares
+from jimpact.fits.search import ends, repeated, settled, stacked, start_points
+from jimpact.fits.solve import DEFAULT_STEPS, Search, SolverState, minimize
 from jimpact.progress import progress_bar
 from jimpact.scene import Scene
-
-_METHOD = "levenberg-marquardt"
 
 
 def fit_many(
@@ -44,9 +35,9 @@ def fit_many(
     ties: Mapping[str, Any] | None = None,
     starts: int = 1,
     seed: int = 0,
-    max_steps: int = DEFAULT_STEPS[_METHOD],
+    max_steps: int = DEFAULT_STEPS["levenberg-marquardt"],
     progress: float | None = None,
-) -> list[Fit[AnyLaw]]:
+) -> "Fits[AnyLaw]":
     """`fit` of one law to each of many data sets, side by side in one compiled program.
 
     Data sets of up to 4, 8, 16, ... shots share a program. Arguments and errors as of `fit`;
@@ -66,7 +57,8 @@ def fit_many(
         progress: a bar on stderr; None: on a terminal.
 
     Returns:
-        A `Fit` for each data set, in their order.
+        `Fits`: arrays of values, and a `Fit` for each data set, in their order, made when it is
+        asked for.
 
     Raises:
         ValueError: as of `fit`.
@@ -78,50 +70,140 @@ def fit_many(
     [0.4, 0.8]
     """
     as_whole("starts", starts, 1)
+    check_kind("many", many, Sequence)
     choice = (free, bounds, priors, ties)
-    problems = [of_shots(law, scene, data, *choice) for data in many]
-    filled = [filled_up(problem.residuals) for problem in problems]
-    groups: dict[str, list[int]] = {}
-    for k, residuals in enumerate(filled):
-        shape = (jax.tree.structure(residuals), [np.shape(x) for x in jax.tree.leaves(residuals)])
-        groups.setdefault(str(shape), []).append(k)
-    fits: dict[int, Fit[AnyLaw]] = {}
+    options = {"starts": starts, "seed": seed, "max_steps": max_steps, "profiles": False}
+
+    @functools.cache
+    def problem(k: int) -> FitProblem:
+        """The problem of one data set."""
+        return of_shots(law, scene, many[k], *choice)
+
+    value: Any = [None] * len(many)
+    squares, converged = np.zeros(len(many)), np.zeros(len(many), bool)
+    makers: list[Callable[[], Fit[AnyLaw]]] = [lambda: fit(problem(0))] * len(many)
     with progress_bar(progress) as show:
-        for group in groups.values():
+        search = Search(max_steps=max_steps, show=show)
+        for group in _alike(many):
             rng = np.random.default_rng(seed)
-            points = np.concatenate([start_points(problems[k], starts, rng) for k in group])
-            stacked = jax.tree.map(
-                lambda *x: np.repeat(np.stack([np.asarray(each) for each in x]), starts, axis=0),
-                *(filled[k] for k in group),
-            )
-            group_problems = [problems[k] for k in group]
-            states = run(stacked, points, _METHOD, max_steps, show, rivals=False)
-            searches = _searches(group_problems, states)
-            if stacked.mixing is not None:
-                best = np.array([search.y for search in searches])
-                group_problems, states = settled(
-                    group_problems,
-                    best,
-                    _METHOD,
-                    max_steps,
-                    show,
-                    slopes=[search.slopes for search in searches],
-                )
-                searches = _searches(group_problems, states)
-            for k, problem, search in zip(group, group_problems, searches):
-                if unusable(problem, search).any():  # what is left is another problem
-                    options: dict[str, Any] = {"starts": starts, "seed": seed, "profiles": False}
-                    fits[k] = fit(problems[k], max_steps=max_steps, progress=False, **options)
-                else:
-                    fits[k] = as_fit(problem, search, _METHOD)
-    return [fits[k] for k in range(len(problems))]
+            first = problem(group[0])
+            points = [start_points(first, starts, rng) for _ in group]
+            side_by_side = _side_by_side(problem, many, group)
+            all_starts = jax.tree.map(lambda x: np.repeat(x, starts, axis=0), side_by_side)
+            states = minimize(all_starts, np.concatenate(points), search)
+            if all_starts.mixing is not None:
+                states, group_problems = _with_errors_before(problem, group, states, search)
+            each = len(states.y) // len(group)
+            for i, k in enumerate(group):
+                rows = slice(i * each, (i + 1) * each)
+                best = rows.start + int(np.nanargmin(states.squares[rows]))
+                ended = jax.tree.map(operator.itemgetter(rows), states)
+                one = functools.partial(problem, k)
+                if all_starts.mixing is not None:
+                    one = functools.partial(group_problems.__getitem__, i)
+                makers[k] = functools.partial(_made, one, ended, options)
+                value[k] = first.values_at(np.asarray(states.y[best]))
+                squares[k], converged[k] = states.squares[best], states.converged[best]
+                squares[k] *= float(side_by_side.size[i]) ** 2
+    return Fits(problem(0).names, np.array(value), squares, converged, tuple(makers))
 
 
-def _searches(problems: list[FitProblem], states: SolverState) -> list[SearchResult]:
-    """The ends of each problem, all of which have equally many starts."""
-    each = len(states.y) // len(problems)
-    rows = [slice(i * each, (i + 1) * each) for i in range(len(problems))]
-    return [ends(p, jax.tree.map(operator.itemgetter(r), states)) for p, r in zip(problems, rows)]
+def _alike(many: Sequence[Experiments]) -> list[list[int]]:
+    """Data sets that share one program: as many shots, filled up, all with or without errors."""
+    groups: dict[Any, list[int]] = {}
+    for k, data in enumerate(many):
+        check_kind(f"many[{k}]", data, Experiments)
+        kind = (filled_count(len(data.shots)), data.pre.shape[1], data.sigma is None)
+        shapes = None if data.scenes is None else data.largest_scene(None).contacts
+        groups.setdefault((*kind, data.sigma_pre is None, shapes), []).append(k)
+    return list(groups.values())
+
+
+def _side_by_side(
+    problem: Callable[[int], FitProblem], many: Sequence[Experiments], group: list[int]
+) -> Residuals:
+    """The residuals of a group, one program's argument.
+
+    Sets of equal shapes in a common scene are stacked as arrays, whose problems nobody needs.
+    """
+    first = problem(group[0])
+    sets = [many[k] for k in group]
+    same = all(x.scenes is None and x.sigma_pre is None for x in sets)
+    same = same and len({(x.pre.shape, x.units) for x in sets}) == 1
+    # of a coarser law, where the noise allows it, each set decides by itself
+    if not same or any("computed with `rtol`" in note for note in first.notes):
+        return stacked([problem(k) for k in group])
+    one = filled_up(first.residuals)
+    pre, post = (np.stack([np.asarray(getattr(x, name)) for x in sets]) for name in ("pre", "post"))
+    errors = np.broadcast_to(sets[0].natural_errors(first.scene), post.shape)
+    if sets[0].sigma is not None:
+        errors = np.stack([np.asarray(x.sigma) for x in sets])
+    here, dtype = ~np.isnan(post), one.offset.dtype
+    weight = np.where(here, 1 / np.where(here, errors, 1.0), 0.0)
+    unit = np.maximum(np.abs(pre).max(axis=(1, 2)), np.nanmax(np.abs(post), axis=(1, 2)))
+    unit = np.where(unit > 0, unit, 1.0)
+    size = unit * np.sqrt(np.sum(weight**2, axis=(1, 2)))
+    rows = np.minimum(np.arange(len(one.measured)), post.shape[1] - 1)
+    weight = np.where(np.arange(len(rows))[:, None] < post.shape[1], weight[:, rows], 0.0)
+    observe: Any = one.observe
+    before = np.repeat(np.asarray(observe.pre)[None], len(sets), axis=0)
+    before[:, :, : post.shape[2]] = pre[:, rows]
+    arrays = (before, np.nan_to_num(post)[:, rows], weight / size[:, None, None], size, unit)
+    many_residuals = repeated(one, len(sets))
+    return eqx.tree_at(
+        lambda r: (r.observe.pre, r.measured, r.weight, r.size, r.unit),
+        many_residuals,
+        tuple(np.asarray(x, dtype) for x in arrays),
+    )
+
+
+def _with_errors_before(
+    problem: Callable[[int], FitProblem], group: list[int], states: SolverState, search: Search
+) -> tuple[SolverState, list[FitProblem]]:
+    """The best minimum of each problem with errors of v- that its own law passes on."""
+    each = len(states.y) // len(group)
+    best = np.arange(0, len(states.y), each) + np.nanargmin(states.cost.reshape(-1, each), axis=1)
+    slopes = list(states.aux[-1][best])
+    points = np.asarray(states.y, float)[best]
+    problems, states = settled([problem(k) for k in group], points, search, slopes=slopes)
+    return states, problems
+
+
+def _made(
+    problem: Callable[[], FitProblem], states: SolverState, options: Mapping[str, Any]
+) -> Fit[Any]:
+    """The fit at the best of these ends; shots that cannot be used are left out in a new one."""
+    solution = ends(problem(), states)
+    if unusable(problem(), solution).any():
+        return fit(problem(), progress=False, **options)
+    return as_fit(problem(), solution, "levenberg-marquardt")
+
+
+@dataclass(frozen=True, eq=False)
+class Fits(Sequence[Fit[AnyLaw]]):
+    """Fits of one law to S data sets: `value` (S, P) by `names`, and a `Fit` each when asked for.
+
+    `squares` (S,) are the sums of squared weighted residuals, `converged` (S,) which searches have
+    ended. `fits[k]` makes errors and report of one; so does a loop over all.
+    """
+
+    names: tuple[str, ...]
+    value: np.ndarray
+    squares: np.ndarray
+    converged: np.ndarray
+    _makers: tuple[Callable[[], Fit[AnyLaw]], ...] = field(repr=False)
+    _made: dict[int, Fit[AnyLaw]] = field(default_factory=dict, repr=False)
+
+    def __len__(self) -> int:
+        return len(self._makers)
+
+    def __getitem__(self, k: Any) -> Any:
+        if isinstance(k, slice):
+            return [self[i] for i in range(*k.indices(len(self)))]
+        k = range(len(self))[k]
+        if k not in self._made:
+            self._made[k] = self._makers[k]()
+        return self._made[k]
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,8 +324,8 @@ def _refits(
     """Minima of these problems next to a fit."""
     points = np.tile(fit.problem.point(fit.value), (len(problems), 1))
     with progress_bar(progress) as show:
-        _, states = settled(problems, points, _METHOD, DEFAULT_STEPS[_METHOD], show, many)
+        _, states = settled(problems, points, Search(show=show), many)
     value = fit.problem.values_at(np.asarray(states.y, float))
     predicted = np.asarray(states.aux[0], float)
     predicted = predicted[:, : len(fit.predicted)] if fit.predicted.ndim else predicted
-    return Refits(fit.names, value, predicted, at_minimum(states))
+    return Refits(fit.names, value, predicted, states.converged)

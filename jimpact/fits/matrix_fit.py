@@ -16,7 +16,7 @@ import numpy as np
 
 from jimpact.compiling import quick_jit
 from jimpact.contact import decoupled, delassus_matrix, kinetic_norm
-from jimpact.fits.least_squares import nearest
+from jimpact.fits.solve import nearest
 from jimpact.law import Law
 from jimpact.laws.kinematic import RestitutionMatrix
 from jimpact.scene import Scene

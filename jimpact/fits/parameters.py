@@ -7,6 +7,7 @@ from typing import Any, NamedTuple, TypeVar
 import jax.numpy as jnp
 import numpy as np
 
+from jimpact._checks import ABBREVIATIONS, suggestion
 from jimpact.fits.ties import Ties, entry_of, places, tied_places
 from jimpact.law import Law, free_parameters_of, parameters_of, with_parameter
 
@@ -174,7 +175,7 @@ def _unknown_field(law: Law, field: str, known: list[str]) -> str:
         )
     return (
         f"Argument `free` must name parameters of {name}, one of {', '.join(known)}, "
-        f"but has {field!r}."
+        f"but has {field!r}.{suggestion(field, known, ABBREVIATIONS)}"
     )
 
 

@@ -12,9 +12,9 @@ import numpy as np
 from jimpact._checks import as_whole, needed
 from jimpact.compiling import known_options
 from jimpact.fits.fitting import Fit
-from jimpact.fits.least_squares import BoxRegion
 from jimpact.fits.problem import FitProblem
 from jimpact.fits.result import check_squares
+from jimpact.fits.solve import BoxRegion
 from jimpact.montecarlo.distributions import Normal, Uniform
 
 HOW = 'pip install "jimpact[bayes]"'

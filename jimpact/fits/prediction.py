@@ -2,19 +2,17 @@
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import check_kind, check_values
 from jimpact.fits.experiments import Experiments
-from jimpact.fits.least_squares import BoxRegion
-from jimpact.fits.multistart import SearchResult, ends, quiet, repeated, run
 from jimpact.fits.parameters import value_of
-from jimpact.fits.problem import FitProblem, filled_up
+from jimpact.fits.problem import FitProblem
 from jimpact.fits.result import FitResult
 from jimpact.fits.scene_parameters import LawInScene
+from jimpact.fits.search import SearchResult, evaluated
 from jimpact.fits.ties import entry_of, tied_names, tied_places
 from jimpact.law import Law, parameters_of
 from jimpact.scene import Scene
@@ -55,15 +53,7 @@ def predicted(fit: FitResult, shots: Any, scene: Scene | None, level: float) -> 
     _check_scene(fit, largest, len(units))
     ties = dict(fit.problem.ties)
     problem = FitProblem.from_shots(law, own, data, fit.problem.parameters.labels, ties=ties)
-    y = problem.point(problem.start)
-    box: Any = BoxRegion(*np.broadcast_to(y.astype(problem.residuals.offset.dtype), (2, len(y))))
-    held = eqx.tree_at(
-        lambda r: (r.low, r.high, r.region),
-        filled_up(problem.residuals),
-        (box.low, box.high, box),
-    )
-    states = run(repeated(held, 1), y[None], "levenberg-marquardt", 1, quiet)
-    solution = ends(problem, states)
+    solution = evaluated(problem, problem.point(problem.start))
     error = fit.errors_of(jacobian_of(problem, solution))
     value, noise = solution.predicted, _noise_of(fit, shots)
     half = quantile * np.hypot(error, noise)

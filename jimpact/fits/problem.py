@@ -19,7 +19,6 @@ from jimpact._checks import as_float_array, check_concrete, check_kind, check_va
 from jimpact.compiling import full_precision, quick_jit
 from jimpact.files.study_file import OF_A_SCENE
 from jimpact.fits.experiments import Experiments, kept_by_corrections
-from jimpact.fits.least_squares import BoxRegion, Method, Region, SolverState, advance, begin
 from jimpact.fits.matrix_fit import matrix_region
 from jimpact.fits.parameters import (
     DEFAULT_FREE,
@@ -38,6 +37,7 @@ from jimpact.fits.scene_parameters import (
     plain_law,
     with_parts_of_scene,
 )
+from jimpact.fits.solve import EXACT, BoxRegion, Region
 from jimpact.fits.ties import Ties, checked_ties, entry_of, tied
 from jimpact.fits.tolerances import tolerated
 from jimpact.impacts import impact
@@ -50,13 +50,12 @@ from jimpact.status import CODE
 UNUSABLE = ("infeasible", "max_steps", "not_finite")
 PENALTY = 1e3  # times the largest measured value
 
-# Mean squares (relative to the velocities) below this are a perfect fit: rounding and the
-# tolerance of the impact.
-EXACT = {"float64": 1e-14, "float32": 1e-8}
-
 # Shots are filled up to 4, 8, 16, ... of them: a program serves all numbers in between, and the
 # copies that fill up cost far less than compiling another one.
 FEWEST, FEW = 4, 64
+# Problems that a program solves side by side: starts of one, and many problems. With ten times
+# more of them, all wait for the one whose impacts take longest.
+LANES, LANES_OF_MANY = 4, 64
 
 
 class Prediction(NamedTuple):
@@ -186,6 +185,27 @@ class Residuals(eqx.Module):
         if passed:
             aux.append(slopes[..., count:])
         return residual, jacobian[:, :count], tuple(aux)
+
+    def blank(self, y: np.ndarray) -> tuple[Any, Any, Any]:
+        """Zeros shaped like what `evaluate` gives of S such problems at y (S, Q), on the host."""
+        (count, q), shape, dtype = y.shape, self.measured.shape[1:], y.dtype
+        size = math.prod(shape) + q
+        statuses = shape[0] if isinstance(self.observe, Shots) else 1
+        aux: Any = (np.zeros((count, *shape), dtype), np.zeros((count, statuses), np.int32))
+        if self.mixing is not None:
+            aux += (np.zeros(np.shape(self.mixing), dtype),)
+        return np.zeros((count, size), dtype), np.zeros((count, size, q), dtype), aux
+
+    def lanes(self, count: int) -> int:
+        """How many of `count` such problems are solved side by side.
+
+        Fits of few shots, or of few values in a row, share the program for all; motions take too
+        long for that.
+        """
+        listed = isinstance(self.observe, Shots) or self.measured.ndim == 2
+        if listed and self.measured.shape[1] <= FEW:
+            return LANES if count <= LANES_OF_MANY else LANES_OF_MANY
+        return LANES if count > 1 else 1
 
     def shifted(self, shift: jax.Array) -> "Residuals":
         """With this change (n,) of the velocities before all shots."""
@@ -765,6 +785,11 @@ def from_scaled(scaled: np.ndarray, scale: np.ndarray, log: np.ndarray) -> np.nd
     return np.where(log, np.exp(np.where(log, scaled, 0.0)), scaled * scale)
 
 
+def filled_count(count: int) -> int:
+    """How many shots a program has that serves so many."""
+    return FEWEST if count <= FEWEST else 2 ** math.ceil(math.log2(count))
+
+
 def filled_up(residuals: Residuals) -> Residuals:
     """With copies of the last shot, of no weight, up to a number that other fits have, too."""
     if not isinstance(residuals.observe, Shots):
@@ -802,33 +827,3 @@ def slopes_before(law: Law, shots: Any) -> np.ndarray:
     """`dv+/dv-` (K, n, n) of every shot."""
     n = shots.bodies
     return np.asarray(_slopes_before(_in(_dtype(shots), law), shots), float)[:, :n, :n]
-
-
-@quick_jit
-def begin_all(problems: Residuals, starts: Any, method: Method, max_steps: int) -> SolverState:
-    """States of a batch of problems and their starts y (S, Q)."""
-
-    def one(problem: Residuals, y: jax.Array) -> SolverState:
-        """The state of one problem."""
-        size, shape = problem.measured.size + y.shape[0], problem.measured.shape
-        statuses = shape[0] if isinstance(problem.observe, Shots) else 1
-        aux: Any = (jnp.zeros(shape, y.dtype), jnp.zeros(statuses, jnp.int32))
-        if problem.mixing is not None:
-            aux += (jnp.zeros_like(problem.mixing),)
-        first = (jnp.zeros(size, y.dtype), jnp.zeros((size, y.shape[0]), y.dtype), aux)
-        return begin(problem.region.retract(y), first, method, max_steps)
-
-    return eqx.filter_vmap(one)(problems, starts)
-
-
-@quick_jit
-def advance_all(
-    problems: Residuals, states: SolverState, method: Method, max_steps: int, passes: int
-) -> SolverState:
-    """Up to `passes` passes more of every problem."""
-
-    def one(problem: Residuals, state: SolverState) -> SolverState:
-        """One problem."""
-        return advance(problem.evaluate, problem.region, method, max_steps, state, passes)
-
-    return eqx.filter_vmap(one)(problems, states)

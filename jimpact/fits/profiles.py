@@ -13,10 +13,10 @@ import numpy as np
 
 from jimpact._checks import as_whole, check_choice
 from jimpact.fits.intervals import Profile, check_level
-from jimpact.fits.least_squares import DEFAULT_STEPS, SolverState
 from jimpact.fits.problem import FEW
 from jimpact.fits.result import FitResult
 from jimpact.fits.scaled import ScaledFit, check_profiled, with_entry
+from jimpact.fits.solve import DEFAULT_STEPS, SolverState
 from jimpact.progress import Show, progress_bar
 
 NEAR = np.array([-2, -1.5, -1, -0.5, 0.5, 1, 1.5, 2])  # half-widths of the interval of a parabola

@@ -8,14 +8,17 @@ from jimpact.fits.intervals import in_words
 from jimpact.fits.parameters import value_of
 from jimpact.fits.prediction import tied_values
 from jimpact.fits.result import FitResult
-from jimpact.fits.scatter import SURE, shown_scatter
 from jimpact.status import STATUS
 
+_ROUNDING = 1e-7  # share of the largest velocity that is printed as 0: impacts are good to 1e-8
 _VELOCITIES_SHOWN = 24  # in the table of shots
 _MINIMA_SHOWN = 5  # in the list of minima, the lowest first
 _PARAMETERS_NAMED = 6  # in one sentence; of more, the least certain
 OF_A_CONTACT = ("restitution", "friction", "tangential_restitution")  # each may have its own
-UNSEEN = "a start: the data do not determine it"  # note on a value in brackets
+# Degrees of freedom up to which intervals are visibly wider than two standard errors: with ten
+# times more they are wider by 2 %.
+FEW_DEGREES = 8
+UNSEEN = "start value; not determined by the data"  # note on a value in brackets
 
 
 def report(fit: FitResult) -> str:
@@ -32,7 +35,6 @@ def report_blocks(fit: FitResult) -> dict[str, list[str]]:
         "quality": _quality(fit),
         "undetermined": _section("What the data do not determine", fit.identifiability),
         "minima": _minima(fit),
-        "scatter": _scatter(fit),
         "warnings": _section("Warnings", fit.warnings),
         "shots": _shots(fit),
     }
@@ -40,17 +42,10 @@ def report_blocks(fit: FitResult) -> dict[str, list[str]]:
 
 def verdict(fit: FitResult) -> str:
     """One sentence: values with errors, what they assume, what is undetermined, what is wrong."""
-    law, data = type(fit.law).__name__, _data_name(fit)
+    law = type(fit.law).__name__
     if not fit.converged:
         return f"No answer: the search for the parameters of {law} has not converged."
-    scatter, reserved = shown_scatter(fit), joined_words(fit.reservations)
-    if scatter is not None and scatter.explains:
-        text = f"{law} fits {data} if {scatter}".rstrip(".")
-        return f"{text}; but {reserved}." if reserved else f"{text}."
-    sentence = _values_in_words(fit)
-    if scatter is not None:
-        sentence += f"; {scatter.name} scatters by {scatter.value:.2g} from shot to shot"
-        sentence += f", which accounts for {100 * scatter.share:.2g} % of chi^2"
+    reserved, sentence = joined_words(fit.reservations), _values_in_words(fit)
     against = _objection(fit)
     if against:
         nearest = f"it comes nearest with {sentence}" if fit.determined.any() else sentence
@@ -213,6 +208,12 @@ def _parameters(fit: FitResult) -> list[str]:
         for name, value, error, *rest in [head, *parameter_rows(fit)]
     ]
     lines += [f"{name} = {with_error(*pair)} is tied" for name, pair in tied_values(fit).items()]
+    freedom = fit.degrees_of_freedom
+    if fit.problem.sigma is None and 0 < freedom <= FEW_DEGREES:
+        lines.append(
+            f"With {degrees(freedom)}, a 95 % interval is {fit.quantile(0.95):.2g} standard errors "
+            "to each side (Student's t), not 1.96."
+        )
     if fit.linearization_misleads:
         lines.append(
             "These intervals take the sum of squares for a parabola, which may mislead here: "
@@ -226,23 +227,48 @@ def _quality(fit: FitResult) -> list[str]:
     unit, one = (" m/s", "velocity") if fit.experiments is not None else ("", "value")
     lines = [f"rms residual   {fit.rms:.4g}{unit}"]
     if fit.problem.sigma is not None:
-        squares = f"{fit.starts[0].sum_of_squares:.4g} with {fit.degrees_of_freedom}"
-        lines.append(f"chi^2          {squares} degrees of freedom (sigma given)")
+        squares = f"{fit.starts[0].sum_of_squares:.4g} with {degrees(fit.degrees_of_freedom)}"
+        lines.append(f"chi^2          {squares} (sigma given)")
         lines += _sigma_sources(fit)
         if fit.noise > 1 and fit.loss == "squares":
             lines.append(
-                f"errors         {fit.noise:.3g} times those of sigma, which chi^2 rejects"
+                f"errors         standard errors multiplied by {fit.noise:.3g}, because chi^2 "
+                f"contradicts the stated sigma{_of_what_part(fit)}"
             )
     elif np.isfinite(fit.noise):
         lines.append(
             f"noise          {fit.noise:.4g}{unit} a {one}, estimated with "
-            f"{fit.degrees_of_freedom} degrees of freedom"
+            f"{degrees(fit.degrees_of_freedom)}"
         )
-    lines.append(
-        f"determined     {fit.rank} of {len(fit.names)} parameters (rank of the derivatives)"
-    )
+    lines.append(f"determined     {_how_many_are_determined(fit)}")
     state = "converged" if fit.converged else "NOT converged"
     return [*lines, f"solver         {state}, at most {fit.steps} steps a start"]
+
+
+def degrees(count: int) -> str:
+    """So many degrees of freedom, in words.
+
+    >>> from jimpact.fits.report import degrees
+    >>> degrees(1), degrees(2)
+    ('1 degree of freedom', '2 degrees of freedom')
+    """
+    return f"{count} degree{'s' * (count != 1)} of freedom"
+
+
+def _how_many_are_determined(fit: FitResult) -> str:
+    """The rank of the derivatives, and whether intervals bound as many parameters."""
+    total, bounded = len(fit.names), int(fit.determined.sum())
+    text = f"{fit.rank} of {total} parameter{'s' * (total > 1)} (rank of the derivatives"
+    if bounded < fit.rank == total:
+        text += f"; the errors leave {total - bounded} unbounded"
+    return f"{text})"
+
+
+def _of_what_part(fit: FitResult) -> str:
+    """Which residuals the factor of the errors is that of, where these are not all."""
+    ratio = np.sqrt(fit.starts[0].sum_of_squares / max(fit.degrees_of_freedom, 1))
+    every = np.isclose(fit.noise, ratio, rtol=1e-3)
+    return "" if every else " (the factor is that of the residuals that are not momentum)"
 
 
 def _sigma_sources(fit: FitResult) -> list[str]:
@@ -263,22 +289,6 @@ def _sigma_sources(fit: FitResult) -> list[str]:
 def _section(title: str, lines: tuple[str, ...]) -> list[str]:
     """A list below its title; no lines if it is empty."""
     return [title, *(f"  - {line}" for line in lines)] if lines else []
-
-
-def _scatter(fit: FitResult) -> list[str]:
-    """The scatter of a parameter from shot to shot, where it explains the residuals."""
-    scatter = shown_scatter(fit)
-    if scatter is None:
-        return []
-    lines = ["Scatter from shot to shot", f"  - {scatter}"]
-    assert fit.experiments is not None
-    speed = fit.experiments.approach_speed(fit.problem.scene)
-    chance = scatter.trend(np.log(np.where(speed > 0, speed, 1.0)))
-    if chance < SURE:
-        lines.append(
-            f"  - It depends on the speed (p-value {chance:.1g}): see `ji.VelocityDependent`."
-        )
-    return lines
 
 
 def _minima(fit: FitResult) -> list[str]:
@@ -305,15 +315,21 @@ def shot_rows(fit: FitResult, most: int | None = None) -> list[list[str]]:
     data = fit.experiments
     assert data is not None
     before, measured = np.asarray(data.pre, float), np.asarray(data.post, float)
-    rows = []
+    rows, fitted = [], _without_rounding(fit.predicted)
     for k, i in np.ndindex(*before[:most].shape):
         value = "-" if np.isnan(measured[k, i]) else f"{measured[k, i]:.6g}"
         residual = "-" if np.isnan(fit.residual[k, i]) else f"{fit.residual[k, i]:.3g}"
         label = data.shots[k] if i == 0 else ""
         status = STATUS[int(fit.status[k])].name if fit.status[k] and i == 0 else ""
-        velocities = [f"{before[k, i]:.6g}", value, f"{fit.predicted[k, i]:.6g}", residual]
+        velocities = [f"{before[k, i]:.6g}", value, f"{fitted[k, i]:.6g}", residual]
         rows.append([label, str(i + 1), *velocities, data.units[i], status])
     return rows
+
+
+def _without_rounding(values: np.ndarray) -> np.ndarray:
+    """0 for what is rounding against the largest of the values (K, n) of its shot."""
+    largest = np.abs(values).max(axis=1, keepdims=True)
+    return np.where(np.abs(values) <= _ROUNDING * largest, 0.0, values)
 
 
 def _shots(fit: FitResult) -> list[str]:

@@ -9,10 +9,10 @@ from scipy.special import ndtri, stdtrit
 from jimpact._checks import check_choice, check_kind
 from jimpact.fits.experiments import Experiments
 from jimpact.fits.intervals import Profile, check_level, joined
-from jimpact.fits.least_squares import BoxRegion
 from jimpact.fits.parameters import AnyLaw
 from jimpact.fits.problem import FitProblem
 from jimpact.fits.scene_parameters import LawInScene
+from jimpact.fits.solve import BoxRegion
 from jimpact.law import Law
 from jimpact.scene import Scene
 

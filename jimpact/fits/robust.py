@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 
 from jimpact.fits.adequacy import MEDIAN
-from jimpact.fits.least_squares import Method
-from jimpact.fits.multistart import SearchResult, search_near
 from jimpact.fits.problem import FitProblem
+from jimpact.fits.search import SearchResult, find_near
+from jimpact.fits.solve import Search
 
 HUBER = 1.345  # sigmas up to which a residual counts squared: 95 % of the efficiency
 STUDENT = 4.0  # degrees of freedom of the tails
@@ -39,7 +39,7 @@ LOSSES = {"huber": _huber, "student": _student}
 
 
 def robust_solution(
-    problem: FitProblem, solution: SearchResult, loss: str, method: Method, max_steps: int
+    problem: FitProblem, solution: SearchResult, loss: str, search: Search
 ) -> tuple[FitProblem, RobustSolution]:
     """Least squares again and again, with weights `psi(u) / u` of the last residuals u.
 
@@ -54,7 +54,7 @@ def robust_solution(
             scale = max(MEDIAN * float(np.median(np.abs(error[here]))), np.finfo(float).tiny)
         share, slope = LOSSES[loss](error / scale)
         factor, before = np.sqrt(share), solution.y
-        solution = search_near(problem.weighed(factor), solution.y, method, max_steps)
+        solution = find_near(problem.weighed(factor), solution.y, search)
         if np.abs(solution.y - before).max() <= SAME:
             break
     else:

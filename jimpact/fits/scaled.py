@@ -3,13 +3,14 @@
 from collections.abc import Sequence
 from typing import Any
 
+import equinox as eqx
 import numpy as np
 
 from jimpact._checks import check_kind
-from jimpact.fits.least_squares import DEFAULT_STEPS, SolverState
-from jimpact.fits.multistart import START_SCALES, run_fixed
 from jimpact.fits.problem import filled_up, from_scaled, to_scaled
 from jimpact.fits.result import FitResult
+from jimpact.fits.search import START_SCALES, repeated
+from jimpact.fits.solve import DEFAULT_STEPS, BoxRegion, Search, SolverState, minimize
 from jimpact.progress import Show
 
 
@@ -59,7 +60,17 @@ class ScaledFit:
         steps: int = DEFAULT_STEPS["levenberg-marquardt"],
     ) -> tuple[np.ndarray, SolverState]:
         """Sums of squares at the minima from each y (Q,) with these of its entries fixed."""
-        states = run_fixed(self.residuals, fixed, steps, show)
+        points = np.array([y for _, y in fixed])
+        low, high = np.tile(self.low, (len(fixed), 1)), np.tile(self.high, (len(fixed), 1))
+        for k, (which, y) in enumerate(fixed):
+            at = np.array(which, int)
+            low[k, at] = high[k, at] = y[at]
+        dtype = self.residuals.offset.dtype
+        box: Any = BoxRegion(low.astype(dtype), high.astype(dtype))  # type: ignore[arg-type]
+        many = repeated(self.residuals, len(fixed))
+        many = eqx.tree_at(lambda r: (r.low, r.high, r.region), many, (box.low, box.high, box))
+        search = Search(max_steps=steps, show=show)
+        states = minimize(many, points, search, what="fixed values")
         return 2 * np.asarray(states.cost, float) * self.size**2, states
 
 

@@ -225,7 +225,7 @@ def fit_laws(
     *,
     free: Iterable[str] = (),
     speed: bool = False,
-    starts: int = 8,
+    starts: int | None = None,
     seed: int = 0,
     progress: float | None = None,
     done: Callable[[str, Fit], None] | None = None,

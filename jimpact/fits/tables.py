@@ -1,5 +1,7 @@
 """A fit as data for other programs: JSON, and tables of pandas and xarray where installed."""
 
+import csv
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,10 +13,10 @@ from jimpact.fits.result import FitResult
 from jimpact.status import STATUS
 
 
-def parameters_frame(fit: FitResult) -> Any:
-    """A row a parameter: value, standard error, ends of its 95 % interval, at its bound, seen."""
+def parameter_columns(fit: FitResult) -> dict[str, np.ndarray]:
+    """Value, standard error, ends of the 95 % interval, at its bound, seen (P,)."""
     interval = fit.confidence_interval()
-    columns = {
+    return {
         "value": fit.value,
         "standard_error": fit.standard_error,
         "low_95": interval[:, 0],
@@ -22,8 +24,23 @@ def parameters_frame(fit: FitResult) -> Any:
         "at_bound": fit.at_bound,
         "determined": fit.determined,
     }
-    index = list(fit.names)
+
+
+def parameters_frame(fit: FitResult) -> Any:
+    """A row a parameter, see `parameter_columns`."""
+    columns, index = parameter_columns(fit), list(fit.names)
     return needed("pandas", "pip install pandas").DataFrame(columns, index=index)
+
+
+def write_parameters(fit: FitResult, path: Path) -> Path:
+    """The same as CSV, in full precision."""
+    columns = parameter_columns(fit)
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["parameter", *columns])
+        for name, *row in zip(fit.names, *(x.tolist() for x in columns.values())):
+            writer.writerow([name, *row])
+    return path
 
 
 def dataset(fit: FitResult) -> Any:

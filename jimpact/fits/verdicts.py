@@ -8,8 +8,9 @@ from jimpact.fits.defects import find_defects
 from jimpact.fits.experiments import kept_by_corrections
 from jimpact.fits.findings import Finding
 from jimpact.fits.matrix_fit import boundary, encloses
-from jimpact.fits.multistart import SearchResult
-from jimpact.fits.problem import EXACT, FitProblem
+from jimpact.fits.problem import FitProblem
+from jimpact.fits.search import SearchResult
+from jimpact.fits.solve import EXACT
 from jimpact.fits.uncertainty import Uncertainty
 from jimpact.laws.kinematic import RestitutionMatrix
 from jimpact.status import STATUS
@@ -30,10 +31,14 @@ def fit_warnings(
         found += find_defects(data, problem.scene, stored)
         found += map(Finding, _unknown_corrections(problem))
     lines: list[str] = []
+    if solution.stuck:
+        lines.append(
+            "The minimum is a kink of the law (the sequence of contacts changes there, or its "
+            "derivatives are wrong): standard errors do not hold."
+        )
     if not solution.converged:
         lines.append(
-            "The fit has not converged: allow more `max_steps` or `starts` (or the minimum sits on "
-            "a kink of the law, where the sequence of contacts changes)."
+            "The fit has not converged: allow more `max_steps`, `starts` or time (`limit`)."
         )
     if data is not None:
         lines += _statuses(solution.status, data.shots)
@@ -53,8 +58,11 @@ def _of_parameters(problem: FitProblem, solution: SearchResult, errors: Uncertai
         )
     names = problem.names
     for i in np.flatnonzero(solution.at_bound):
+        _, high = problem.domains[i]
+        end, towards = ("upper", "smaller") if solution.value[i] >= high else ("lower", "larger")
         lines.append(
-            f"{names[i]} ends at its bound {solution.value[i]:g}: its error holds for one side."
+            f"{names[i]} is at its {end} bound {solution.value[i]:g}; its standard error only "
+            f"holds towards {towards} values."
         )
     if errors.rank < len(names):
         lines.append(

@@ -75,6 +75,7 @@ def fit_motion(
     max_steps: int = MAX_PASSES,
     profiles: bool = False,
     progress: float | None = None,
+    limit: float | None = None,
     **options: Any,
 ) -> Fit:
     """The parameters of `law` with which `simulate` comes nearest to one or more measured motions.
@@ -97,7 +98,7 @@ def fit_motion(
         sigma: standard errors of the measurement, scalar or shaped like it; None: estimated.
         bounds, priors, ties: as in `fit`.
         observe: Motion -> array; None: the positions. E.g. `lambda m: m.events.time[:10]`.
-        loss, starts, seed, max_steps, profiles, progress: as in `fit`.
+        loss, starts, seed, max_steps, profiles, progress, limit: as in `fit`.
         options: of `simulate`; `samples` follows from `measured` where `observe` is None.
 
     Returns:
@@ -141,6 +142,7 @@ def fit_motion(
         max_steps=max_steps,
         profiles=profiles,
         progress=progress,
+        limit=limit,
     )
 
 

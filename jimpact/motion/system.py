@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jimpact._checks import as_float_array, check_values
+from jimpact._checks import as_float_array, check_values, in_numbers
 from jimpact.bodies.base import STANDARD_GRAVITY, Body, GivenBody, LinearPotential, Potential
 from jimpact.bodies.blocks import Block
 from jimpact.bodies.dimers import Dimer
@@ -56,6 +56,15 @@ class System(eqx.Module):
     potential: Potential | None
     base: Base | None
     base_directions: jax.Array | None
+
+    def __str__(self) -> str:
+        """The body, its mass, and the loads."""
+        names = ("force", "potential", "base")
+        loads = [name for name in names if getattr(self, name) is not None]
+        lines = [f"system of a {type(self.body).__name__}"]
+        if not callable(self.mass):
+            lines.append(f"mass     {in_numbers(self.mass)}")
+        return "\n".join([*lines, f"loads    {', '.join(loads) or 'none'}"])
 
     def __init__(
         self,

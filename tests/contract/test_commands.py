@@ -65,11 +65,9 @@ def test_a_study_knows_priors_and_names_of_entries(tmp_path):
 
 def test_fit_of_a_study(tmp_path, capsys):
     picture = tmp_path / "deep" / "a.svg"
-    page = tmp_path / "fit.html"
-    options = ["--out", picture, "--seed", "1", "--report", page]
+    options = ["--out", picture, "--seed", "1"]
     code, said = call(capsys, "fit", written(tmp_path), *options)
     assert code == 0
-    assert "seed 1" in page.read_text(encoding="utf-8")
     for words in ("study", "as measured", "corrected ", "Rank: ", "Warnings", "Picture: "):
         assert words in said.out
     assert picture.read_text().startswith("<?xml")
@@ -452,7 +450,7 @@ def test_laws(capsys, tmp_path, monkeypatch):
     [
         (["fit", "nowhere.toml"], "Study 'nowhere.toml' does not exist"),
         (["fit", "--out", "fit.docx"], "--out must end in .png, .pdf or .svg"),
-        (["fit", "--report", "fit.pdf"], "--report must end in .html"),
+        (["fit", "--limit", "0"], "--limit must be > 0 seconds"),
         (["fit", "--json", "--csv"], "--json and --csv must not both be given"),
         (["fit", "--law", "aristotle"], "the law must be one of"),
         (["compare", "--shot", "2"], "--shot must lie in [1, 1], but is 2"),
@@ -646,8 +644,8 @@ def test_ctrl_c_while_importing_and_compiling(verb, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_fit_as_a_user_runs_it(tmp_path, monkeypatch):
-    """The bundled three balls: one e; corrected; all free; the other laws; a picture."""
-    command = [sys.executable, "-m", "jimpact.cli", "fit", "--json"]
+    """The bundled three balls: one e; corrected; all free, since asked for; a picture."""
+    command = [sys.executable, "-m", "jimpact.cli", "fit", "--json", "--all-free"]
     monkeypatch.delenv("COLUMNS", raising=False)
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
     assert all(len(line) <= 80 for line in done.stderr.splitlines())
@@ -657,7 +655,6 @@ def test_fit_as_a_user_runs_it(tmp_path, monkeypatch):
         np.testing.assert_allclose(fits[name]["rms"], rms, atol=5e-5)
     assert fits["all free"]["rank"] == 2
     assert len(fits["all free"]["parameters"]) == 3
-    np.testing.assert_allclose(fits["Newton"]["parameters"][0]["value"], 0.61185, atol=1e-5)
     assert "1.0422" in fits["as measured"]["warnings"][0]
     assert "1.0103" in fits["as measured"]["warnings"][1]
     assert (tmp_path / "jimpact-fit.png").stat().st_size > 10_000

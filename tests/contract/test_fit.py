@@ -373,7 +373,7 @@ def test_carts_that_stick_end_at_the_bound():
         found = ji.fit(law, ji.chain([0.34175, 0.15449]), data)
         assert float(found.law.restitution) == 0.0
         assert found.at_bound[0]
-        assert "restitution ends at its bound 0" in " ".join(found.warnings)
+        assert "restitution is at its lower bound 0" in " ".join(found.warnings)
         assert "The data violate conservation of momentum" in found.warnings[0]
         assert found.confidence_interval()[0, 0] == 0.0
 
@@ -415,8 +415,6 @@ def test_a_stiffness_that_nobody_freed_is_held():
     (note,) = found.identifiability
     assert note.startswith("stiffness is fixed at its start")
     assert note in str(found)
-    more = ji.design(found, data)
-    assert more.names == ("restitution",)
     pair = ji.FitProblem.from_shots(ji.LZB([0.9], [2.0]), PAIR, TWO)
     assert pair.names == ("restitution[1]",)
     laws = ji.fit_laws(BALLS, data, {"mine": ji.LZB(0.95)}, starts=1)
@@ -643,12 +641,6 @@ def test_what_only_a_prior_knows_is_said_to_be_its():
     assert (found.rank, found.from_prior.tolist()) == (2, [False, True])
     assert "restitution[2] = 0.70 ± 0.05, which is its prior" in found.verdict
     assert "prior alone 0.7 ± 0.05" in str(found)
-    plan = ji.design(found, ji.Experiments(PRE_3[2:3], PRE_3[2:3], 0.01))
-    alone = ji.design(
-        ji.fit(law, BALLS, seen, starts=1), ji.Experiments(PRE_3[2:3], PRE_3[2:3], 0.01)
-    )
-    together = 1 / (alone.standard_error[0, 1] ** -2 + 0.05**-2)
-    np.testing.assert_allclose(plan.standard_error[0, 1], np.sqrt(together), rtol=1e-4)
 
 
 @pytest.mark.parametrize(("free", "priors", "message"), [
@@ -1025,30 +1017,6 @@ def test_bootstrap_scatters_as_much_as_the_standard_error():
     exact = ji.Experiments(SHOTS[:1], [[np.nan, 0.6]])
     with pytest.raises(ValueError, match="must have a known noise"):
         ji.bootstrap(ji.fit(ji.Newton(0.9), PAIR, exact, starts=1))
-
-
-def test_the_next_shot_is_the_one_that_tells_most():
-    """Against fits of all data together: the errors promised, and the best of the candidates."""
-    noise, law = 0.01, ji.Newton([0.8, 0.6])
-    seen = ji.Experiments(PRE_3[:1], simulated(law, BALLS, PRE_3[:1]), noise)
-    found = ji.fit(law, BALLS, seen, starts=1)
-    assert found.rank == 1  # nothing has approached contact 2
-    more = np.array([[2.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 0.0, -2.0]])
-    errors = []
-    for pre in more:
-        both = np.stack([PRE_3[0], pre])
-        data = ji.Experiments(both, simulated(law, BALLS, both), noise)
-        errors.append(ji.fit(law, BALLS, data, starts=1).standard_error)
-    plan = ji.design(found, ji.Experiments(more, more, noise))
-    assert plan.index.tolist() == [2]
-    np.testing.assert_allclose(plan.standard_error[0], errors[2], rtol=1e-3)
-    same = ji.design(found, ji.Experiments(more, more), count=2, target="restitution[1]")
-    assert same.index[0] == 0
-    assert same.standard_error.shape == (2, 2)
-    other = ji.design(found, ji.Experiments(more, more, noise), target="restitution[2]")
-    assert other.index[0] == np.argmin(np.array(errors)[:, 1]) == 2
-    with pytest.raises(ValueError, match="`target` must be one of"):
-        ji.design(found, seen, target="friction")
 
 
 def test_a_law_with_a_matrix_field():

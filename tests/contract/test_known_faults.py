@@ -21,7 +21,7 @@ def fault(issue, **options):
     return pytest.mark.xfail(strict=True, reason=f"issue '{issue}'", **options)
 
 
-FRICTION, ENGINE, FIT = "One friction", "One engine", "A fit"
+FRICTION, ENGINE = "One friction", "One engine"
 
 
 def status_of(out):
@@ -267,7 +267,6 @@ WALL_SHOTS = np.array(
 
 
 @pytest.mark.release
-@fault(FIT)
 def test_a_fit_of_four_balls_and_a_wall_reaches_its_minimum():
     """chi^2 is 56.2206 by MINPACK on `ji.impact` and its Jacobian."""
     scene = ji.chain([0.1, 0.1, 0.2, 0.1], wall=True)

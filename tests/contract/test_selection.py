@@ -1,18 +1,17 @@
 """Which law, restitution by speed, scatter between shots, the posterior."""
 
 import json
-import sys
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy import optimize, stats
+from scipy import stats
 from scipy.special import chdtrc
 from selection_cases import PAIR, PRE, SPEED, after
 
 import jimpact as ji
-from jimpact import Scatter, read_study
+from jimpact import read_study
 
 
 @pytest.fixture(scope="module")
@@ -166,15 +165,6 @@ def test_a_study_names_the_option(tmp_path):
     assert study.free == {"restitution": True, "yield_speed": True}
 
 
-def test_a_page_of_something_else_than_shots(tmp_path):
-    problem = ji.FitProblem.from_observable(
-        ji.Newton(0.9), lambda law: law.restitution ** jnp.array([2.0, 4.0]), [0.49, 0.25], 0.01
-    )
-    text = ji.fit(problem).report(tmp_path / "fit.html").read_text(encoding="utf-8")
-    assert "restitution = 0.70" in text
-    assert text.count("<img") == 2
-
-
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -227,202 +217,3 @@ def test_exponents_are_sought_where_they_mean_something():
     data = ji.Experiments([1.0, 0.0, 0.0], [-0.06, 0.1, 0.96])
     problem = ji.FitProblem.from_shots(law, balls, data, "exponent")
     assert problem.domains.tolist() == [[1.0, 5.0], [1.0, 7.0]]
-
-
-def test_scatter_between_shots():
-    """Its size, and the mean's error, which is that of so many draws."""
-    rng = np.random.default_rng(3)
-    e = 0.7 + 0.05 * rng.normal(size=12)
-    found = ji.fit(ji.Newton(0.5), PAIR, ji.Experiments(PRE, after(e, 0.002), sigma=0.002))
-    reported = ji.scatter(found)
-    assert reported.explains
-    assert reported.value == pytest.approx(e.std(ddof=1), rel=0.05)
-    assert reported.standard_error[0] == pytest.approx(reported.value / np.sqrt(12), rel=0.05)
-    np.testing.assert_allclose(reported.each, e, atol=0.02)
-    assert "if restitution scatters by 0.0" in found.verdict
-    assert "Scatter from shot to shot" in str(found)
-    assert found.noise > 5  # the errors of the plain fit are stretched
-    falling = ji.Experiments(PRE, after(0.8 * SPEED**-0.2, 0.002), sigma=0.002)
-    assert "It depends on the speed" in str(ji.fit(ji.Newton(0.5), PAIR, falling))
-    moved = after(e, 0.002) + 0.1 * rng.normal(size=(12, 1))  # no e makes momentum
-    both = ji.fit(ji.Newton(0.5), PAIR, ji.Experiments(PRE, moved, sigma=0.002))
-    reported = ji.scatter(both)
-    share = 1 - reported.squares / both.starts[0].sum_of_squares
-    assert 0.1 < share < 0.9
-    assert not reported.explains
-    assert f"from shot to shot, which accounts for {100 * share:.2g} % of chi^2" in both.verdict
-
-
-def test_the_chance_of_scatter_is_half_that_of_chi_squared():
-    """Shots alike: `deviance(t) = (K - 1) log(s^2 + t^2) + S / (s^2 + t^2)`, least at S / (K - 1)."""
-    sigma, e = 0.02, 0.7 + 0.04 * np.sin(np.arange(12.0))
-    pre = np.tile([1.0, 0.0], (12, 1))
-    post = np.stack([(1 - 2 * e) / 3, (1 + e) / 3], axis=1)
-    s = sigma / np.sqrt((2 / 3) ** 2 + (1 / 3) ** 2)  # error of the e of one shot
-    ratio = e.var(ddof=1) / s**2
-    gain = 11 * (ratio - 1 - np.log(ratio))
-    scatter = ji.scatter(ji.fit(ji.Newton(0.5), PAIR, ji.Experiments(pre, post, sigma)))
-    assert scatter.value == pytest.approx(s * np.sqrt(ratio - 1), rel=1e-4)
-    assert scatter.chance == pytest.approx(0.5 * stats.chi2.sf(gain, 1), rel=1e-4)
-
-
-def test_a_trend_over_the_shots_has_two_sides():
-    """With equal errors it is the t test of a regression line."""
-    x = np.arange(8.0)
-    y = 0.7 - 0.01 * x + 0.02 * np.cos(3 * x)
-    scatter = Scatter("e", 0.0, 1.0, ("e",), y[:1], y[:1], 1.0, 7, y, np.full(8, 0.02))
-    assert scatter.trend(x) == pytest.approx(stats.linregress(x, y).pvalue)
-    assert scatter.trend(-x) == pytest.approx(stats.linregress(x, y).pvalue)
-
-
-def test_no_scatter_is_said():
-    data = ji.Experiments(PRE, after(np.full(12, 0.7), 0.01))
-    found = ji.fit(ji.Newton(0.5), PAIR, data)
-    reported = ji.scatter(found)
-    assert reported.chance > 0.01
-    assert "shows no scatter" in str(reported)
-    assert reported.mean[0] == pytest.approx(found.value[0], abs=0.5 * found.standard_error[0])
-    with pytest.raises(ValueError, match="`name` must be one of restitution"):
-        ji.scatter(found, "friction")
-
-
-BALLS = ji.chain([1.0, 1.0, 1.0])
-
-
-def of_both_ends(sets, shots, sds, correlation, sigma):
-    """Sets of shots of two balls at a third, from both ends, whose e1 and e2 scatter."""
-    rng = np.random.default_rng(7)
-    spread = np.outer(sds, sds) * [[1.0, correlation], [correlation, 1.0]]
-    e = rng.multivariate_normal([0.7, 0.6], spread, (sets, shots))
-    post = np.stack([-2 * e[..., 0] - e[..., 1], e[..., 0] - e[..., 1], e @ [1.0, 2.0]], axis=-1)
-    post = post / 3 + sigma * rng.normal(size=post.shape)
-    return [ji.Experiments(np.tile([1.0, 0.0, -1.0], (shots, 1)), v, sigma) for v in post]
-
-
-def test_scatter_of_two_parameters():
-    """Shots alike: D is the covariance of their (e1, e2) less S, that of the errors of one.
-
-    `deviance = (K - 1) (log det V + tr(V^-1 C))`, V = D + S, C the covariance of what they show.
-    """
-    sigma, (data,) = 0.005, of_both_ends(1, 16, [0.06, 0.04], 0.5, 0.005)
-    slope = np.array([[-2.0, -1.0], [1.0, -1.0], [1.0, 2.0]]) / 3
-    shown = np.cov(np.linalg.pinv(slope) @ np.asarray(data.post).T)
-    error = sigma**2 * np.linalg.inv(slope.T @ slope)
-
-    def deviance(sds, correlation):
-        v = np.outer(sds, sds) * [[1.0, correlation], [correlation, 1.0]] + error
-        return 15 * (np.linalg.slogdet(v)[1] + np.trace(np.linalg.solve(v, shown)))
-
-    fit = ji.fit(ji.Newton([0.9, 0.9]), BALLS, data)
-    found = ji.joint_scatter(fit, fit.names)
-    spread = shown - error
-    np.testing.assert_allclose(found.value, np.sqrt(np.diag(spread)), rtol=1e-3)
-    correlation = spread[0, 1] / np.sqrt(spread[0, 0] * spread[1, 1])
-    np.testing.assert_allclose(found.correlation, [[1, correlation], [correlation, 1]], atol=1e-3)
-    np.testing.assert_allclose(found.standard_error**2, np.diag(shown) / 16, rtol=1e-3)
-    least = deviance(found.value, correlation)
-    np.testing.assert_allclose(
-        found.chance, stats.chi2.sf(deviance([0.0, 0.0], 0.0) - least, 3), rtol=1e-2
-    )
-    for end in found.interval[0]:
-
-        def others(x, end=end):
-            return deviance([end, np.exp(x[0])], np.tanh(x[1]))
-
-        best = optimize.minimize(others, [-3.0, 0.5], method="Nelder-Mead")
-        assert best.fun - least == pytest.approx(stats.chi2.isf(0.05, 1), rel=0.01)
-    apart = ji.joint_scatter(fit, fit.names, correlated=False)
-    assert apart.correlation.tolist() == [[1.0, 0.0], [0.0, 1.0]]
-    assert "restitution[2] scatters by" in str(apart)
-    with pytest.raises(ValueError, match="at least two parameters"):
-        ji.joint_scatter(fit, ["restitution[1]"])
-
-
-@pytest.mark.release
-def test_intervals_of_two_scatters_cover():
-    """100 sets of 24 shots: 95 % intervals, of which 100 show a standard deviation of 2 %."""
-    sds = np.array([0.05, 0.02])
-    fits = ji.fit_many(ji.Newton([0.9, 0.9]), BALLS, of_both_ends(100, 24, sds, 0.5, 0.005))
-    low, high = np.moveaxis([ji.joint_scatter(x, x.names).interval for x in fits], 2, 0)
-    assert (((low <= sds) & (sds <= high)).mean(axis=0) > 0.89).all()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("sigma", [0.01, None])
-def test_errors_of_the_mean_are_true(sigma):
-    """Over many sets of shots whose e scatters: the spread of what is found is what is reported."""
-    rng, sets = np.random.default_rng(5), 150
-    many = []
-    for k in range(sets):
-        e = np.clip(0.6 + 0.06 * rng.normal(size=12), 0, 1)
-        many.append(ji.Experiments(PRE, after(e, 0.01, seed=k), sigma))
-    found = [ji.scatter(fit) for fit in ji.fit_many(ji.Newton(0.5), PAIR, many)]
-    mean = np.array([x.mean[0] for x in found])
-    error = np.array([x.standard_error[0] for x in found])
-    assert mean.std() == pytest.approx(np.sqrt(np.mean(error**2)), rel=0.15)
-    inside = np.abs(mean - 0.6) < 2.2 * error  # Student's t of 11 degrees of freedom, 95 %
-    assert inside.mean() > 0.9
-    assert np.median([x.value for x in found]) == pytest.approx(0.06, rel=0.15)
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("lenient")
-def test_posterior_is_the_linearized_one_where_it_is_gaussian(found):
-    pytest.importorskip("numpyro")
-    pytest.importorskip("arviz")
-    size = {"samples": 2500, "warmup": 200, "chains": 2}
-    flat = ji.posterior(found, **size)
-    x = np.asarray(flat.posterior["restitution"])
-    assert x.shape == (2, 2500)
-    assert x.mean() == pytest.approx(found.value[0], abs=0.1 * found.standard_error[0])
-    assert x.std() == pytest.approx(found.standard_error[0], rel=0.05)
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("lenient")
-def test_posterior_of_an_admissible_matrix_is_that_of_a_grid():
-    pytest.importorskip("numpyro")
-    pytest.importorskip("arviz")
-    balls, law = ji.chain([1.0] * 3), ji.RestitutionMatrix([[0.5, 0.1], [0.15, 0.4]])
-    pre = np.array([[1.0, 0, 0], [1, 0, -1], [0, 0, -1], [1, 0.2, -0.5]])
-    post = np.array([ji.impact(law, balls, v).velocity for v in pre])
-    post += 0.15 * np.random.default_rng(0).normal(size=post.shape)
-    free = {"matrix": np.array([[False, True], [True, False]])}
-    fitted = ji.fit(law, balls, ji.Experiments(pre, post, 0.15), free, starts=1)
-    drawn = ji.posterior(fitted, samples=800, warmup=300, chains=2).posterior
-    x = np.stack([np.ravel(drawn[name]) for name in fitted.names])
-
-    problem, region = fitted.problem, fitted.problem.residuals.region
-    middle = (np.arange(40) + 0.5) / 40
-    grid = np.stack(np.meshgrid(middle, middle), axis=-1).reshape(-1, 2)
-    slack, density = jax.jit(
-        jax.vmap(lambda y, x: (region.conditions(y)[0].min(), problem.log_density(x)))
-    )(problem.point(grid), grid)
-    weight = np.where(slack >= 0, np.exp(density - np.max(density)), 0.0)
-    weight /= weight.sum()
-    mean = weight @ grid
-    np.testing.assert_allclose(x.mean(axis=1), mean, atol=0.015)
-    np.testing.assert_allclose(x.std(axis=1), np.sqrt(weight @ (grid - mean) ** 2), rtol=0.1)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("priors", "message"),
-    [
-        ({"restitution": ji.Uniform(0.5, 1.5)}, r"`priors` must lie in \[0, 1\]"),
-        ({"restitution": ji.Normal(2.0, 0.1)}, "`priors` must have its mean in"),
-        ({"restitution": 0.5}, "`priors` must map `restitution`"),
-        ({"stiffness": ji.Uniform(0.5, 1.5)}, "`priors` must name parameters, restitution"),
-    ],
-)
-def test_bad_priors(found, priors, message):
-    pytest.importorskip("numpyro")
-    pytest.importorskip("arviz")
-    with pytest.raises(ValueError, match=message):
-        ji.posterior(found, priors)
-
-
-def test_the_extra_is_named_where_it_is_missing(found, monkeypatch):
-    monkeypatch.setitem(sys.modules, "numpyro", None)
-    with pytest.raises(ImportError, match=r"jimpact\[bayes\]"):
-        ji.posterior(found)

@@ -72,11 +72,9 @@ def test_every_body_has_a_table(kind):
     [
         ["fit", "--out", "file/a.png"],
         ["fit", "--out", "file/deep/a.png"],
-        ["fit", "--report", "file/a.html"],
         ["simulate", "--gif", "file/a.gif"],
         ["simulate", "--portrait", "file/a.png"],
         ["montecarlo", "--folder", "file/chunks"],
-        ["fit", "--report", "folder.html"],
     ],
 )
 def test_unwritable_places_are_refused_before_anything_is_computed(

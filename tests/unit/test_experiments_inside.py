@@ -129,6 +129,7 @@ def test_gross_defects_need_no_test():
     post = 100 * exact + np.array([[5.0, 3.0], [-6.0, -10.0]])  # cm/s
     lines = data_defects(ji.Experiments(pre, post), ji.chain([1.0, 1.0]))
     assert [line.split(" (")[0] for line in lines] == [
+        "Units? The momentum after is 100 times that before: cm/s in one of the columns?",
         "The data violate conservation of momentum",
         "The data gain energy",
     ]

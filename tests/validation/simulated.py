@@ -17,10 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import jimpact as ji
-from jimpact.fits.least_squares import BoxRegion
-from jimpact.fits.multistart import run
 from jimpact.fits.problem import filled_up
 from jimpact.fits.scaled import ScaledFit
+from jimpact.fits.solve import BoxRegion, Search, minimize
 
 PAGE = Path(__file__).parents[2] / "docs" / "coverage.md"
 PAIR, BALLS = ji.chain([1.0, 2.0]), ji.chain([1.0, 1.0, 1.0])
@@ -212,7 +211,7 @@ def covered(row, fits):
         many = jax.tree.map(lambda *x: np.stack([np.asarray(each) for each in x]), *filled)
         box = BoxRegion(low, high)
         many = eqx.tree_at(lambda r: (r.low, r.high, r.region), many, (low, high, box))
-        states = run(many, y, "levenberg-marquardt", 100, lambda *reported: None, rivals=False)
+        states = minimize(many, y, Search())
         squares = 2 * np.asarray(states.cost) * np.array([s.size for s in scaled]) ** 2
         deviance = np.array([s.deviance_of(x) for x, s in zip(squares, scaled)])
         inside.append(deviance <= [f.quantile(0.95) ** 2 for f in fits])
