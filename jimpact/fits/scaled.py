@@ -13,6 +13,9 @@ from jimpact.fits.search import START_SCALES, repeated
 from jimpact.fits.solve import DEFAULT_STEPS, BoxRegion, Search, SolverState, minimize
 from jimpact.progress import Show
 
+# Deviances are right to this (see `solve.FINE`): an interval's ends move by a millionth.
+_STOP = 1e-7
+
 
 class ScaledFit:
     """A fit in scaled parameters y (Q,), and the minima with some of them fixed."""
@@ -70,7 +73,7 @@ class ScaledFit:
         many = repeated(self.residuals, len(fixed))
         many = eqx.tree_at(lambda r: (r.low, r.high, r.region), many, (box.low, box.high, box))
         search = Search(max_steps=steps, show=show)
-        states = minimize(many, points, search, what="fixed values")
+        states = minimize(many, points, search, _STOP, what="fixed values")
         return 2 * np.asarray(states.cost, float) * self.size**2, states
 
 
