@@ -215,8 +215,8 @@ def fit(
         max_steps: iterations per start.
         profiles: whether intervals are those of `profile`; None: where standard errors cannot be
             trusted (at a bound, in a valley, with several minima, or for weakly determined
-            parameters) and the law fits, of up to 256 shots, with a single start of up to 64; else
-            the report says how to get them.
+            parameters) and the law fits, of up to 3 parameters and 256 shots (64 with one start);
+            else the report says how to get them.
         progress: bar on stderr; None: on a terminal, for fits longer than two seconds.
         limit: seconds after which no further step of the search is begun; None: no limit.
 

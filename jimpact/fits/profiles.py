@@ -24,6 +24,9 @@ SAME = 1e-6  # relative sums of squares that are equal
 END = 1e-3  # of the root of the limit: how near to it an end is searched for
 FAR, ROUGH = 2.0, 2  # times the limit beyond which only ROUGH passes are spent
 MANY = 256  # shots up to which they take half as long as a fit with eight starts
+# Parameters up to which `fit` profiles of itself: with four of LZB that takes several times as long
+# as the search, and the report names `ji.profile` in its place.
+MOST_PARAMETERS = 3
 QUICK_POINTS, QUICK_LEVEL = 17, 0.95  # of the profiles that `fit` computes by default: fixed values
 LONGEST = 2.0  # steps by which a scan is extrapolated
 ROUNDS = 8  # of the search for an end: it is then right to a millionth of a grid cell, mostly
@@ -370,6 +373,7 @@ def needs_profiles(fit: FitResult) -> bool:
     """
     most = FEW if fit.start_count == 1 else MANY
     few = fit.experiments is not None and len(fit.predicted) <= most
+    few &= len(fit.names) <= MOST_PARAMETERS
     return few and fit.linearization_misleads and not fit.shows_lack_of_fit
 
 
