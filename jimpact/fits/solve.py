@@ -37,6 +37,7 @@ DEFAULT_STEPS = {"levenberg-marquardt": 100, "lbfgs": 100, "adam": 500, "sgd": 1
 FINE = {"float64": 1e-17, "float32": 1e-4}
 ROUNDING = {"float64": 1e-7, "float32": 1e-3}
 COARSE, CONVERGED = 1e-3, 1e-2
+DESCENDED = 1e-6  # the same for gradient descent, which has no step that would make up for it
 # ... or less than this: residuals are of order 1, and impacts are good to 1e-8 (1e-5), which
 # counts where no lower point is found.
 STOP_EXACT = {"float64": 1e-24, "float32": 1e-12}
@@ -165,7 +166,8 @@ class SolverState(eqx.Module):
     def converged(self) -> np.ndarray:
         """Which of the points (S,) are so close to a minimum that they stand, on the host."""
         promised, squares = 2 * np.asarray(self.gain, float), self.squares
-        small = promised <= CONVERGED * squares / self.residual.shape[-1]
+        enough = CONVERGED if isinstance(self.memory, Damping) else DESCENDED
+        small = promised <= enough * squares / self.residual.shape[-1]
         return small | (squares <= EXACT[str(self.y.dtype)]) | np.asarray(self.stuck)
 
 
