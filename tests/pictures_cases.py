@@ -8,7 +8,7 @@ BALLS, STRIKE = ji.chain([1.0, 1.0, 1.0]), np.array([1.0, 0.0, 0.0])
 
 
 def samples(gaps):
-    law, options = ji.Newton(0.5), {"samples": 64, "chunk": 64}
+    law, options = ji.Binary(0.5, order="earliest"), {"samples": 64, "chunk": 64}
     if not gaps:  # two equal balls of which one is struck with a random speed
         pair, speeds = ji.chain([1.0, 1.0]), ji.Uniform([1.0, 0.0], [2.0, 0.0])
         return ji.plot.monte_carlo(ji.monte_carlo(law, pair, speeds, **options))

@@ -88,9 +88,13 @@ def meaningless(status: jax.Array) -> jax.Array:
 
 
 class Observed(eqx.Module):
-    """The observable of a user's own function of a law."""
+    """The observable of a user's own function of a law.
+
+    `absolute`: it may see absolute stiffnesses (a force, a time), not only their ratios.
+    """
 
     function: Callable[[Law], Any] = eqx.field(static=True)
+    absolute: bool = eqx.field(static=True, default=False)
 
     def __call__(self, law: Law) -> Prediction:
         """The value of the function; NaN counts as meaningless."""
@@ -362,7 +366,10 @@ class FitProblem:
         if sigma is not None:
             sigma = np.where(np.isnan(post), 1.0, np.asarray(as_float_array("sigma", sigma)))
             check_values("sigma", sigma, low=0.0, open_low=True)
-        observable = Observed(observe) if not isinstance(observe, eqx.Module) else observe
+        # a stiffness that the user names is one that the function sees
+        absolute = free is not DEFAULT_FREE
+        own = isinstance(observe, eqx.Module)
+        observable = observe if own else Observed(observe, absolute)
         unit = np.nanmax(np.abs(post)) or 1.0
         dtype = _dtype(law, observable, post)
         errors = np.ones(()) if sigma is None else sigma

@@ -17,6 +17,8 @@ from jimpact.events.impact_dynamics import method_for
 from jimpact.events.queues import SLOTS
 from jimpact.solvers.step_impulses import StepProblem, descent_lengths, solve
 
+pytestmark = pytest.mark.slow  # they compile programs of their own
+
 
 def pressed(name):
     """Scene and velocity of a body on the ground."""

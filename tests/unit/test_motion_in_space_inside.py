@@ -20,6 +20,8 @@ from jimpact.motion.persistent_contact import (
 )
 from jimpact.motion.record import EVENT_KINDS
 
+pytestmark = pytest.mark.slow  # they compile programs of their own
+
 RADIUS = 0.1
 
 

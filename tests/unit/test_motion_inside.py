@@ -15,6 +15,8 @@ from jimpact.motion.flow import nan_derivatives, status_at_start
 from jimpact.motion.simulate import CHUNK
 from jimpact.motion.transitions import impact_jump
 
+pytestmark = pytest.mark.slow  # they compile programs of their own
+
 
 @pytest.mark.release
 def test_runs_of_the_program_follow_each_other():

@@ -2,11 +2,13 @@
 
 import jax
 import numpy as np
+import pytest
 
 import jimpact as ji
 from jimpact.events import queues
 
 
+@pytest.mark.slow
 def test_a_queue_gives_the_outcomes_of_single_impacts(monkeypatch):
     monkeypatch.setattr(queues, "SLOTS", 4)
     monkeypatch.setattr(queues, "FREE", 2)

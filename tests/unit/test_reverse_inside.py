@@ -9,6 +9,8 @@ from reverse_cases import both_modes
 import jimpact as ji
 from jimpact.events import kept_steps
 
+pytestmark = pytest.mark.slow  # they compile programs of their own
+
 
 def test_steps_that_are_run_again_have_their_derivatives(monkeypatch):
     """Duration pi sqrt(m/k) of a ball of 1 m/s, largest force sqrt(k m), force sqrt(k m) sin(w t)."""
