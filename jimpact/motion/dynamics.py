@@ -39,6 +39,7 @@ def carried_along(system: System, v: jax.Array, t: jax.Array) -> jax.Array:
     return jnp.zeros_like(v) if velocity is None else velocity
 
 
+@full_precision
 def _displaced(system: System, t: jax.Array) -> jax.Array:
     """Displacement of the base `B y_b(t)` (n,)."""
     assert system.base is not None
@@ -46,6 +47,7 @@ def _displaced(system: System, t: jax.Array) -> jax.Array:
     return system.base_directions @ jnp.atleast_1d(system.base(t))
 
 
+@full_precision
 def seen_from_base(system: System, q: jax.Array, t: jax.Array) -> jax.Array:
     """The configuration, displaced by `-B y_b(t)`."""
     return q if system.base is None else system.body.moved(q, -_displaced(system, t))
