@@ -197,13 +197,15 @@ def settled(
         states = minimize(many, points, search)
         before, points = points, np.asarray(states.y, float)
         moved = np.abs(points - before).max(axis=1) > SETTLED
-        if many.mixing is None:
+        if many.mixing is None or search.max_steps == 1:
             return problems, states
         best = np.nanargmin(states.cost.reshape(-1, each), axis=1)
         last = list(states.aux[-1][np.arange(0, len(points), each) + best])
-        if not moved.any():
-            return problems, states  # whose residuals and Jacobians are weighted by the same law
-        slopes = last
+        settled_now, slopes = not moved.any() and slopes is not None, last
+        if settled_now:  # residuals and Jacobians once more, weighted by the law that was found
+            search = search._replace(max_steps=1)
+        elif not moved.any():
+            return problems, states
     return problems, eqx.tree_at(lambda s: s.gain, states, np.where(moved, np.inf, states.gain))
 
 

@@ -13,6 +13,8 @@ from jimpact import Binary, RandomLaw, Uniform, chain, monte_carlo
 from jimpact.montecarlo.executors import Devices, Executor, Serial, as_executor
 from jimpact.montecarlo.store import fingerprint
 
+pytestmark = pytest.mark.slow  # they compile programs of their own
+
 BALLS = chain([0.25, 1.0, 0.25])
 
 
