@@ -190,23 +190,32 @@ def settled(
         many = stacked([problem for problem in problems for _ in range(each)])
     for _ in range(SETTLING):
         if slopes is not None:
-            problems = [p.with_errors_before(slope) for p, slope in zip(problems, slopes)]
-            weights = [_weights(filled_up(p.residuals)) for p in problems]
-            new = (np.repeat(np.stack(x), each, axis=0) for x in zip(*weights))
-            many = eqx.tree_at(_weights, many, tuple(new))
+            problems, many = _weighted(problems, many, slopes)
         states = minimize(many, points, search)
         before, points = points, np.asarray(states.y, float)
         moved = np.abs(points - before).max(axis=1) > SETTLED
-        if many.mixing is None or search.max_steps == 1:
+        if many.mixing is None:
             return problems, states
         best = np.nanargmin(states.cost.reshape(-1, each), axis=1)
         last = list(states.aux[-1][np.arange(0, len(points), each) + best])
-        settled_now, slopes = not moved.any() and slopes is not None, last
-        if settled_now:  # residuals and Jacobians once more, weighted by the law that was found
-            search = search._replace(max_steps=1)
-        elif not moved.any():
+        if not moved.any():
+            if slopes is not None:  # residuals and Jacobians with the weights of the final law
+                problems, many = _weighted(problems, many, last)
+                states = minimize(many, points, search._replace(max_steps=1))
             return problems, states
+        slopes = last
     return problems, eqx.tree_at(lambda s: s.gain, states, np.where(moved, np.inf, states.gain))
+
+
+def _weighted(
+    problems: list[FitProblem], many: Residuals, slopes: list[np.ndarray | None]
+) -> tuple[list[FitProblem], Residuals]:
+    """The problems, and equally many residuals of each, with errors passed on by `slopes`."""
+    problems = [p.with_errors_before(slope) for p, slope in zip(problems, slopes)]
+    weights = [_weights(filled_up(p.residuals)) for p in problems]
+    each = len(many.offset) // len(problems)
+    new = (np.repeat(np.stack(x), each, axis=0) for x in zip(*weights))
+    return problems, eqx.tree_at(_weights, many, tuple(new))
 
 
 def _weights(residuals: Residuals) -> tuple[Any, ...]:
