@@ -247,27 +247,37 @@ def _field(declared: Domain | Option, default: Any, kw_only: bool, static: bool)
     )
 
 
-class _Signed(type(eqx.Module)):  # type: ignore[misc]
-    """The metaclass of equinox; calls that do not fit a class are told what it takes."""
+def _takes(cls: type, *args: Any, **kwargs: Any) -> None:
+    """Raise a TypeError that says what `cls` takes, where these arguments do not fit."""
+    signature = inspect.signature(cls)
+    try:
+        signature.bind(*args, **kwargs)
+    except TypeError as why:
+        names = ", ".join(
+            f"`{name}`" if x.default is x.empty else f"`{name}` = {x.default!r}"
+            for name, x in signature.parameters.items()
+        )
+        raise TypeError(f"{cls.__name__} takes {names}: {why}.") from None
 
-    def __call__(cls, *args: Any, **kwargs: Any) -> Any:
-        """An instance."""
-        try:
-            return super().__call__(*args, **kwargs)
-        except TypeError:
-            taken = inspect.signature(cls)
+
+if TYPE_CHECKING:
+    # a `__call__` of our own would hide the constructors' signatures from type checkers
+    _Signed = type(eqx.Module)
+else:
+
+    class _Signed(type(eqx.Module)):
+        """The metaclass of equinox; calls that do not fit a class name what it takes."""
+
+        def __call__(cls, *args: Any, **kwargs: Any) -> Any:
+            """An instance."""
             try:
-                taken.bind(*args, **kwargs)
-            except TypeError as why:
-                names = ", ".join(
-                    f"`{name}`" if x.default is x.empty else f"`{name}` = {x.default!r}"
-                    for name, x in taken.parameters.items()
-                )
-                raise TypeError(f"{cls.__name__} takes {names}: {why}.") from None
-            raise
+                return super().__call__(*args, **kwargs)
+            except TypeError:
+                _takes(cls, *args, **kwargs)
+                raise
 
 
-class Declared(eqx.Module, metaclass=_Signed):
+class Declared(eqx.Module, metaclass=_Signed):  # type: ignore[metaclass]
     """A module whose fields are parameters and options: laws, contact forces."""
 
     def __init_subclass__(cls, **options: Any) -> None:

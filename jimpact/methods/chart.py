@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_whole, check_choice, check_values, in_common_dtype
+from jimpact.compiling import full_precision
 from jimpact.files.records import fields_as_data, number, table
 from jimpact.fits.parameters import with_entries
 from jimpact.impacts import Impact, impact
@@ -146,6 +147,7 @@ class WorkPrecision:
         return "\n".join(lines)
 
 
+@full_precision
 def work_precision(
     scene: Scene,
     velocity: Any,

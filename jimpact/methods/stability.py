@@ -25,6 +25,7 @@ import numpy as np
 
 from jimpact._checks import as_whole, check_choice, check_values
 from jimpact.audits import audit
+from jimpact.compiling import full_precision
 from jimpact.contact import delassus_matrix
 from jimpact.files.records import as_data, fields_as_data, table
 from jimpact.laws.lzb import LZB
@@ -214,6 +215,7 @@ class StabilityMap:
         return "\n".join(lines)
 
 
+@full_precision
 def stability_map(
     methods: Sequence[str] | None = None,
     axes: Mapping[str, Sequence[float]] | None = None,

@@ -146,7 +146,7 @@ SECTIONS = {
         Row(
             "6.1.1.4",
             "2 balls hit 8: balls that move forward",
-            "sum(ji.impact(ji.LZB(1.0, np.ones(9)), ji.chain(np.ones(10)), np.r_[1.0, 1.0, np.zeros(8)]).velocity > 0).item()",
+            "int((ji.impact(ji.LZB(1.0, np.ones(9)), ji.chain(np.ones(10)), np.r_[1.0, 1.0, np.zeros(8)]).velocity > 0).sum())",
             "M + 2",
             4,
             "so for M <= 6 of ten balls; 13 of 20 at M = 9",
