@@ -102,6 +102,7 @@ def slid(mu, angle):
     return -0.5 / up + 0.5 * down * (1 - 1 / up) ** 2
 
 
+@pytest.mark.slow
 def test_friction_on_a_slope():
     """Sliding, sticking and work in closed form."""
     run = jax.jit(on_a_slope)

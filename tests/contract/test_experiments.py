@@ -268,6 +268,7 @@ def test_nearly_clean_impacts_of_the_cube():
     assert two.shots[:21] == ji.cube_impacts(2).shots
 
 
+@pytest.mark.slow
 def test_measured_drops():
     """Geometry in closed form: an ellipse's contact is where its outline is lowest."""
     ellipse, square = ji.ellipse_impacts(), ji.square_impacts()
@@ -293,6 +294,7 @@ def test_measured_drops():
     assert abs(low) < 4e-3
 
 
+@pytest.mark.slow
 def test_a_correction_leaves_the_errors_before_in_what_it_conserves():
     """Generalized least squares of the velocity difference alone: a pair, its momentum corrected."""
     m, sigma, before = np.array([1.0, 2.0]), np.array([0.02, 0.05]), np.array([0.05, 0.03])

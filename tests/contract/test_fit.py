@@ -427,6 +427,7 @@ def rank_2_of_3():
     return ji.fit(ji.LZB([0.95, 0.95], [1.0, 1.0]), BALLS, data)
 
 
+@pytest.mark.slow
 def test_one_shot_of_three_balls_determines_two_of_three(rank_2_of_3):
     found = rank_2_of_3
     assert found.names == ("restitution[1]", "restitution[2]", "stiffness[2]")

@@ -717,6 +717,7 @@ def cube(row):
 RATES = (("v", "m_s"), ("omega", "rad_s"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("contacts", [1, 2])
 def test_lzb_of_a_real_cube(contacts):
     """Corners that slip, stop, stick (two of one body redundantly) and break loose."""

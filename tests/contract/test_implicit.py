@@ -205,6 +205,7 @@ def test_agrees_with_an_independent_integration(contacts):
     assert (error <= 3 * TIGHT * speed + 3 * held["uncertainty"]).all(), error
 
 
+@pytest.mark.slow
 def test_history_is_that_of_the_other_method():
     """Force, indentation, duration and end of an impact of two contacts, frozen from 'time'."""
     law = ji.LZB([0.9, 0.8], [1.0, 0.5], 1.5, method="implicit", rtol=1e-7)

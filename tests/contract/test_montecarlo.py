@@ -234,6 +234,7 @@ def test_bad_draws_are_counted_listed_and_kept_apart():
     json.dumps(result.to_dict(), allow_nan=False)
 
 
+@pytest.mark.slow
 def test_failed_impacts_are_kept_apart():
     # one collision is allowed: enough for the first row, not for the second
     rows = np.array([[1.0, 0.0, 1.0], [1.0, 0.0, -1.0]] * 4)
@@ -305,6 +306,7 @@ def test_the_linearization_beside_monte_carlo():
     np.testing.assert_allclose(exact.covariance(np.eye(2)), exact.jacobian @ exact.jacobian.T)
 
 
+@pytest.mark.slow
 def test_where_the_linearization_has_nothing_to_say(whole):
     assert whole.gap_scale is None
     jumps = gap_sensitivity(LAW, BALLS, BEFORE, whole.gap_mean, whole)

@@ -134,6 +134,7 @@ def test_an_impact_is_in_the_middle_of_its_step():
     np.testing.assert_allclose(motion.velocity[1], [0.0, after], rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_superball_leaves_with_its_slip_reversed():
     """`u+ = -e_t u-` of the contact point, with friction enough: one impact, and free flight."""
     disc, e_t = ji.Disc(0.5), 0.6
@@ -193,6 +194,7 @@ def test_what_goes_wrong_on_the_way_is_reported(gap, mass, restitution, expected
     assert status(run(restitution)) == expected
 
 
+@pytest.mark.slow
 def test_a_motion_says_how_its_law_fails():
     motion = stepped(ROW, ji.Moreau(1.0), [0.0, 0.3, 0.6], [0.0] * 3)
     codes = motion.events.status.at[0].set(ji.impacts.CODE["negative_impulse"])
@@ -212,6 +214,7 @@ def test_friction_below_0_is_reported():
     assert status(run(-0.3)) == "law_failed"
 
 
+@pytest.mark.slow
 def test_a_quaternion_of_length_2_is_reported():
     ball = ji.Sphere(0.1)
     run = jax.jit(lambda q: stepped(ji.System(ball), ji.Moreau(0.5), q, jnp.zeros(6)))
@@ -332,6 +335,7 @@ def test_a_disc_without_walls_is_refused():
         stepped(ji.System(disc), ji.Moreau(0.5), disc.at([[0.0, 1.0]]), np.zeros(3))
 
 
+@pytest.mark.slow
 def test_a_motion_is_in_the_widest_precision_given():
     """A start in single precision, of a body in double; whole forces."""
     system = ji.System(

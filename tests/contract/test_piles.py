@@ -167,6 +167,7 @@ def test_spheres_fall_into_a_box_and_come_to_rest():
     assert -1e-3 < float(np.min(motion.gaps)) < 0
 
 
+@pytest.mark.slow
 def test_a_mixed_pile_has_the_contacts_of_planar_bodies():
     """The same gaps, normals and tangents, up to their sides; infinite gaps only fill rows."""
     pentagon = 0.2 * np.stack(
@@ -282,6 +283,7 @@ def struck():
     return spheres, spheres.at(places), v
 
 
+@pytest.mark.slow
 def test_a_packing_has_the_contacts_of_its_body(struck):
     spheres, q, _ = struck
     scene, places, columns = spheres.touching(q), np.asarray(q).reshape(8, 6)[:, :3], []

@@ -93,7 +93,14 @@ MOTIONS = {
 }
 
 
-@pytest.mark.parametrize("method", MOTIONS)
+@pytest.mark.parametrize(
+    "method",
+    [
+        "events",
+        "time_stepping",
+        pytest.param("contact_forces", marks=pytest.mark.slow),
+    ],
+)
 def test_motions(method):
     law, options = MOTIONS[method]
     block = ji.Block(0.3, 0.4, 1.3)

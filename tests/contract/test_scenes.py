@@ -115,6 +115,7 @@ BLOCKS = {  # aspect: kinetic angle, 40-digit values
 DIMERS = {0.0: 1.44546849562683122, 5 / 24: 1.42420445174657522, 1e12: 1.53630673083321779}
 
 
+@pytest.mark.slow
 def test_kinetic_angles_of_bodies():
     @jax.jit
     def angles(aspects, ratios):
@@ -146,6 +147,7 @@ def test_kinetic_angles_of_bodies():
     np.testing.assert_allclose(found[away], g[away], atol=1e-14)
 
 
+@pytest.mark.slow
 def test_scene_from_gaps_is_the_block():
     width, height = 1.0, 2.0
 

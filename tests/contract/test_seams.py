@@ -74,6 +74,7 @@ def test_rounding_keeps_its_derivative():
     np.testing.assert_allclose(slopes(v), slopes(exact), atol=1e-14)
 
 
+@pytest.mark.slow
 def test_poisson_on_redundant_contacts():
     """Two contacts of one pair of bodies: v+ depends on how they share p_c, if their e differ."""
     pair = ji.Scene([1.0, 1.0], [[-1.0, -1.0], [1.0, 1.0]])

@@ -126,6 +126,7 @@ def test_restitution_by_speed_is_what_it_says():
     assert float(none.restitution_at(7.0)) == 0.3
 
 
+@pytest.mark.slow
 def test_slopes_of_restitution_by_speed_at_its_edges_are_whole():
     """Where e reaches 1, at the yield speed, at e = 0: one side's, not the mean of two."""
 

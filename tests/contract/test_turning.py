@@ -104,6 +104,7 @@ def test_derivative():
         assert float(slope[i]) == pytest.approx(float(difference), abs=1e-6)
 
 
+@pytest.mark.slow
 def test_nothing_approaches_and_bad_input():
     out = turning_impact(GAPS, MASS, FLAT, -LANDING, Hertz(1e6))
     assert bool(out.ended)

@@ -70,6 +70,7 @@ def test_restitution_falls_with_the_speed(found):
     assert (change[1:4] < -1e-3).all()
 
 
+@pytest.mark.slow
 def test_chains_with_gaps(found):
     v, slope, status, change = found
     assert (status[4:] == 0).all()
