@@ -1,7 +1,12 @@
 """Small dense systems: elimination, singular matrices, and how redundant contacts share forces.
 
 LAYOUT   Flows keep the batch in the last axis: matrices (n, n, B), vectors (n, B). The functions
-`solve_definite`, `null_projector`, `solve_symmetric`, `determinants` have no batch.
+`solve_definite`, `singular_values`, `eigenvectors`, `null_projector`, `solve_symmetric` and
+`determinants` have no batch.
+
+LAPACK   Its kernels go through a batch one by one, and independent ones can wait for each other for
+ever on few cores (jaxlib 0.10). So they factor single matrices; in batches, loops of our own do, up
+to `_BY_LOOP` rows.
 
 COMPILING   Elimination of more than two rows is a loop over the pivots, and products of more than
 `COLUMNS_WRITTEN_OUT` columns are reductions: programs do not grow with the number of contacts.
@@ -18,19 +23,18 @@ depend on the choice; it decides which contact reaches its friction cone first:
 
 import functools
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jimpact.compiling import full_precision
-from jimpact.loops import fori_loop
+from jimpact.loops import fori_loop, while_loop
 
-# Rows up to which one system is solved by the loop, not by LAPACK: in a batch that is three to six
-# times as fast for 4 rows, and independent batched triangular solves of LAPACK can wait for each
-# other for ever on few cores (jaxlib 0.10). With ten times more the cubic cost of many contacts
-# would not be blocked.
+# Rows up to which a loop of our own factors a matrix, not LAPACK: in a batch that is three to six
+# times as fast for 4 rows. With ten times more the cubic cost of many contacts would not be
+# blocked.
 _BY_LOOP = 16
 # Columns up to which products are written out: a reduction does not fuse with what follows it, and
 # is no vector operation: four times as long for the 12 of four contacts with friction in space. Ten
@@ -43,6 +47,7 @@ SINGULAR = 100.0
 # Parts of a matrix below this multiple of sqrt(eps) of its largest entry are none in its
 # pseudoinverse. Ten times more would drop small, regular parts.
 _NEGLIGIBLE_PART = 4.0
+_JACOBI_SWEEPS = 12  # over all pairs of up to 16 columns; 10 are enough, more only cost time
 _NEWTON_SCHULZ = 3  # iterations, each of which squares the error; ten times more only cost time
 
 
@@ -282,13 +287,132 @@ def pseudoinverse(matrix: jax.Array, held: jax.Array) -> jax.Array:
     return z
 
 
+class SingularValues(NamedTuple):
+    """`A = left diag(values) right` of a matrix (n, n), values (n,) falling."""
+
+    left: jax.Array
+    values: jax.Array
+    right: jax.Array
+
+
+_ALL_BATCHED: Any = SingularValues(True, True, True)  # type: ignore[arg-type]
+
+
+@jax.custom_batching.custom_vmap
+def singular_values(matrix: jax.Array) -> SingularValues:
+    """Of one matrix (n, n), without derivatives."""
+    return SingularValues(*jnp.linalg.svd(matrix))
+
+
+@singular_values.def_vmap
+def _batch_of_singular_values(
+    size: int, batched: Any, matrices: jax.Array
+) -> tuple[SingularValues, Any]:
+    """Batches by Jacobi's rotations: A V = U diag(values). A^T has U where values are 0."""
+    n = matrices.shape[-1]
+    if n > _BY_LOOP:
+        return SingularValues(*jnp.linalg.svd(matrices)), _ALL_BATCHED
+    matrix = jnp.moveaxis(matrices, 0, -1)
+    images, right, values = _orthogonal(matrix)
+    null = values <= SINGULAR * n * float(jnp.finfo(values.dtype).eps) * values[:1]
+    left = images / jnp.where(null, 1.0, values)[None]
+    left = jax.lax.cond(
+        jnp.any(null),
+        lambda: jnp.where(null[None], _orthogonal(matrix.swapaxes(0, 1))[1], left),
+        lambda: left,
+    )
+    parts = SingularValues(left, values, right.swapaxes(0, 1))
+    return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), parts), _ALL_BATCHED
+
+
+@jax.custom_batching.custom_vmap
+def eigenvectors(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Eigenvalues (n,) and eigenvectors (n, n), in columns, of one positive semidefinite matrix,
+    without derivatives."""
+    values, vectors = jnp.linalg.eigh(matrix)
+    return values, vectors
+
+
+@eigenvectors.def_vmap
+def _batch_of_eigenvectors(
+    size: int, batched: Any, matrices: jax.Array
+) -> tuple[tuple[jax.Array, jax.Array], tuple[bool, bool]]:
+    """Batches by Jacobi's rotations: lengths of A V are the eigenvalues."""
+    if matrices.shape[-1] > _BY_LOOP:
+        values, vectors = jnp.linalg.eigh(matrices)
+        return (values, vectors), (True, True)
+    _, vectors, values = _orthogonal(jnp.moveaxis(matrices, 0, -1))
+    return (values.T, jnp.moveaxis(vectors, -1, 0)), (True, True)
+
+
+def _orthogonal(matrix: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """`A V` (n, n, B) with orthogonal columns, V, and their lengths (n, B), falling.
+
+    In each round, columns at the same place of two rows are rotated. Then all but the first move
+    on by one place, so that after a sweep each has met each.
+
+    Source: Hestenes, J. SIAM 6 (1958); Brent and Luk, SIAM J. Sci. Stat. Comput. 6 (1985).
+    """
+    n = len(matrix)
+    places = n + n % 2  # an odd number of columns: one of zeros, which no rotation changes
+    both = jnp.concatenate([matrix, jnp.broadcast_to(unit(matrix), matrix.shape)])
+    both = jnp.pad(both, ((0, 0), (0, places - n), (0, 0)))
+
+    class Sweep(NamedTuple):
+        """Two rows of columns, the largest square of a cosine between columns, sweeps done."""
+
+        first: jax.Array
+        second: jax.Array
+        cosine: jax.Array
+        done: jax.Array
+
+    def rotate(_: int, at: Sweep) -> Sweep:
+        """One round."""
+        x, y, largest, done = at
+        product = jnp.sum(x[:n] * y[:n], axis=0, keepdims=True)
+        squares = [jnp.sum(columns[:n] ** 2, axis=0, keepdims=True) for columns in (x, y)]
+        half = (squares[1] - squares[0]) / 2
+        real = jnp.minimum(*squares) > (rounding**2) * whole  # other columns are 0
+        angle = jnp.where(real, product**2 / jnp.where(real, squares[0] * squares[1], 1.0), 0.0)
+        root = jnp.sqrt(half**2 + product**2)
+        longer = jnp.where(half >= 0, half + root, half - root)
+        slope = product / jnp.where(longer != 0, longer, 1.0)
+        cosine = 1 / jnp.sqrt(1 + slope**2)
+        sine = slope * cosine
+        x, y = cosine * x - sine * y, sine * x + cosine * y
+        largest = jnp.maximum(largest, jnp.max(angle))
+        if places == 2:
+            return Sweep(x, y, largest, done)
+        first = jnp.concatenate([x[:, :1], y[:, :1], x[:, 1:-1]], axis=1)
+        return Sweep(first, jnp.concatenate([y[:, 1:], x[:, -1:]], axis=1), largest, done)
+
+    def sweep(at: Sweep) -> Sweep:
+        """All rounds."""
+        start = at._replace(cosine=jnp.zeros_like(at.cosine))
+        end = fori_loop(0, places - 1, rotate, start)
+        return end._replace(done=at.done + 1)
+
+    rounding = n * float(jnp.finfo(matrix.dtype).eps)
+    whole = jnp.sum(matrix**2, axis=(0, 1), keepdims=True)
+    first, second = jnp.split(both, 2, axis=1)
+    start = Sweep(first, second, jnp.ones((), matrix.dtype), jnp.int32(0))
+    end = while_loop(
+        lambda at: (at.cosine > rounding**2) & (at.done < _JACOBI_SWEEPS), sweep, start
+    )
+    both = jnp.concatenate([end.first, end.second], axis=1)[:, :n]
+    length = jnp.sqrt(jnp.sum(both[:n] ** 2, axis=0))
+    order = jnp.argsort(-length, axis=0)
+    both = jnp.take_along_axis(both, order[None], axis=1)
+    return both[:n], both[n:], jnp.take_along_axis(length, order, axis=0)
+
+
 def null_projector(g: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Orthogonal projector (m, m) on the null space of G (unit diagonal), and whether it is not 0.
 
     Held constant in derivatives: a perturbation is taken to keep the rank.
     """
-    eigenvalues, vectors = jnp.linalg.eigh(jax.lax.stop_gradient(g))
-    null = eigenvalues < SINGULAR * jnp.finfo(g.dtype).eps * g.shape[0]
+    values, vectors = eigenvectors(jax.lax.stop_gradient(g))
+    null = values < SINGULAR * jnp.finfo(g.dtype).eps * g.shape[0]
     basis = jnp.where(null[None, :], vectors, 0.0)
     return basis @ basis.T, jnp.any(null)
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from jimpact.compiling import full_precision
 from jimpact.loops import while_loop
-from jimpact.solvers.dense import null_projector
+from jimpact.solvers.dense import null_projector, solve_definite
 from jimpact.solvers.many_contacts import solve_many
 from jimpact.solvers.sparse import Sparse, conjugate_gradients
 from jimpact.solvers.tridiagonal import Symmetric, as_matrix, is_regular
@@ -83,7 +83,7 @@ def solve_lcp(
     b = b / size
     still = jax.lax.stop_gradient((a, b))
     support, code = _support(*still)
-    z = _solve_on(support, a, -b)
+    z = _solve_on(support, a, -b, symmetric)
     wrong = _wrong(*still, support, jax.lax.stop_gradient(z))
     code = jnp.where((code == CODE["ok"]) & wrong, CODE["max_steps"], code)
     if symmetric and not regular:
@@ -137,11 +137,14 @@ def gathered_rounding(unknowns: int, dtype: Any) -> float:
     return unknowns * float(jnp.finfo(dtype).eps) ** _POWER
 
 
-def _solve_on(support: jax.Array, a: jax.Array, right: jax.Array) -> jax.Array:
+def _solve_on(
+    support: jax.Array, a: jax.Array, right: jax.Array, symmetric: bool = True
+) -> jax.Array:
     """Solve `A_SS z_S = right_S`, z = 0 elsewhere."""
     both = support[:, None] & support[None, :]
     masked = jnp.where(both, a, jnp.eye(a.shape[0], dtype=a.dtype))
-    return jnp.linalg.solve(masked, jnp.where(support, right, 0.0))
+    solve = solve_definite if symmetric else jnp.linalg.solve
+    return solve(masked, jnp.where(support, right, 0.0))
 
 
 def _least_norm(a: jax.Array, b: jax.Array, z: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -21,7 +21,7 @@ def fault(issue, **options):
     return pytest.mark.xfail(strict=True, reason=f"issue '{issue}'", **options)
 
 
-FRICTION, ENGINE = "One friction", "One engine"
+ENGINE = "One engine"
 
 
 def status_of(out):
@@ -122,7 +122,6 @@ def test_arguments_that_a_law_does_not_take(make, word):
         make()
 
 
-@fault(FRICTION)
 def test_programs_of_batches_call_no_lapack():
     """Batched triangular solves of LAPACK hang on two cores in some versions of jaxlib."""
     scene = row_of_points(0, (-0.1, 0.1))
