@@ -8,12 +8,10 @@ from scipy import optimize
 
 import jimpact as ji
 from jimpact.files.records import with_error
-from jimpact.fits.parameters import bounds_of, free_parameters
-from jimpact.fits.prediction import placed_fit
-from jimpact.fits.saved import write_fit
-from jimpact.fits.scene_parameters import LawInScene
+from jimpact.fits.fitting import placed_fit
+from jimpact.fits.parameters import LawInScene, bounds_of, free_parameters, tied
+from jimpact.fits.report import write_fit
 from jimpact.fits.solve import Damping
-from jimpact.fits.ties import tied
 
 
 def test_entries_are_named_as_in_the_report():
