@@ -14,12 +14,13 @@ import numpy as np
 
 from jimpact._checks import as_whole, check_choice, check_kind
 from jimpact.fits.problem import scaled
-from jimpact.fits.solve import DEFAULT_STEPS, START_SCALES, Ends, Search, minimize_with, repeated
+from jimpact.fits.solve import START_SCALES, Ends, Search, minimize_with, repeated
 from jimpact.fits.uncertainty import FitResult, Profile, check_level
 from jimpact.progress import Show, progress_bar
 
-# Deviances are right to this (see `solve.FINE`): an interval's ends move by a millionth.
-_STOP = 1e-7
+# Deviances are right to this (see `solve.FINE`): the ends of an interval move by a hundred
+# thousandth. A search that goes on after so many passes creeps along a kink.
+_STOP, PASSES = 1e-5, 24
 STEP, WIDEST = 0.4, 2.0  # of a walk: rise of the root of the deviance, over the limit's; growth
 FIRST_SHARE = 1 / 16  # of what can be reached: the first step where the error is infinite
 LONGEST = 2.0  # steps by which a walk is extrapolated
@@ -51,7 +52,7 @@ class Deviances:
         self,
         fixed: Sequence[Sequence[int]],
         y: Sequence[np.ndarray],
-        steps: int = DEFAULT_STEPS["levenberg-marquardt"],
+        steps: int = PASSES,
     ) -> Ends:
         """Minima from each y (A, Q) with these of its parameters fixed, all side by side."""
         held = np.zeros((len(y), len(self.best)), bool)
@@ -109,7 +110,7 @@ def profile(
     names: str | Iterable[str] | None = None,
     *,
     level: float = 0.95,
-    points: int = 33,
+    points: int = 17,
     progress: float | None = None,
 ) -> tuple[Profile, ...]:
     """Profile likelihoods of parameters: intervals without the assumption of a parabola.
@@ -189,6 +190,7 @@ class _Scans(Deviances):
         super().__init__(fit, show)
         self.which, self.level = which, level
         self.limit = fit.quantile(level) ** 2  # deviance at the ends of an interval
+        self.walked: dict[tuple[int, float], float] = {}  # sums of squares where walks have been
         self.lower: np.ndarray | None = None  # a point below the minimum of the fit
         self.known: dict[int, dict[float, _Known]] = {i: {} for i in which}
         for start in fit.starts:
@@ -201,11 +203,11 @@ class _Scans(Deviances):
         fit = self.fit
         minima: list[tuple[Any, Any]] = [(fit.value, fit.standard_error)]
         if fit.rank == len(fit.names):  # else they are ends in one valley
-            minima += [(end.value, end.standard_error) for end in fit.starts[1:]]
+            near = [end for end in fit.starts[1:] if self.of(end.sum_of_squares) <= self.limit]
+            minima += [(end.value, end.standard_error) for end in near]
         return [
             (self.problem.point(value), error / self.problem.steps_at(value))
             for value, error in minima
-            if error is not None
         ]
 
     def walk(self, starts: Sequence[tuple[np.ndarray, np.ndarray]]) -> None:
@@ -222,6 +224,8 @@ class _Scans(Deviances):
             aims = [(walk, aim) for walk in walks if (aim := self._next(walk)) is not None]
             if not aims:
                 return
+            places = [(walk.i, float(y[walk.i])) for walk, y in aims]
+            before = [self.walked.get(place, np.inf) for place in places]
             ends = self.solve([(walk.i, y) for walk, y in aims])
             heights = np.sqrt(self.of(np.array([end.squares for end in ends])) / self.limit)
             # where a walk leaves the interval it may be on a ridge: once more from the fit
@@ -233,9 +237,11 @@ class _Scans(Deviances):
                 heights[k] = np.sqrt(self.of(ends[k].squares) / self.limit)
             walks = [
                 _Walk(walk.i, walk.step * _growth(h - walk.height), end.y, h, walk.last)
-                for (walk, _), end, h in zip(aims, ends, heights)
-                if h <= np.sqrt(FAR)
+                for (walk, _), known, end, h in zip(aims, before, ends, heights)
+                # others have been there, or it is far from the interval
+                if h <= np.sqrt(FAR) and end.squares < (1 - SAME) * known
             ]
+            self.walked |= dict(zip(places, (end.squares for end in ends)))
 
     def _next(self, walk: _Walk) -> np.ndarray | None:
         """Where the next minimum of a walk is searched from; None at the end of the domain."""
@@ -244,6 +250,9 @@ class _Scans(Deviances):
         value = float(np.clip(last[i] + walk.step, low, high))
         if value == last[i]:
             return None
+        known = [x for j, x in self.walked if j == i]
+        between = [x for x in known if 0 < (x - last[i]) / (value - last[i]) < 1]
+        value = min(between, key=lambda x: abs(x - last[i]), default=value)
         if walk.before is None:
             return with_entry(last, i, value)
         share = (value - last[i]) / (last[i] - walk.before[i])
@@ -351,7 +360,9 @@ class _Scans(Deviances):
                     y = a + np.clip(share, 0.02, 0.98) * (b - a)
                     near = min(abs(p), abs(q)) <= END * limit
                     if not near and a < y < b and b - a > 1e-6 * max(1.0, abs(a)):
-                        trials.append((i, with_entry(self._nearest(i, y), i, y)))
+                        start, end = (self.known[i][x].y for x in (a, b))
+                        at = start + (y - a) / (b - a) * (end - start)
+                        trials.append((i, with_entry(at, i, y)))
             if not trials:
                 return
             self.solve(trials)
