@@ -34,17 +34,16 @@ from .contact import (
 )
 from .fits.data import Experiments as Experiments, read_experiments as read_experiments
 from .fits.fitting import (
-    Fit as Fit,
     Refits as Refits,
     bootstrap as bootstrap,
     fit as fit,
     fit_many as fit_many,
     leave_one_out as leave_one_out,
-    load_fit as load_fit,
 )
 from .fits.posterior import posterior as posterior
 from .fits.problem import FitProblem as FitProblem
 from .fits.profiles import Contour as Contour, contour as contour, profile as profile
+from .fits.report import Fit as Fit, load_fit as load_fit
 from .fits.selection import (
     LawFits as LawFits,
     NestedTest as NestedTest,

@@ -4,29 +4,19 @@ import functools
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
 
-from jimpact._checks import as_whole, check_choice, check_kind, check_values
+from jimpact._checks import as_whole, check_choice, check_kind
 from jimpact.files.records import listed
 from jimpact.fits.checks import MEDIAN, fit_warnings, stretch, unusable, weighted
 from jimpact.fits.data import Experiments
-from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw, LawInScene, plain_law
+from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw, plain_law
 from jimpact.fits.problem import FitProblem, filled_count, of_shots
 from jimpact.fits.profiles import needs_profiles, profile, walked_profiles
-from jimpact.fits.report import (
-    as_dict,
-    dataset,
-    parameters_frame,
-    read_fit,
-    report,
-    verdict,
-    write_fit,
-    write_parameters,
-)
+from jimpact.fits.report import Fit
 from jimpact.fits.solve import (
     DEFAULT_STEPS,
     Method,
@@ -37,7 +27,6 @@ from jimpact.fits.solve import (
     default_steps,
     find_minima,
     minimize,
-    minimize_with,
     repeated,
     settled,
     solution,
@@ -46,19 +35,14 @@ from jimpact.fits.solve import (
 )
 from jimpact.fits.uncertainty import (
     FitMinimum,
-    FitResult,
     Profile,
     Uncertainty,
     check_level,
     check_squares,
     uncertainty,
 )
-from jimpact.law import Law, parameters_of
 from jimpact.progress import progress_bar
 from jimpact.scene import Scene
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure  # which takes long to import
 
 # A minimum gets standard errors up to a sum of squares this many noise standard deviations above
 # the best: intervals of all levels end before. With ten times more, only time is lost.
@@ -68,118 +52,6 @@ HUBER = 1.345  # sigmas up to which a residual counts squared: 95 % of the effic
 STUDENT = 4.0  # degrees of freedom of the tails
 ROUNDS = 50  # of weights
 SAME = 1e-7  # in natural scales of the parameters: the weights have settled
-
-
-class Fit(FitResult[AnyLaw]):
-    """See `FitResult`."""
-
-    __doc__ = FitResult.__doc__
-
-    def to_dict(self) -> dict[str, Any]:
-        """Everything a JSON file can hold; numbers that are not finite become None."""
-        return as_dict(self)
-
-    @property
-    def verdict(self) -> str:
-        """The result in one sentence that can be quoted: the first one of `print(fit)`.
-
-        Values with their errors, what they assume, and what speaks against them.
-        """
-        return verdict(self)
-
-    def predict(self, shots: Any, scene: Scene | None = None, level: float = 0.95) -> "Predicted":
-        """Velocities after further shots, with the errors that the parameters leave in them.
-
-        Equation: `sqrt(J C J^T)`, J derivatives in the parameters, C their covariance; a
-        measurement, with its own standard error s, lies within `q sqrt(J C J^T + s^2)`, q the
-        quantile as in `intervals`.
-
-        Args:
-            shots: v- (K, n) [m/s], or `Experiments`, of which v- and scenes count.
-            scene: of all shots; None: that of the fit, or those of the shots.
-            level: of the band.
-
-        Returns:
-            `velocity` (K, n) [m/s], `standard_error` (K, n): inf where it depends on what the data
-            do not determine, NaN where the errors are unknown; `status` (K,); `noise` (K, n) of a
-            measurement: the `sigma` of the shots if they have one, else as in the fit; `low` and
-            `high` (K, n), the band of a measurement.
-
-        Raises:
-            ValueError: a fit of something else than shots; velocities that do not fit the scene, a
-                scene that does not fit the law; a level outside (0, 1).
-        """
-        return predicted(self, shots, scene, level)
-
-    def save(self, path: str | Path) -> Path:
-        """Write the fit to a file (JSON) that `ji.load_fit` reads: problem, result, versions.
-
-        Args:
-            path: the file; an existing file is replaced.
-
-        Returns:
-            The path.
-
-        Raises:
-            ValueError: a fit of something else than shots, or with ties: functions cannot be saved.
-        """
-        return write_fit(self, Path(path))
-
-    def plot(self) -> "Figure":
-        """The picture of `ji.plot.fit`: measured and fitted velocities, and the residuals."""
-        from jimpact import plot
-
-        return plot.fit(self)
-
-    def to_csv(self, path: str | Path) -> Path:
-        """Write a row a parameter: value, standard error, ends of its 95 % interval, whether seen.
-
-        Args:
-            path: the file; an existing file is replaced.
-
-        Returns:
-            The path.
-        """
-        return write_parameters(self, Path(path))
-
-    def to_pandas(self) -> Any:
-        """The parameters as a `pandas.DataFrame`, which must be installed."""
-        return parameters_frame(self)
-
-    def to_xarray(self) -> Any:
-        """Parameters, covariance, every shot as an `xarray.Dataset`, which must be installed."""
-        return dataset(self)
-
-    def __str__(self) -> str:
-        return report(self)
-
-
-def load_fit(path: str | Path) -> Fit[Any]:
-    """The fit that `Fit.save` has written, with all that one can do with a fit.
-
-    The classes of laws and scenes are imported by name, so read only files that you trust.
-
-    Args:
-        path: the file.
-
-    Returns:
-        `Fit`.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: no saved fit, one of another format, a law that cannot be imported.
-
-    >>> import tempfile
-    >>> from pathlib import Path
-    >>> import jimpact as ji
-    >>> data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.3, 0.7], [0.6, 1.4]], sigma=0.02)
-    >>> result = ji.fit(ji.Newton(0.9), ji.chain([1.0, 1.0]), data)
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     again = ji.load_fit(result.save(Path(folder) / "fit.json"))
-    >>> again.verdict == result.verdict
-    True
-    """
-    return Fit(**read_fit(Path(path)))
 
 
 def fit(
@@ -298,7 +170,7 @@ def fit(
             found = solution(problem, ends, counts, found.lost)
         robust = None
         if loss != "squares":
-            problem, robust = _robust(problem, found, loss, search)
+            problem, found, robust = _robust(problem, found, loss, search)
     result = replace(as_fit(problem, found, method, robust), loss=loss, seed=seed)
     if profiles:
         return _with_profiles(result, profile(result, progress=progress))
@@ -355,15 +227,18 @@ def _without(problem: FitProblem, lost: np.ndarray) -> FitProblem:
 
 
 def as_fit(
-    problem: FitProblem, found: Solution, method: Method, robust: "_Robust | None" = None
+    problem: FitProblem, found: Solution, method: Method, robust: float | None = None
 ) -> Fit[Any]:
-    """The fit at the end of a search: errors, rank and warnings."""
-    if robust is not None:
-        found = _without_robust_factors(problem, robust)
+    """The fit at the end of a search: errors, rank and warnings.
+
+    `robust`: noise times the root of the degrees of freedom, of a loss that outliers move little.
+    """
     judged = replace(problem, scene=problem.to_scene(found.value))
     errors = _errors(problem, judged, found, robust)
     residual = np.asarray(problem.measured, float) - found.predicted
     findings = fit_warnings(judged, found, errors, robust is not None)
+    numbers = errors._asdict()
+    undetermined = numbers.pop("undetermined")
     slope = found.jacobian.reshape((*residual.shape, len(problem.names)))
     starts = [
         FitMinimum(x.squares, x.value, x.starts, _standard_error(problem, found, x, errors))
@@ -374,19 +249,13 @@ def as_fit(
         method=method if isinstance(method, str) else "optax",
         names=problem.names,
         value=found.value,
-        standard_error=errors.standard_error,
-        covariance=errors.covariance,
-        correlation=errors.correlation,
         bounds=(problem.domains[:, 0], problem.domains[:, 1]),
         at_bound=found.at_bound,
         predicted=found.predicted,
         residual=residual,
         rms=_rms(problem, residual),
-        noise=errors.noise,
-        degrees_of_freedom=errors.degrees_of_freedom,
-        rank=errors.rank,
-        singular_values=errors.singular_values,
-        identifiability=(*problem.notes, *errors.undetermined),
+        **numbers,
+        identifiability=(*problem.notes, *undetermined),
         starts=tuple(starts),
         status=found.status,
         converged=found.converged,
@@ -400,7 +269,7 @@ def as_fit(
 
 
 def _errors(
-    problem: FitProblem, judged: FitProblem, found: Solution, robust: "_Robust | None"
+    problem: FitProblem, judged: FitProblem, found: Solution, robust: float | None
 ) -> Uncertainty:
     """Errors of the parameters; with known errors of the data wider where the law does not fit."""
     best, noise = found.minima[0], None
@@ -408,7 +277,7 @@ def _errors(
     if robust is not None:
         noise = np.nan if problem.sigma is None else 1.0
         if errors.degrees_of_freedom > 0:
-            noise = robust.noise / np.sqrt(errors.degrees_of_freedom)
+            noise = robust / np.sqrt(errors.degrees_of_freedom)
     elif problem.sigma is not None:
         noise = stretch(judged, weighted(problem, found), errors.rank)
     return errors if noise in (None, 1.0) else uncertainty(problem, best, noise)
@@ -428,14 +297,6 @@ def _standard_error(
 # ---------------------------------------------------------------------------- robust losses
 
 
-class _Robust(NamedTuple):
-    """The end of a search, factors its loss puts on the weights, noise times root of freedom."""
-
-    solution: Solution
-    factor: np.ndarray
-    noise: float
-
-
 def _huber(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """psi(u) / u and psi'(u)."""
     inside = np.abs(u) <= HUBER
@@ -453,7 +314,7 @@ LOSSES = {"huber": _huber, "student": _student}
 
 def _robust(
     problem: FitProblem, found: Solution, loss: str, search: Search
-) -> tuple[FitProblem, _Robust]:
+) -> tuple[FitProblem, Solution, float]:
     """Least squares again and again, with weights `psi(u) / u` of the last residuals u.
 
     Equation: the covariance is `s^2 mean(psi^2) / mean(psi')^2 (J^T J)^-1` (Huber, 1981).
@@ -475,105 +336,12 @@ def _robust(
         found = found._replace(converged=False)
     psi = (share * error / scale)[here]
     noise = scale * np.sqrt(np.sum(psi**2)) / max(slope[here].mean(), SAME)
-    return problem, _Robust(found, factor, float(noise))
-
-
-def _without_robust_factors(problem: FitProblem, robust: _Robust) -> Solution:
-    """The minimum that the loss found, its residuals weighted as in `problem`."""
-    found, factor = robust.solution, robust.factor.reshape(-1, 1)
+    # weighted as in the problem, without the factors of the loss
     residual = problem.independent(problem.measured - found.predicted)
     from_priors, _ = problem.prior_errors(found.value)
     squares = float(np.sum(residual**2) + np.sum(from_priors**2))
-    return found._replace(minima=[Minimum(squares, found.value, 1, found.jacobian / factor)])
-
-
-# ---------------------------------------------------------------------------- further shots
-
-
-class Predicted(NamedTuple):
-    """Velocities after each shot (K, n) [m/s], their standard errors (K, n), status codes (K,).
-
-    `noise` (K, n) is the standard error of a measurement of them. `low` and `high` (K, n) are the
-    ends of the band in which such a measurement lies.
-    """
-
-    velocity: np.ndarray
-    standard_error: np.ndarray
-    status: np.ndarray
-    noise: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-
-
-def predicted(fit: FitResult, shots: Any, scene: Scene | None, level: float) -> Predicted:
-    """Values at the fitted parameters, and `sqrt(J C J^T)` with their covariance C."""
-    quantile = fit.quantile(level)
-    if fit.experiments is None:
-        raise ValueError("Argument `fit` must be to shots.")
-    data, scenes, units = shots, None, fit.experiments.units
-    if isinstance(shots, Experiments):
-        data, scenes, units = shots.pre, shots.scenes, shots.units
-    if np.ndim(data) != 2 or np.shape(data)[1] != len(units):
-        raise ValueError(
-            f"Argument `shots` must have shape (K, {len(units)}), velocities of the bodies of the "
-            f"fit, but has shape {np.shape(data)}."
-        )
-    check_values("shots", data)
-    data = Experiments(data, np.zeros_like(np.asarray(data, float)), scenes=scenes, units=units)
-    law, own = placed_fit(fit, scene)
-    largest = own if scenes is None else max(scenes, key=lambda each: each.contacts)
-    _check_scene(fit, largest, len(units))
-    ties = dict(fit.problem.ties)
-    problem = FitProblem.from_shots(law, own, data, fit.problem.parameters.labels, ties=ties)
-    point, every = problem.point(problem.start)[None], np.ones((1, len(problem.low)), bool)
-    ends = minimize_with(repeated(problem, 1), point, every, Search(max_steps=1))
-    there = solution(problem, ends)
-    slope = there.jacobian.reshape((*problem.measured.shape, len(problem.names)))
-    error = fit.errors_of(problem.errors_of(slope / problem.steps_at(problem.start)))
-    value, noise = there.predicted, _noise_of(fit, shots)
-    half = quantile * np.hypot(error, noise)
-    return Predicted(value, error, np.asarray(there.status), noise, value - half, value + half)
-
-
-def placed_fit(fit: FitResult, scene: Scene | None) -> tuple[Law, Scene | None]:
-    """The law of a fit, with the parts of the scene that were fitted, and the scene of new shots.
-
-    Raises:
-        ValueError: another scene than that of which parts were fitted.
-    """
-    law = fit.law_in_scene
-    if isinstance(law, LawInScene) and scene is not None:
-        raise ValueError(
-            "Argument `scene` must be left out where parts of the scene were fitted: they hold for "
-            "that of the fit only."
-        )
-    return law, fit.problem.scene if scene is None else scene
-
-
-def _check_scene(fit: FitResult, scene: Any, size: int) -> None:
-    """Raise unless this is a scene for the law that was fitted and velocities of this size."""
-    check_kind("scene", scene, Scene)
-    values = [x.value for x in parameters_of(fit.law).values() if x.domain.per_contact]
-    counts = {np.shape(value)[0] for value in values if np.ndim(value) == 1}
-    if scene.size != size or counts - {scene.contacts}:
-        contacts = f" and {min(counts)} contacts, one for each value of the law" if counts else ""
-        raise ValueError(
-            f"Argument `scene` must have {size} velocities as the fit{contacts}, but has "
-            f"{scene.size} and {scene.contacts}."
-        )
-
-
-def _noise_of(fit: FitResult, shots: Any) -> np.ndarray:
-    """Standard errors (K, n) of measured velocities: of the shots, or as those of the fit (rms)."""
-    if isinstance(shots, Experiments) and shots.sigma is not None:
-        stretched = 1.0 if fit.problem.sigma is None else fit.noise
-        return stretched * np.asarray(shots.sigma, float)
-    pre = shots.pre if isinstance(shots, Experiments) else shots
-    weight = fit.problem.weight
-    variance = np.where(weight > 0, 1 / np.where(weight > 0, weight, 1.0) ** 2, 0.0).sum(axis=0)
-    count = (weight > 0).sum(axis=0)
-    each = np.sqrt(variance / np.where(count > 0, count, np.nan))  # NaN: never measured
-    return np.broadcast_to(fit.noise * each, np.shape(pre))
+    minimum = Minimum(squares, found.value, 1, found.jacobian / factor.reshape(-1, 1))
+    return problem, found._replace(minima=[minimum]), float(noise)
 
 
 # ---------------------------------------------------------------------------- many fits

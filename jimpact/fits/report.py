@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -18,11 +18,14 @@ import numpy as np
 import jimpact
 from jimpact._checks import needed
 from jimpact.files.records import as_data, with_error
-from jimpact.fits.parameters import value_of
+from jimpact.fits.parameters import AnyLaw, value_of
 from jimpact.fits.problem import FitProblem
 from jimpact.fits.uncertainty import FitResult, pieces_in_words
 from jimpact.law import StaticNumber, StaticNumbers
 from jimpact.status import STATUS
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure  # which takes long to import
 
 _ROUNDING = 1e-7  # share of the largest velocity that is printed as 0: impacts are good to 1e-8
 _VELOCITIES_SHOWN = 24  # in the table of shots
@@ -48,15 +51,10 @@ def joined_words(parts: Sequence[str]) -> str:
     return " and ".join([", ".join(parts[:-1]), parts[-1]]) if len(parts) > 1 else "".join(parts)
 
 
-def report(fit: FitResult) -> str:
-    """The whole report: its blocks, an empty line between them."""
-    return "\n\n".join("\n".join(block) for block in report_blocks(fit).values() if block)
-
-
-def report_blocks(fit: FitResult) -> dict[str, list[str]]:
+def report_blocks(fit: "Fit") -> dict[str, list[str]]:
     """The lines of the report, block by block."""
     return {
-        "verdict": [verdict(fit)],
+        "verdict": [fit.verdict],
         "headline": [_headline(fit)],
         "parameters": _parameters(fit),
         "quality": _quality(fit),
@@ -65,21 +63,6 @@ def report_blocks(fit: FitResult) -> dict[str, list[str]]:
         "warnings": _section("Warnings", fit.warnings),
         "shots": _shots(fit),
     }
-
-
-def verdict(fit: FitResult) -> str:
-    """One sentence: values with errors, what they assume, what is undetermined, what is wrong."""
-    law = type(fit.law).__name__
-    if not fit.converged:
-        return f"No answer: the search for the parameters of {law} has not converged."
-    reserved, sentence = joined_words(fit.reservations), _values_in_words(fit)
-    against = _objection(fit)
-    if against:
-        nearest = f"it comes nearest with {sentence}" if fit.determined.any() else sentence
-        sentence = f"{law} {against}; {nearest}"
-    if reserved:
-        sentence += f"; {'and' if against else 'but'} {reserved}"
-    return f"{sentence}."
 
 
 def _values_in_words(fit: FitResult) -> str:
@@ -378,6 +361,200 @@ def _shots(fit: FitResult) -> list[str]:
     return lines
 
 
+# ---------------------------------------------------------------------------- the fit
+
+
+class Fit(FitResult[AnyLaw]):
+    """See `FitResult`."""
+
+    __doc__ = FitResult.__doc__
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything a JSON file can hold; numbers that are not finite become None."""
+        interval = self.confidence_interval()
+        parameters = [
+            {
+                "name": name,
+                "value": as_data(self.value[i]),
+                "standard_error": as_data(self.standard_error[i]),
+                "confidence_interval_95": as_data(interval[i]),
+                "at_bound": bool(self.at_bound[i]),
+                "seen": bool(self.determined[i]),
+                "profile_95": as_data(self.profiles[i].intervals) if self.profiles else None,
+            }
+            for i, name in enumerate(self.names)
+        ]
+        starts = [
+            {"sum_of_squares": s.sum_of_squares, "value": as_data(s.value), "count": s.count}
+            for s in self.starts
+        ]
+        return {
+            "law": type(self.law).__name__,
+            "method": self.method,
+            "parameters": parameters,
+            "rms": self.rms,
+            "noise": as_data(self.noise),
+            "degrees_of_freedom": self.degrees_of_freedom,
+            "rank": self.rank,
+            "identifiability": list(self.identifiability),
+            "warnings": list(self.warnings),
+            "verdict": self.verdict,
+            "reservations": list(self.reservations),
+            "seed": self.seed,
+            "converged": self.converged,
+            "covariance": as_data(self.covariance),
+            "correlation": as_data(self.correlation),
+            "starts": starts,
+            "shots": [] if self.experiments is None else list(self.experiments.shots),
+            "predicted": as_data(self.predicted),
+            "residual": as_data(self.residual),
+            "status": [STATUS[code].name for code in self.status],
+        }
+
+    @property
+    def verdict(self) -> str:
+        """The result in one sentence that can be quoted: the first one of `print(fit)`.
+
+        Values with their errors, what they assume, and what speaks against them.
+        """
+        law = type(self.law).__name__
+        if not self.converged:
+            return f"No answer: the search for the parameters of {law} has not converged."
+        reserved, sentence = joined_words(self.reservations), _values_in_words(self)
+        against = _objection(self)
+        if against:
+            nearest = f"it comes nearest with {sentence}" if self.determined.any() else sentence
+            sentence = f"{law} {against}; {nearest}"
+        if reserved:
+            sentence += f"; {'and' if against else 'but'} {reserved}"
+        return f"{sentence}."
+
+    def save(self, path: str | Path) -> Path:
+        """Write the fit to a file (JSON) that `ji.load_fit` reads: problem, result, versions.
+
+        Args:
+            path: the file; an existing file is replaced.
+
+        Returns:
+            The path.
+
+        Raises:
+            ValueError: a fit of something else than shots, or with ties: functions cannot be saved.
+        """
+        problem = self.problem
+        if self.experiments is None:
+            raise ValueError("Argument `fit` must be to shots to be saved: functions cannot be.")
+        if problem.ties:
+            raise ValueError("Argument `fit` must have no ties to be saved: functions cannot be.")
+        names = [field.name for field in dataclasses.fields(self) if field.name != _REBUILT]
+        record = {
+            "format": FORMAT,
+            "versions": versions(),
+            "problem": {
+                "law": _encoded(problem.law),
+                "scene": _encoded(problem.scene),
+                "experiments": _encoded(self.experiments),
+                "free": {name: label.tolist() for name, label in problem.parameters.labels.items()},
+                "bounds": _encoded(dict(zip(problem.names, problem.domains.tolist()))),
+                "priors": {problem.names[i]: [mean, std] for i, mean, std in problem.priors},
+                "used": (~np.isnan(problem.measured).all(axis=1)).tolist(),
+                "notes": list(problem.notes),
+                "left_out": list(problem.left_out),
+            },
+            "result": {name: _encoded(getattr(self, name)) for name in names},
+        }
+        path = Path(path)
+        path.write_text(json.dumps(record, allow_nan=False, indent=1) + "\n", encoding="utf-8")
+        return path
+
+    def plot(self) -> "Figure":
+        """The picture of `ji.plot.fit`: measured and fitted velocities, and the residuals."""
+        from jimpact import plot
+
+        return plot.fit(self)
+
+    def to_csv(self, path: str | Path) -> Path:
+        """Write a row a parameter: value, standard error, ends of its 95 % interval, whether seen.
+
+        Args:
+            path: the file; an existing file is replaced.
+
+        Returns:
+            The path.
+        """
+        columns, path = parameter_columns(self), Path(path)
+        with path.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(["parameter", *columns])
+            for name, *row in zip(self.names, *(x.tolist() for x in columns.values())):
+                writer.writerow([name, *row])
+        return path
+
+    def to_pandas(self) -> Any:
+        """The parameters as a `pandas.DataFrame`, which must be installed."""
+        columns, index = parameter_columns(self), list(self.names)
+        return needed("pandas", "pip install pandas").DataFrame(columns, index=index)
+
+    def to_xarray(self) -> Any:
+        """Parameters, covariance, every shot as an `xarray.Dataset`, which must be installed."""
+        pair = ("parameter", "parameter_2")
+        arrays: dict[str, Any] = {
+            "value": ("parameter", self.value),
+            "standard_error": ("parameter", self.standard_error),
+            "determined": ("parameter", self.determined),
+            "covariance": (pair, self.covariance),
+            "correlation": (pair, self.correlation),
+        }
+        coordinates: dict[str, Any] = {axis: list(self.names) for axis in pair}
+        measured, data = np.asarray(self.problem.measured, float), self.experiments
+        axes: tuple[str, ...] = tuple(f"value_{i + 1}" for i in range(measured.ndim))
+        if data is not None:
+            axes = ("shot", "velocity")
+            units = data.units
+            coordinates |= {"shot": list(data.shots), "unit": ("velocity", list(units))}
+            arrays["before"] = (axes, np.asarray(data.pre))
+            arrays["status"] = ("shot", [STATUS[code].name for code in self.status])
+        for name, values in (
+            ("measured", measured),
+            ("predicted", self.predicted),
+            ("residual", self.residual),
+        ):
+            arrays[name] = (axes, values)
+        about = {"law": type(self.law).__name__, "verdict": self.verdict, "rms": self.rms}
+        return needed("xarray", "pip install xarray").Dataset(arrays, coordinates, about)
+
+    def __str__(self) -> str:
+        return "\n\n".join("\n".join(block) for block in report_blocks(self).values() if block)
+
+
+def load_fit(path: str | Path) -> Fit[Any]:
+    """The fit that `Fit.save` has written, with all that one can do with a fit.
+
+    The classes of laws and scenes are imported by name, so read only files that you trust.
+
+    Args:
+        path: the file.
+
+    Returns:
+        `Fit`.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: no saved fit, one of another format, a law that cannot be imported.
+
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import jimpact as ji
+    >>> data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.3, 0.7], [0.6, 1.4]], sigma=0.02)
+    >>> result = ji.fit(ji.Newton(0.9), ji.chain([1.0, 1.0]), data)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     again = ji.load_fit(result.save(Path(folder) / "fit.json"))
+    >>> again.verdict == result.verdict
+    True
+    """
+    return Fit(**_read_fit(Path(path)))
+
+
 # ---------------------------------------------------------------------------- as data
 
 
@@ -391,95 +568,6 @@ def parameter_columns(fit: FitResult) -> dict[str, np.ndarray]:
         "high_95": interval[:, 1],
         "at_bound": fit.at_bound,
         "determined": fit.determined,
-    }
-
-
-def parameters_frame(fit: FitResult) -> Any:
-    """A row a parameter, see `parameter_columns`."""
-    columns, index = parameter_columns(fit), list(fit.names)
-    return needed("pandas", "pip install pandas").DataFrame(columns, index=index)
-
-
-def write_parameters(fit: FitResult, path: Path) -> Path:
-    """The same as CSV, in full precision."""
-    columns = parameter_columns(fit)
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(["parameter", *columns])
-        for name, *row in zip(fit.names, *(x.tolist() for x in columns.values())):
-            writer.writerow([name, *row])
-    return path
-
-
-def dataset(fit: FitResult) -> Any:
-    """By parameter: values and covariance; by shot and body: before, measured, fitted, residual."""
-    pair = ("parameter", "parameter_2")
-    arrays: dict[str, Any] = {
-        "value": ("parameter", fit.value),
-        "standard_error": ("parameter", fit.standard_error),
-        "determined": ("parameter", fit.determined),
-        "covariance": (pair, fit.covariance),
-        "correlation": (pair, fit.correlation),
-    }
-    coordinates: dict[str, Any] = {axis: list(fit.names) for axis in pair}
-    measured, data = np.asarray(fit.problem.measured, float), fit.experiments
-    axes: tuple[str, ...] = tuple(f"value_{i + 1}" for i in range(measured.ndim))
-    if data is not None:
-        axes = ("shot", "velocity")
-        units = data.units
-        coordinates |= {"shot": list(data.shots), "unit": ("velocity", list(units))}
-        arrays["before"] = (axes, np.asarray(data.pre))
-        arrays["status"] = ("shot", [STATUS[code].name for code in fit.status])
-    for name, values in (
-        ("measured", measured),
-        ("predicted", fit.predicted),
-        ("residual", fit.residual),
-    ):
-        arrays[name] = (axes, values)
-    about = {"law": type(fit.law).__name__, "verdict": verdict(fit), "rms": fit.rms}
-    return needed("xarray", "pip install xarray").Dataset(arrays, coordinates, about)
-
-
-def as_dict(fit: FitResult) -> dict[str, Any]:
-    """Plain numbers, strings and lists; not finite numbers become None."""
-    interval = fit.confidence_interval()
-    parameters = [
-        {
-            "name": name,
-            "value": as_data(fit.value[i]),
-            "standard_error": as_data(fit.standard_error[i]),
-            "confidence_interval_95": as_data(interval[i]),
-            "at_bound": bool(fit.at_bound[i]),
-            "seen": bool(fit.determined[i]),
-            "profile_95": as_data(fit.profiles[i].intervals) if fit.profiles else None,
-        }
-        for i, name in enumerate(fit.names)
-    ]
-    starts = [
-        {"sum_of_squares": s.sum_of_squares, "value": as_data(s.value), "count": s.count}
-        for s in fit.starts
-    ]
-    return {
-        "law": type(fit.law).__name__,
-        "method": fit.method,
-        "parameters": parameters,
-        "rms": fit.rms,
-        "noise": as_data(fit.noise),
-        "degrees_of_freedom": fit.degrees_of_freedom,
-        "rank": fit.rank,
-        "identifiability": list(fit.identifiability),
-        "warnings": list(fit.warnings),
-        "verdict": verdict(fit),
-        "reservations": list(fit.reservations),
-        "seed": fit.seed,
-        "converged": fit.converged,
-        "covariance": as_data(fit.covariance),
-        "correlation": as_data(fit.correlation),
-        "starts": starts,
-        "shots": [] if fit.experiments is None else list(fit.experiments.shots),
-        "predicted": as_data(fit.predicted),
-        "residual": as_data(fit.residual),
-        "status": [STATUS[code].name for code in fit.status],
     }
 
 
@@ -497,35 +585,7 @@ def versions() -> dict[str, str]:
     return found | {"Python": f"{platform.python_version()}, {platform.system()}"}
 
 
-def write_fit(fit: FitResult, path: Path) -> Path:
-    """Write a fit to shots without ties."""
-    problem = fit.problem
-    if fit.experiments is None:
-        raise ValueError("Argument `fit` must be to shots to be saved: functions cannot be.")
-    if problem.ties:
-        raise ValueError("Argument `fit` must have no ties to be saved: functions cannot be.")
-    names = [field.name for field in dataclasses.fields(fit) if field.name != _REBUILT]
-    record = {
-        "format": FORMAT,
-        "versions": versions(),
-        "problem": {
-            "law": _encoded(problem.law),
-            "scene": _encoded(problem.scene),
-            "experiments": _encoded(fit.experiments),
-            "free": {name: label.tolist() for name, label in problem.parameters.labels.items()},
-            "bounds": _encoded(dict(zip(problem.names, problem.domains.tolist()))),
-            "priors": {problem.names[i]: [mean, std] for i, mean, std in problem.priors},
-            "used": (~np.isnan(problem.measured).all(axis=1)).tolist(),
-            "notes": list(problem.notes),
-            "left_out": list(problem.left_out),
-        },
-        "result": {name: _encoded(getattr(fit, name)) for name in names},
-    }
-    path.write_text(json.dumps(record, allow_nan=False, indent=1) + "\n", encoding="utf-8")
-    return path
-
-
-def read_fit(path: Path) -> dict[str, Any]:
+def _read_fit(path: Path) -> dict[str, Any]:
     """The fields of a fit that `write_fit` has written."""
     try:
         record = json.loads(path.read_text(encoding="utf-8"))

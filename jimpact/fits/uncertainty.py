@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.special import ndtri, stdtrit
 
-from jimpact._checks import check_choice, check_kind
+from jimpact._checks import check_choice, check_kind, check_values
 from jimpact.fits.data import Experiments
 from jimpact.fits.parameters import (
     AnyLaw,
@@ -20,8 +20,8 @@ from jimpact.fits.parameters import (
     value_of,
 )
 from jimpact.fits.problem import FitProblem
-from jimpact.fits.solve import Minimum
-from jimpact.law import Law
+from jimpact.fits.solve import Minimum, Search, minimize_with, repeated, solution
+from jimpact.law import Law, parameters_of
 from jimpact.scene import Scene
 
 # Singular values of the scaled Jacobian below this share of the largest are zero: derivatives of
@@ -236,6 +236,21 @@ class FittedParameter(NamedTuple):
     determined: bool
 
 
+class Predicted(NamedTuple):
+    """Velocities after each shot (K, n) [m/s], their standard errors (K, n), status codes (K,).
+
+    `noise` (K, n) is the standard error of a measurement of them. `low` and `high` (K, n) are the
+    ends of the band in which such a measurement lies.
+    """
+
+    velocity: np.ndarray
+    standard_error: np.ndarray
+    status: np.ndarray
+    noise: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+
 @dataclass(frozen=True, eq=False)
 class FitResult(Generic[AnyLaw]):
     """The result of `fit`. `print(fit)` gives its report.
@@ -366,10 +381,94 @@ class FitResult(Generic[AnyLaw]):
         blind = (np.abs(slope[..., ~seen]) > 0).any(axis=-1)
         return np.where(blind, np.inf, np.sqrt(variance))
 
-    @property
-    def contradicts_priors(self) -> bool:
-        """Whether a test finds the data at odds with a prior."""
-        return any(line.startswith("The data contradict the prior") for line in self.warnings)
+    def predict(self, shots: Any, scene: Scene | None = None, level: float = 0.95) -> Predicted:
+        """Velocities after further shots, with the errors that the parameters leave in them.
+
+        Equation: `sqrt(J C J^T)`, J derivatives in the parameters, C their covariance; a
+        measurement, with its own standard error s, lies within `q sqrt(J C J^T + s^2)`, q the
+        quantile as in `intervals`.
+
+        Args:
+            shots: v- (K, n) [m/s], or `Experiments`, of which v- and scenes count.
+            scene: of all shots; None: that of the fit, or those of the shots.
+            level: of the band.
+
+        Returns:
+            `velocity` (K, n) [m/s], `standard_error` (K, n): inf where it depends on what the data
+            do not determine, NaN where the errors are unknown; `status` (K,); `noise` (K, n) of a
+            measurement: the `sigma` of the shots if they have one, else as in the fit; `low` and
+            `high` (K, n), the band of a measurement.
+
+        Raises:
+            ValueError: a fit of something else than shots; velocities that do not fit the scene, a
+                scene that does not fit the law; a level outside (0, 1).
+        """
+        quantile = self.quantile(level)
+        if self.experiments is None:
+            raise ValueError("Argument `fit` must be to shots.")
+        data, scenes, units = shots, None, self.experiments.units
+        if isinstance(shots, Experiments):
+            data, scenes, units = shots.pre, shots.scenes, shots.units
+        if np.ndim(data) != 2 or np.shape(data)[1] != len(units):
+            raise ValueError(
+                f"Argument `shots` must have shape (K, {len(units)}), velocities of the bodies of "
+                f"the fit, but has shape {np.shape(data)}."
+            )
+        check_values("shots", data)
+        data = Experiments(data, np.zeros_like(np.asarray(data, float)), scenes=scenes, units=units)
+        law, own = self.placed(scene)
+        largest = own if scenes is None else max(scenes, key=lambda each: each.contacts)
+        self._check_scene(largest, len(units))
+        ties = dict(self.problem.ties)
+        problem = FitProblem.from_shots(law, own, data, self.problem.parameters.labels, ties=ties)
+        point, every = problem.point(problem.start)[None], np.ones((1, len(problem.low)), bool)
+        ends = minimize_with(repeated(problem, 1), point, every, Search(max_steps=1))
+        there = solution(problem, ends)
+        slope = there.jacobian.reshape((*problem.measured.shape, len(problem.names)))
+        error = self.errors_of(problem.errors_of(slope / problem.steps_at(problem.start)))
+        value, noise = there.predicted, self._noise_of(shots)
+        half = quantile * np.hypot(error, noise)
+        return Predicted(value, error, np.asarray(there.status), noise, value - half, value + half)
+
+    def placed(self, scene: Scene | None) -> tuple[Law, Scene | None]:
+        """The law, with the parts of the scene that were fitted, and the scene of new shots.
+
+        Raises:
+            ValueError: another scene than that of which parts were fitted.
+        """
+        law = self.law_in_scene
+        if isinstance(law, LawInScene) and scene is not None:
+            raise ValueError(
+                "Argument `scene` must be left out where parts of the scene were fitted: they hold "
+                "for that of the fit only."
+            )
+        return law, self.problem.scene if scene is None else scene
+
+    def _check_scene(self, scene: Any, size: int) -> None:
+        """Raise unless this is a scene for the law that was fitted and velocities of this size."""
+        check_kind("scene", scene, Scene)
+        values = [x.value for x in parameters_of(self.law).values() if x.domain.per_contact]
+        counts = {np.shape(value)[0] for value in values if np.ndim(value) == 1}
+        if scene.size != size or counts - {scene.contacts}:
+            contacts = (
+                f" and {min(counts)} contacts, one for each value of the law" if counts else ""
+            )
+            raise ValueError(
+                f"Argument `scene` must have {size} velocities as the fit{contacts}, but has "
+                f"{scene.size} and {scene.contacts}."
+            )
+
+    def _noise_of(self, shots: Any) -> np.ndarray:
+        """Standard errors (K, n) of measured velocities: of the shots, or as in the fit (rms)."""
+        if isinstance(shots, Experiments) and shots.sigma is not None:
+            stretched = 1.0 if self.problem.sigma is None else self.noise
+            return stretched * np.asarray(shots.sigma, float)
+        pre = shots.pre if isinstance(shots, Experiments) else shots
+        weight = self.problem.weight
+        variance = np.where(weight > 0, 1 / np.where(weight > 0, weight, 1.0) ** 2, 0.0).sum(axis=0)
+        count = (weight > 0).sum(axis=0)
+        each = np.sqrt(variance / np.where(count > 0, count, np.nan))  # NaN: never measured
+        return np.broadcast_to(self.noise * each, np.shape(pre))
 
     @property
     def experiments(self) -> Experiments | None:
