@@ -32,29 +32,25 @@ from .contact import (
     normalized_delassus as normalized_delassus,
     normalized_gap_velocity as normalized_gap_velocity,
 )
-from .fits.contours import Contour as Contour, contour as contour
-from .fits.experiments import Experiments as Experiments, read_experiments as read_experiments
-from .fits.fitting import Fit as Fit, fit as fit, load_fit as load_fit
-from .fits.many import (
+from .fits.data import Experiments as Experiments, read_experiments as read_experiments
+from .fits.fitting import (
     Refits as Refits,
     bootstrap as bootstrap,
+    fit as fit,
     fit_many as fit_many,
     leave_one_out as leave_one_out,
 )
-from .fits.measured import (
-    ellipse_impacts as ellipse_impacts,
-    square_drops as square_drops,
-    square_impacts as square_impacts,
-)
 from .fits.posterior import posterior as posterior
 from .fits.problem import FitProblem as FitProblem
-from .fits.profiles import Profile as Profile, profile as profile
+from .fits.profiles import Contour as Contour, contour as contour, profile as profile
+from .fits.report import Fit as Fit, load_fit as load_fit
 from .fits.selection import (
     LawFits as LawFits,
     NestedTest as NestedTest,
     fit_laws as fit_laws,
     nested_test as nested_test,
 )
+from .fits.uncertainty import Profile as Profile
 from .impacts import Impact as Impact, impact as impact, raise_on_failure as raise_on_failure
 from .law import (
     Impulses as Impulses,
@@ -105,6 +101,11 @@ from .laws.mujoco_contact import (
 from .laws.poisson import Poisson as Poisson
 from .laws.routh import Routh as Routh
 from .laws.velocity_dependent import VelocityDependent as VelocityDependent
+from .measured import (
+    ellipse_impacts as ellipse_impacts,
+    square_drops as square_drops,
+    square_impacts as square_impacts,
+)
 from .methods.advice import advise as advise
 from .methods.chart import work_precision as work_precision
 from .methods.comparison import (

@@ -5,7 +5,7 @@ import numpy as np
 
 import jimpact as ji
 from jimpact import Fit
-from jimpact.fits.result import FitMinimum
+from jimpact.fits.uncertainty import FitMinimum
 from jimpact.laws.histories import History
 from jimpact.motion.record import KIND_CODE, no_events, with_row
 

@@ -21,9 +21,9 @@ from jimpact.files.study_file import (
     distribution,
     from_file,
 )
-from jimpact.fits.experiments import Experiments, read_experiments
+from jimpact.fits.data import Experiments, read_experiments
 from jimpact.fits.fitting import Fit, fit
-from jimpact.fits.matrix_fit import admissible_start
+from jimpact.fits.matrices import admissible_start
 from jimpact.fits.parameters import OF_SPEED, default_free
 from jimpact.fits.problem import FitProblem, of_shots
 from jimpact.law import Law, free_parameters_of

@@ -1,158 +1,57 @@
-"""`fit`: parameters of a law from measured velocities, with their errors."""
+"""`fit`: parameters of a law from measured velocities, with errors; many fits side by side."""
 
+import functools
 import time
-from collections.abc import Mapping
-from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
 
+import jax
 import numpy as np
 
-from jimpact._checks import as_whole, check_choice
+from jimpact._checks import as_whole, check_choice, check_kind
 from jimpact.files.records import listed
-from jimpact.fits.adequacy import reproduced, stretch, unusable, weighted
-from jimpact.fits.experiments import Experiments
-from jimpact.fits.intervals import Profile
-from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw
-from jimpact.fits.prediction import Predicted, jacobian_of, predicted, tied_values
-from jimpact.fits.problem import FitProblem, of_shots
-from jimpact.fits.profiles import needs_profiles, profile, quick_profiles
-from jimpact.fits.report import report, verdict
-from jimpact.fits.result import FitMinimum, FitResult
-from jimpact.fits.robust import LOSSES, RobustSolution, robust_solution
-from jimpact.fits.saved import read_fit, write_fit
-from jimpact.fits.scene_parameters import plain_law
-from jimpact.fits.search import Minimum, SearchResult, ends, find_minima, settled
-from jimpact.fits.solve import Method, Search, check_method, default_steps
-from jimpact.fits.tables import as_dict, dataset, parameters_frame, write_parameters
-from jimpact.fits.uncertainty import RANK_TOLERANCE, Uncertainty, uncertainty
-from jimpact.fits.verdicts import fit_warnings
+from jimpact.fits.checks import MEDIAN, fit_warnings, stretch, unusable, weighted
+from jimpact.fits.data import Experiments
+from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw, plain_law
+from jimpact.fits.problem import FitProblem, filled_count, of_shots
+from jimpact.fits.profiles import needs_profiles, profile, walked_profiles
+from jimpact.fits.report import Fit
+from jimpact.fits.solve import (
+    DEFAULT_STEPS,
+    Method,
+    Minimum,
+    Search,
+    Solution,
+    check_method,
+    default_steps,
+    find_minima,
+    minimize,
+    repeated,
+    settled,
+    solution,
+    stacked,
+    start_points,
+)
+from jimpact.fits.uncertainty import (
+    FitMinimum,
+    Profile,
+    Uncertainty,
+    check_level,
+    check_squares,
+    uncertainty,
+)
 from jimpact.progress import progress_bar
 from jimpact.scene import Scene
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure  # which takes long to import
 
 # A minimum gets standard errors up to a sum of squares this many noise standard deviations above
 # the best: intervals of all levels end before. With ten times more, only time is lost.
 HARDLY_WORSE = 10.0
-
-
-class Fit(FitResult[AnyLaw]):
-    """See `FitResult`."""
-
-    __doc__ = FitResult.__doc__
-
-    def to_dict(self) -> dict[str, Any]:
-        """Everything a JSON file can hold; numbers that are not finite become None."""
-        return as_dict(self)
-
-    @property
-    def verdict(self) -> str:
-        """The result in one sentence that can be quoted: the first one of `print(fit)`.
-
-        Values with their errors, what they assume, and what speaks against them.
-        """
-        return verdict(self)
-
-    @property
-    def tied(self) -> dict[str, tuple[float, float]]:
-        """What is tied to parameters, by name: values with their standard errors."""
-        return tied_values(self)
-
-    def predict(self, shots: Any, scene: Scene | None = None, level: float = 0.95) -> Predicted:
-        """Velocities after further shots, with the errors that the parameters leave in them.
-
-        Equation: `sqrt(J C J^T)`, J derivatives in the parameters, C their covariance; a
-        measurement, with its own standard error s, lies within `q sqrt(J C J^T + s^2)`, q the
-        quantile as in `intervals`.
-
-        Args:
-            shots: v- (K, n) [m/s], or `Experiments`, of which v- and scenes count.
-            scene: of all shots; None: that of the fit, or those of the shots.
-            level: of the band.
-
-        Returns:
-            `velocity` (K, n) [m/s], `standard_error` (K, n): inf where it depends on what the data
-            do not determine, NaN where the errors are unknown; `status` (K,); `noise` (K, n) of a
-            measurement: the `sigma` of the shots if they have one, else as in the fit; `low` and
-            `high` (K, n), the band of a measurement.
-
-        Raises:
-            ValueError: a fit of something else than shots; velocities that do not fit the scene, a
-                scene that does not fit the law; a level outside (0, 1).
-        """
-        return predicted(self, shots, scene, level)
-
-    def save(self, path: str | Path) -> Path:
-        """Write the fit to a file (JSON) that `ji.load_fit` reads: problem, result, versions.
-
-        Args:
-            path: the file; an existing file is replaced.
-
-        Returns:
-            The path.
-
-        Raises:
-            ValueError: a fit of something else than shots, or with ties: functions cannot be saved.
-        """
-        return write_fit(self, Path(path))
-
-    def plot(self) -> "Figure":
-        """The picture of `ji.plot.fit`: measured and fitted velocities, and the residuals."""
-        from jimpact import plot
-
-        return plot.fit(self)
-
-    def to_csv(self, path: str | Path) -> Path:
-        """Write a row a parameter: value, standard error, ends of its 95 % interval, whether seen.
-
-        Args:
-            path: the file; an existing file is replaced.
-
-        Returns:
-            The path.
-        """
-        return write_parameters(self, Path(path))
-
-    def to_pandas(self) -> Any:
-        """The parameters as a `pandas.DataFrame`, which must be installed."""
-        return parameters_frame(self)
-
-    def to_xarray(self) -> Any:
-        """Parameters, covariance, every shot as an `xarray.Dataset`, which must be installed."""
-        return dataset(self)
-
-    def __str__(self) -> str:
-        return report(self)
-
-
-def load_fit(path: str | Path) -> Fit[Any]:
-    """The fit that `Fit.save` has written, with all that one can do with a fit.
-
-    The classes of laws and scenes are imported by name, so read only files that you trust.
-
-    Args:
-        path: the file.
-
-    Returns:
-        `Fit`.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: no saved fit, one of another format, a law that cannot be imported.
-
-    >>> import tempfile
-    >>> from pathlib import Path
-    >>> import jimpact as ji
-    >>> data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.3, 0.7], [0.6, 1.4]], sigma=0.02)
-    >>> result = ji.fit(ji.Newton(0.9), ji.chain([1.0, 1.0]), data)
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     again = ji.load_fit(result.save(Path(folder) / "fit.json"))
-    >>> again.verdict == result.verdict
-    True
-    """
-    return Fit(**read_fit(Path(path)))
+QUICK_LEVEL = 0.95  # of the profiles that `fit` computes by default
+HUBER = 1.345  # sigmas up to which a residual counts squared: 95 % of the efficiency
+STUDENT = 4.0  # degrees of freedom of the tails
+ROUNDS = 50  # of weights
+SAME = 1e-7  # in natural scales of the parameters: the weights have settled
 
 
 def fit(
@@ -259,24 +158,25 @@ def fit(
     deadline = np.inf if limit is None else time.monotonic() + limit
     with progress_bar(progress) as show:
         search = Search(method, steps, show, deadline)
-        solution = find_minima(problem, starts, seed, search)
-        while (lost := unusable(problem, solution)).any() and not lost.all():
+        found = find_minima(problem, starts, seed, search)
+        while (lost := unusable(problem, found)).any() and not lost.all():
             problem = _without(problem, lost)
-            solution = find_minima(problem, starts, seed, search)
-        _check_derivatives(problem, solution)
-        if problem.residuals.mixing is not None:
-            points = problem.point(np.array([minimum.value for minimum in solution.minima]))
-            (problem,), states = settled([problem], points, search, slopes=[solution.slopes])
-            counts = np.array([minimum.starts for minimum in solution.minima])
-            solution = ends(problem, states, counts, solution.lost)
+            found = find_minima(problem, starts, seed, search)
+        _check_derivatives(problem, found)
+        if found.slopes is not None:
+            points = problem.point(np.array([minimum.value for minimum in found.minima]))
+            (problem,), ends = settled([problem], points, search, slopes=[found.slopes])
+            counts = np.array([minimum.starts for minimum in found.minima])
+            found = solution(problem, ends, counts, found.lost)
         robust = None
         if loss != "squares":
-            problem, robust = robust_solution(problem, solution, loss, search)
-    result = replace(as_fit(problem, solution, method, robust), loss=loss, seed=seed)
+            problem, found, robust = _robust(problem, found, loss, search)
+    result = replace(as_fit(problem, found, method, robust), loss=loss, seed=seed)
     if profiles:
         return _with_profiles(result, profile(result, progress=progress))
     if profiles is None and needs_profiles(result):
-        return _with_profiles(result, quick_profiles(result, progress))
+        every = range(len(result.names))
+        return _with_profiles(result, walked_profiles(result, every, QUICK_LEVEL, 0, progress))
     return result
 
 
@@ -294,7 +194,7 @@ def _with_profiles(result: Fit[AnyLaw], profiles: tuple[Profile, ...]) -> Fit[An
     return replace(result, profiles=profiles)
 
 
-def _check_derivatives(problem: FitProblem, solution: SearchResult) -> None:
+def _check_derivatives(problem: FitProblem, solution: Solution) -> None:
     """Raise a ValueError where derivatives are not finite, whichever shots are left out."""
     lost = np.flatnonzero(~np.isfinite(solution.jacobian).all(axis=1))
     if len(lost):
@@ -327,123 +227,399 @@ def _without(problem: FitProblem, lost: np.ndarray) -> FitProblem:
 
 
 def as_fit(
-    problem: FitProblem,
-    solution: SearchResult,
-    method: Method,
-    robust: RobustSolution | None = None,
+    problem: FitProblem, found: Solution, method: Method, robust: float | None = None
 ) -> Fit[Any]:
-    """The fit at the end of a search: errors, rank and warnings."""
-    if robust is not None:
-        solution = _without_robust_factors(problem, robust)
-    size = problem.size
-    judged = replace(problem, scene=problem.to_scene(solution.value))
-    errors = _errors(problem, judged, solution, robust)
-    residual = np.asarray(problem.measured, float) - solution.predicted
-    findings = fit_warnings(judged, solution, errors, robust is not None)
+    """The fit at the end of a search: errors, rank and warnings.
+
+    `robust`: noise times the root of the degrees of freedom, of a loss that outliers move little.
+    """
+    judged = replace(problem, scene=problem.to_scene(found.value))
+    errors = _errors(problem, judged, found, robust)
+    residual = np.asarray(problem.measured, float) - found.predicted
+    findings = fit_warnings(judged, found, errors, robust is not None)
+    numbers = errors._asdict()
+    undetermined = numbers.pop("undetermined")
+    slope = found.jacobian.reshape((*residual.shape, len(problem.names)))
+    starts = [
+        FitMinimum(x.squares, x.value, x.starts, _standard_error(problem, found, x, errors))
+        for x in found.minima
+    ]
     return Fit(
-        law=plain_law(problem.residuals.law_of(solution.entries)),
+        law=plain_law(problem.law_in_scene(found.value)),
         method=method if isinstance(method, str) else "optax",
         names=problem.names,
-        value=solution.value,
-        standard_error=errors.standard_error,
-        covariance=errors.covariance,
-        correlation=errors.correlation,
+        value=found.value,
         bounds=(problem.domains[:, 0], problem.domains[:, 1]),
-        at_bound=solution.at_bound,
-        predicted=solution.predicted,
+        at_bound=found.at_bound,
+        predicted=found.predicted,
         residual=residual,
         rms=_rms(problem, residual),
-        noise=errors.noise,
-        degrees_of_freedom=errors.degrees_of_freedom,
-        rank=errors.rank,
-        singular_values=errors.singular_values,
-        identifiability=(*problem.notes, *errors.undetermined),
-        starts=tuple(
-            FitMinimum(
-                size**2 * minimum.squares,
-                minimum.value,
-                minimum.starts,
-                _standard_error(problem, solution, minimum, errors),
-            )
-            for minimum in solution.minima
-        ),
-        status=solution.status,
-        converged=solution.converged,
-        steps=solution.steps,
-        lost_starts=solution.lost,
-        warnings=tuple(found.line for found in findings),
-        reservations=tuple(found.reservation for found in findings if found.reservation),
+        **numbers,
+        identifiability=(*problem.notes, *undetermined),
+        starts=tuple(starts),
+        status=found.status,
+        converged=found.converged,
+        steps=found.steps,
+        lost_starts=found.lost,
+        warnings=tuple(each.line for each in findings),
+        reservations=tuple(each.reservation for each in findings if each.reservation),
         problem=problem,
-        jacobian=jacobian_of(problem, solution),
+        jacobian=problem.errors_of(slope / problem.steps_at(found.value)),
     )
-
-
-def _without_robust_factors(problem: FitProblem, robust: RobustSolution) -> SearchResult:
-    """The minimum that the loss found, its residuals weighted as in `problem`."""
-    solution, weighed = robust.solution, problem.weighed(robust.factor).residuals
-    size = problem.size
-    back = float(weighed.size) / size / robust.factor.reshape(-1, 1)
-    residual = problem.independent(problem.measured - solution.predicted)
-    from_priors, _ = problem.prior_errors(solution.value)
-    squares = float(np.sum(residual**2) + np.sum(from_priors**2)) / size**2
-    jacobian = back * solution.jacobian
-    minimum = Minimum(squares, solution.value, 1, jacobian)
-    return solution._replace(jacobian=jacobian, minima=[minimum])
 
 
 def _errors(
-    problem: FitProblem, judged: FitProblem, solution: SearchResult, robust: RobustSolution | None
+    problem: FitProblem, judged: FitProblem, found: Solution, robust: float | None
 ) -> Uncertainty:
     """Errors of the parameters; with known errors of the data wider where the law does not fit."""
-    best = solution.minima[0]
-    errors = _uncertainty(problem, solution, best)
+    best, noise = found.minima[0], None
+    errors = uncertainty(problem, best)
     if robust is not None:
-        freedom = errors.degrees_of_freedom
         noise = np.nan if problem.sigma is None else 1.0
-        if freedom > 0:
-            noise = robust.noise / np.sqrt(freedom)
-        return _uncertainty(problem, solution, best, noise)
-    if problem.sigma is not None:
-        times = stretch(judged, weighted(problem, solution), errors.rank)
-        if times > 1:
-            return _uncertainty(problem, solution, best, times)
-    return errors
-
-
-def _uncertainty(
-    problem: FitProblem, solution: SearchResult, minimum: Minimum, noise: float | None = None
-) -> Uncertainty:
-    """Linearized errors at a minimum; noise: None: as stated, or of its residuals.
-
-    Data without sigma that are reproduced to the last digit do not show their noise.
-    """
-    size = problem.size
-    if noise is None and problem.sigma is not None:
-        noise = 1.0
-    elif noise is None and reproduced(problem, minimum):
-        noise = np.nan
-    scale = np.where(solution.log, minimum.value, solution.scale)
-    _, of_priors = problem.prior_errors(minimum.value)
-    return uncertainty(
-        names=problem.names,
-        jacobian=np.vstack([size * minimum.jacobian, of_priors * scale]),
-        scale=scale,
-        log=solution.log,
-        sum_of_squares=size**2 * minimum.squares,
-        values=problem.values,
-        noise=noise,
-        rank_tolerance=RANK_TOLERANCE[problem.precision],
-        value_name=problem.value_name,
-    )
+        if errors.degrees_of_freedom > 0:
+            noise = robust / np.sqrt(errors.degrees_of_freedom)
+    elif problem.sigma is not None:
+        noise = stretch(judged, weighted(problem, found), errors.rank)
+    return errors if noise in (None, 1.0) else uncertainty(problem, best, noise)
 
 
 def _standard_error(
-    problem: FitProblem, solution: SearchResult, minimum: Minimum, best: Uncertainty
+    problem: FitProblem, found: Solution, minimum: Minimum, best: Uncertainty
 ) -> np.ndarray | None:
     """Standard errors (P,) at a minimum that fits hardly worse than the best; else None."""
-    if minimum is solution.minima[0]:
+    if minimum is found.minima[0]:
         return best.standard_error
-    more = problem.size**2 * (minimum.squares - solution.minima[0].squares)
-    if not more <= (HARDLY_WORSE * best.noise) ** 2:
+    if not minimum.squares - found.minima[0].squares <= (HARDLY_WORSE * best.noise) ** 2:
         return None
-    return _uncertainty(problem, solution, minimum, best.noise).standard_error
+    return uncertainty(problem, minimum, best.noise).standard_error
+
+
+# ---------------------------------------------------------------------------- robust losses
+
+
+def _huber(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """psi(u) / u and psi'(u)."""
+    inside = np.abs(u) <= HUBER
+    return np.where(inside, 1.0, HUBER / np.where(inside, 1.0, np.abs(u))), inside.astype(float)
+
+
+def _student(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """psi(u) / u and psi'(u)."""
+    below = STUDENT + u**2
+    return (STUDENT + 1) / below, (STUDENT + 1) * (STUDENT - u**2) / below**2
+
+
+LOSSES = {"huber": _huber, "student": _student}
+
+
+def _robust(
+    problem: FitProblem, found: Solution, loss: str, search: Search
+) -> tuple[FitProblem, Solution, float]:
+    """Least squares again and again, with weights `psi(u) / u` of the last residuals u.
+
+    Equation: the covariance is `s^2 mean(psi^2) / mean(psi')^2 (J^T J)^-1` (Huber, 1981).
+    """
+    here = ~np.isnan(problem.measured)
+    for _ in range(ROUNDS):
+        problem = problem.with_errors_before(found.slopes)
+        error = problem.independent(problem.measured - found.predicted)
+        scale = 1.0
+        if problem.sigma is None:
+            scale = max(MEDIAN * float(np.median(np.abs(error[here]))), np.finfo(float).tiny)
+        share, slope = LOSSES[loss](error / scale)
+        factor, before = np.sqrt(share), problem.point(found.value)
+        weighed = problem.weighed(factor)
+        found = solution(weighed, minimize(repeated(weighed, 1), before[None], search))
+        if np.abs(problem.point(found.value) - before).max() <= SAME:
+            break
+    else:
+        found = found._replace(converged=False)
+    psi = (share * error / scale)[here]
+    noise = scale * np.sqrt(np.sum(psi**2)) / max(slope[here].mean(), SAME)
+    # weighted as in the problem, without the factors of the loss
+    residual = problem.independent(problem.measured - found.predicted)
+    from_priors, _ = problem.prior_errors(found.value)
+    squares = float(np.sum(residual**2) + np.sum(from_priors**2))
+    minimum = Minimum(squares, found.value, 1, found.jacobian / factor.reshape(-1, 1))
+    return problem, found._replace(minima=[minimum]), float(noise)
+
+
+# ---------------------------------------------------------------------------- many fits
+
+
+def fit_many(
+    law: AnyLaw,
+    scene: Scene | None,
+    many: Sequence[Experiments],
+    free: Any = DEFAULT_FREE,
+    *,
+    bounds: Mapping[str, Any] | None = None,
+    priors: Mapping[str, Any] | None = None,
+    ties: Mapping[str, Any] | None = None,
+    starts: int = 1,
+    seed: int = 0,
+    max_steps: int = DEFAULT_STEPS["levenberg-marquardt"],
+    progress: float | None = None,
+) -> "Fits[AnyLaw]":
+    """`fit` of one law to each of many data sets, side by side in one compiled program.
+
+    Data sets of up to 4, 8, 16, ... shots share a program. Arguments and errors as of `fit`;
+    `starts` are those of each data set; around the best, and in scans, none are added.
+
+    Args:
+        law: start values of all.
+        scene: of all shots; None: each of `many` carries its own.
+        many: the data sets.
+        free: as of `fit`.
+        bounds: as of `fit`.
+        priors: as of `fit`; of each data set.
+        ties: as of `fit`.
+        starts: of each data set.
+        seed: of the random starts.
+        max_steps: iterations per start.
+        progress: a bar on stderr; None: on a terminal.
+
+    Returns:
+        `Fits`: arrays of values, and a `Fit` for each data set, in their order, made when it is
+        asked for.
+
+    Raises:
+        ValueError: as of `fit`.
+
+    >>> import jimpact as ji
+    >>> sets = [ji.Experiments([1.0, 0.0], [0.5 - 0.5 * e, 0.5 + 0.5 * e]) for e in (0.4, 0.8)]
+    >>> fits = ji.fit_many(ji.Newton(0.9), ji.chain([1.0, 1.0]), sets)
+    >>> [round(float(each.law.restitution), 6) for each in fits]
+    [0.4, 0.8]
+    """
+    as_whole("starts", starts, 1)
+    check_kind("many", many, Sequence)
+    choice = (free, bounds, priors, ties)
+    options: dict[str, Any] = {
+        "starts": starts,
+        "seed": seed,
+        "max_steps": max_steps,
+        "profiles": False,
+    }
+
+    @functools.cache
+    def problem(k: int) -> FitProblem:
+        """The problem of one data set."""
+        return of_shots(law, scene, many[k], *choice)
+
+    groups = []
+    with progress_bar(progress) as show:
+        search = Search(max_steps=max_steps, show=show)
+        for members in _alike(many):
+            first, side_by_side = problem(members[0]), _side_by_side(problem, many, members)
+            points = start_points(first, starts, np.random.default_rng(seed))
+            all_starts = jax.tree.map(lambda x: np.repeat(x, starts, axis=0), side_by_side)
+            ends = minimize(all_starts, np.tile(points, (len(members), 1)), search)
+            problems: list[FitProblem] | None = None
+            if ends.slopes is not None:  # errors of v- are passed on by each set's own law
+                best = ends.rows(_best(ends.squares, starts))
+                own = [problem(k) for k in members]
+                problems, ends = settled(own, best.y, search, slopes=best.slopes)
+            groups.append((members, ends, problems))
+
+    @functools.cache
+    def made(k: int) -> Fit[AnyLaw]:
+        """The fit of one; shots that cannot be used are left out in a new one."""
+        members, ends, problems = next(group for group in groups if k in group[0])
+        i, each = members.index(k), len(ends.y) // len(members)
+        one = problem(k) if problems is None else problems[i]
+        found = solution(one, ends.rows(slice(i * each, (i + 1) * each)))
+        if unusable(one, found).any():
+            return fit(problem(k), progress=False, **options)
+        return as_fit(one, found, "levenberg-marquardt")
+
+    order = np.argsort(np.concatenate([members for members, _, _ in groups]))
+    best_ends = [x.rows(_best(x.squares, len(x.y) // len(members))) for members, x, _ in groups]
+    value = np.concatenate([problem(0).values_at(x.y) for x in best_ends])[order]
+    squares = np.concatenate([x.squares for x in best_ends])[order]
+    converged = np.concatenate([x.converged for x in best_ends])[order]
+    return Fits(problem(0).names, value, squares, converged, made)
+
+
+def _best(squares: np.ndarray, each: int) -> np.ndarray:
+    """Where the best of so many starts is, of each problem."""
+    return np.arange(0, len(squares), each) + np.nanargmin(squares.reshape(-1, each), axis=1)
+
+
+def _alike(many: Sequence[Experiments]) -> list[list[int]]:
+    """Data sets that share one program: as many shots, filled up, all with or without errors."""
+    groups: dict[Any, list[int]] = {}
+    for k, data in enumerate(many):
+        check_kind(f"many[{k}]", data, Experiments)
+        kind = (filled_count(len(data.shots)), data.pre.shape[1], data.sigma is None)
+        shapes = None if data.scenes is None else data.largest_scene(None).contacts
+        groups.setdefault((*kind, data.sigma_pre is None, shapes), []).append(k)
+    return list(groups.values())
+
+
+def _side_by_side(
+    problem: Callable[[int], FitProblem], many: Sequence[Experiments], members: list[int]
+) -> Any:
+    """The problems of a group, one program's argument.
+
+    Sets of equal shapes in a common scene are stacked as arrays, whose problems nobody needs.
+    """
+    first, sets = problem(members[0]), [many[k] for k in members]
+    same = all(x.scenes is None and x.sigma_pre is None for x in sets)
+    same = same and len({(x.pre.shape, x.units) for x in sets}) == 1
+    # of a coarser law, where the noise allows it, each set decides by itself
+    if not same or any("computed with `rtol`" in note for note in first.notes):
+        return stacked([problem(k) for k in members])
+    one = first.program()
+    pre, post = (np.stack([np.asarray(getattr(x, name)) for x in sets]) for name in ("pre", "post"))
+    errors = np.broadcast_to(sets[0].natural_errors(first.scene), post.shape)
+    if sets[0].sigma is not None:
+        errors = np.stack([np.asarray(x.sigma) for x in sets])
+    here, dtype = ~np.isnan(post), one.low.dtype
+    weight = np.where(here, 1 / np.where(here, errors, 1.0), 0.0)
+    unit = np.maximum(np.abs(pre).max(axis=(1, 2)), np.nanmax(np.abs(post), axis=(1, 2)))
+    unit = np.where(unit > 0, unit, 1.0)
+    size = unit * np.sqrt(np.sum(weight**2, axis=(1, 2)))
+    rows = np.minimum(np.arange(len(one.measured)), post.shape[1] - 1)
+    weight = np.where(np.arange(len(rows))[:, None] < post.shape[1], weight[:, rows], 0.0)
+    every = repeated(first, len(sets))
+    before = np.array(every.observe.pre)
+    before[:, :, : post.shape[2]] = pre[:, rows]
+    arrays = {"measured": post[:, rows], "weight": weight, "size": size, "unit": unit}
+    return replace(
+        every,
+        observe=replace(every.observe, pre=before),
+        **{name: np.asarray(x, dtype) for name, x in arrays.items()},
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Fits(Sequence[Fit[AnyLaw]]):
+    """Fits of one law to S data sets: `value` (S, P) by `names`, and a `Fit` each when asked for.
+
+    `squares` (S,) are the sums of squared weighted residuals, `converged` (S,) which searches have
+    ended. `fits[k]` makes errors and report of one; so does a loop over all.
+    """
+
+    names: tuple[str, ...]
+    value: np.ndarray
+    squares: np.ndarray
+    converged: np.ndarray
+    _made: Callable[[int], Fit[AnyLaw]] = field(repr=False)
+
+    def __len__(self) -> int:
+        return len(self.value)
+
+    def __getitem__(self, k: Any) -> Any:
+        each = range(len(self))[k]
+        return [self._made(i) for i in each] if isinstance(each, range) else self._made(each)
+
+
+@dataclass(frozen=True, eq=False)
+class Refits:
+    """Parameters `value` (B, P), by `names`, of fits to changed data.
+
+    `predicted` (B, ...) is what each predicts, shaped like what was measured [m/s]; `converged`
+    (B,) which of the fits have.
+    """
+
+    names: tuple[str, ...]
+    value: np.ndarray
+    predicted: np.ndarray
+    converged: np.ndarray
+
+    def interval(self, level: float = 0.95) -> np.ndarray:
+        """Quantiles (P, 2) between which the share `level` of the values lies."""
+        check_level(level)
+        return np.quantile(self.value, [0.5 - 0.5 * level, 0.5 + 0.5 * level], axis=0).T
+
+
+def bootstrap(
+    fit: Fit, samples: int = 200, *, seed: int = 0, progress: float | None = None
+) -> Refits:
+    """Fits to data that the fitted law made, with the noise of the fit (parametric bootstrap).
+
+    Equation: `v+* = v+(law) + sigma z`, z standard normal; sigma as stated, else `fit.noise`;
+    errors of v- are passed on by the law.
+
+    Args:
+        fit: with a known noise.
+        samples: data sets B.
+        seed: of z.
+        progress: a bar on stderr; None: on a terminal.
+
+    Returns:
+        `Refits` with `value` (B, P).
+
+    Raises:
+        ValueError: samples < 1; a noise that is not known; a robust loss.
+
+    >>> import jimpact as ji
+    >>> data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.11, 0.88], [0.2, 1.81]], sigma=0.02)
+    >>> result = ji.fit(ji.Newton(0.9), ji.chain([1.0, 1.0]), data)
+    >>> spread = ji.bootstrap(result).value.std()
+    >>> bool(abs(spread / result.standard_error[0] - 1) < 0.1)
+    True
+    """
+    as_whole("samples", samples, 1)
+    check_squares("fit", fit)
+    if not np.isfinite(fit.noise):
+        raise ValueError("Argument `fit` must have a known noise, but its noise is not finite.")
+    problem, shape = fit.problem, fit.predicted.shape
+    z = np.random.default_rng(seed).normal(size=(samples, *shape))
+    errors = problem.errors_of(fit.noise * np.moveaxis(z, 0, -1))
+    many = repeated(problem, samples)
+    measured = np.full(many.measured.shape, np.nan, many.measured.dtype)
+    rows = (slice(None), slice(len(fit.predicted))) if shape else slice(None)
+    measured[rows] = fit.predicted + np.moveaxis(errors, -1, 0)
+    means = np.array(many.prior_mean)  # as if they had been measured anew
+    z = np.random.default_rng((seed, 1)).normal(size=(samples, len(problem.priors)))
+    for prior, drawn in zip(problem.priors, z.T):
+        i = prior.parameter
+        means[:, i] = fit.value[i] + fit.noise * prior.std * drawn
+    many = replace(many, measured=measured, prior_mean=means)
+    return _refits(fit, [problem] * samples, many, progress)
+
+
+def leave_one_out(fit: Fit, *, progress: float | None = None) -> Refits:
+    """A fit without each of the K shots in turn; `predicted` (K, n) is of the shot left out.
+
+    `measured - predicted` is an honest error of prediction: laws with different numbers of
+    parameters may be compared by it.
+
+    Args:
+        fit: of K >= 2 shots.
+        progress: a bar on stderr; None: on a terminal.
+
+    Returns:
+        `Refits` with `value` (K, P).
+
+    Raises:
+        ValueError: a fit to something else than at least two shots; a robust loss.
+
+    >>> import jimpact as ji
+    >>> data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.1, 0.9], [0.6, 1.4]])
+    >>> result = ji.fit(ji.Newton(0.9), ji.chain([1.0, 1.0]), data)
+    >>> ji.leave_one_out(result).value.round(6).tolist()
+    [[0.4], [0.8]]
+    """
+    check_squares("fit", fit)
+    shots = 0 if fit.experiments is None else len(fit.predicted)
+    if shots < 2:
+        raise ValueError(f"Argument `fit` must be of at least 2 shots, but has {shots}.")
+    many = repeated(fit.problem, shots)
+    weight = np.array(many.weight)
+    weight[np.arange(shots), np.arange(shots)] = 0.0
+    each = np.eye(shots)[:, :, None] * np.ones(fit.predicted.shape)
+    problems = [fit.problem.weighed(1 - shot) for shot in each]
+    refits = _refits(fit, problems, replace(many, weight=weight), progress)
+    return replace(refits, predicted=refits.predicted[np.arange(shots), np.arange(shots)])
+
+
+def _refits(fit: Fit, problems: list[FitProblem], many: Any, progress: float | None) -> Refits:
+    """Minima of these problems next to a fit."""
+    points = np.tile(fit.problem.point(fit.value), (len(problems), 1))
+    with progress_bar(progress) as show:
+        _, ends = settled(problems, points, Search(show=show), many)
+    predicted = ends.predicted[:, : len(fit.predicted)] if fit.predicted.ndim else ends.predicted
+    return Refits(fit.names, fit.problem.values_at(ends.y), predicted, ends.converged)

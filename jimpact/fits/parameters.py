@@ -1,58 +1,88 @@
-"""Which entries of a law are free, their names, bounds and natural scales."""
+"""What is fitted of a law and its scene: names, entries, bounds, priors, ties."""
 
 import dataclasses
-from collections.abc import Mapping
+import re
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, TypeVar
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import ABBREVIATIONS, suggestion
-from jimpact.fits.ties import Ties, entry_of, places, tied_places
-from jimpact.law import Law, free_parameters_of, parameters_of, with_parameter
+from jimpact.contact import Contact
+from jimpact.files.study_file import OF_A_SCENE
+from jimpact.law import (
+    Domain,
+    Impulses,
+    Law,
+    OptionalValues,
+    forwards_to_law,
+    free_parameters_of,
+    parameter,
+    parameters_of,
+    with_parameter,
+)
+from jimpact.laws.kinematic import RestitutionMatrix
+from jimpact.scene import Scene, with_gaps
 
 AnyLaw = TypeVar("AnyLaw", bound=Law)  # what goes in as LZB comes out as LZB
+Ties = tuple[tuple[str, Callable[["Values"], Any]], ...]  # names, and what they follow from
+Limits = tuple[np.ndarray, np.ndarray]  # lowest and highest values (P,)
 DEFAULT_FREE = ("restitution", "stiffness")  # or a matrix, or what else a law has
 OF_SPEED = ("speed_exponent", "yield_speed")  # a law has them only if requested
 
 # What is fitted in its logarithm, a stiffness, may without bounds move this far from its start:
 # beyond, the softer contact has no further influence that a measurement could see.
 LOG_RANGE = 1e4
+# A part of a scene is searched up to so many standard deviations of its prior away. With ten times
+# more, random starts would lie where the prior makes a fit hopeless.
+REACH = 10.0
+
+_ENTRY = re.compile(r"(\w+)\[([1-9]\d*(?:[,=][1-9]\d*)*)\]")  # a name with entries, from 1
 
 
-@dataclasses.dataclass(frozen=True)
-class Parameters:
-    """P free parameters. Each moves one or several of the Q entries of the named fields.
+# ---------------------------------------------------------------------------- names and entries
 
-    Entries are numbered through the flattened fields, in the order of `fields`; entries in no
-    group are fixed. (All entries are listed so that a compiled fit does not depend on the groups.)
+
+def entry_of(name: str) -> tuple[str, str | None]:
+    """The field of a name as in `Parameters.names`, and what is in its brackets.
+
+    >>> from jimpact.fits.parameters import entry_of
+    >>> entry_of("restitution"), entry_of("restitution[1=3]")
+    (('restitution', None), ('restitution', '1=3'))
     """
+    match = _ENTRY.fullmatch(name)
+    return (match[1], match[2]) if match else (name, None)
 
-    labels: dict[str, np.ndarray]  # of each field: 0 is fixed, equal numbers share a value
-    names: tuple[str, ...]
-    groups: tuple[tuple[int, ...], ...]
-    entry_fields: tuple[str, ...]  # of each entry
-    log: np.ndarray  # (Q,) entries that are fitted in their logarithm
 
-    @property
-    def fields(self) -> tuple[str, ...]:
-        """Names of the fields."""
-        return tuple(self.labels)
-
-    @property
-    def first(self) -> list[int]:
-        """The first entry of every group: it stands for the parameter."""
-        return [group[0] for group in self.groups]
-
-    def field_of(self, parameter: int) -> str:
-        """The field that a parameter belongs to."""
-        return self.entry_fields[self.groups[parameter][0]]
+def places(argument: str, name: str, shape: tuple[int, ...]) -> list[int]:
+    """Where in the flattened field of this shape the entries of a name are, counted from 0."""
+    _, entry = entry_of(name)
+    if entry is None:
+        return list(range(int(np.prod(shape, dtype=int))))
+    members = [tuple(int(i) - 1 for i in part.split(",")) for part in entry.split("=")]
+    for index in members:
+        inside = len(index) == len(shape) and all(0 <= i < n for i, n in zip(index, shape))
+        if not inside:
+            kind = f"of shape {shape}" if shape else "one value for all contacts"
+            raise ValueError(
+                f"Argument `{argument}` must name entries that the field has, counted from 1, but "
+                f"has {name!r} of a field that is {kind}."
+            )
+    return [int(np.ravel_multi_index(index, shape)) for index in members]
 
 
 def value_of(law: Law, field: str) -> Any:
     """A parameter of a law, or of its parts (the force of a compliant one); None if it has none."""
-    parameter = parameters_of(law).get(field)
-    return None if parameter is None else parameter.value
+    known = parameters_of(law).get(field)
+    return None if known is None else known.value
+
+
+def domain_of(law: Law, field: str) -> Domain:
+    """What values a parameter may have."""
+    return parameters_of(law)[field].domain
 
 
 def entries(law: Law, fields: tuple[str, ...]) -> np.ndarray:
@@ -71,6 +101,40 @@ def with_entries(law: AnyLaw, fields: tuple[str, ...], values: Any) -> AnyLaw:
     return law
 
 
+@dataclasses.dataclass(frozen=True)
+class Parameters:
+    """P free parameters. Each moves one or several of the Q entries of the named fields.
+
+    Entries are numbered through the flattened fields, in the order of `fields`; entries in no
+    group are fixed. (All entries are listed so that a compiled fit does not depend on the groups.)
+    """
+
+    labels: dict[str, np.ndarray]  # of each field: 0 is fixed, equal numbers share a value
+    names: tuple[str, ...]
+    groups: tuple[tuple[int, ...], ...]
+    log: np.ndarray  # (P,) whether a parameter is fitted in its logarithm
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Names of the fields."""
+        return tuple(self.labels)
+
+    @property
+    def count(self) -> int:
+        """Number of entries Q."""
+        return sum(label.size for label in self.labels.values())
+
+    @property
+    def first(self) -> list[int]:
+        """The first entry of every group: it stands for the parameter."""
+        return [group[0] for group in self.groups]
+
+    @property
+    def of_fields(self) -> list[str]:
+        """(P,) the field that each parameter belongs to."""
+        return [entry_of(name)[0] for name in self.names]
+
+
 def free_parameters(
     law: Law, free: Any, absolute: bool = False, ties: Ties = ()
 ) -> tuple[Parameters, list[str]]:
@@ -78,26 +142,13 @@ def free_parameters(
 
     `absolute`: forces or times were measured, which show a common factor of all stiffnesses.
     """
-    known = free_parameters_of(law)
-    labels, fixed = {}, ""
+    known, fixed = free_parameters_of(law), ""
     if free is DEFAULT_FREE:
         free = default_free(law, absolute)
         if "stiffness" in known and "stiffness" not in free:
             fixed = "stiffness"
-    choices = dict(free) if isinstance(free, Mapping) else dict.fromkeys(_as_names(free), True)
-    for name, choice in choices.items():
-        field, entry = entry_of(name)
-        if field not in known:
-            raise ValueError(_unknown_field(law, name, list(known)))
-        shape = np.shape(value_of(law, field))
-        if entry is None:
-            labels[field] = _as_labels(field, choice, shape)
-        else:
-            label = labels.setdefault(field, np.zeros(shape, int))
-            at = places("free", name, entry, shape)
-            label.flat[at] = (label.max() + 1) * _as_flag(name, choice)
-    ratios = not absolute and _only_ratios(law, labels)
-    if ratios and "stiffness" in labels and labels["stiffness"].all():
+    labels = _labels(law, free)
+    if not absolute and _only_ratios(law, labels) and labels.get("stiffness", np.zeros(1)).all():
         shared = labels["stiffness"] == labels["stiffness"].flat[0]
         if shared.all():
             raise ValueError(
@@ -108,11 +159,6 @@ def free_parameters(
             )
         labels["stiffness"][shared] = 0
         fixed = "stiffness[1]"
-    notes = []
-    if fixed:
-        notes = [
-            f"{fixed} is fixed at its start: with equal exponents only stiffness ratios matter."
-        ]
     for name, at in tied_places(law, ties).items():
         field, _ = entry_of(name)
         if field in labels:
@@ -120,15 +166,35 @@ def free_parameters(
     names, groups, start = [], [], 0
     for field, label in labels.items():
         for value in dict.fromkeys(label[label > 0].tolist()):
-            members = np.argwhere(label == value)
-            names.append(_name(field, members, label.size))
+            names.append(_name(field, np.argwhere(label == value), label.size))
             groups.append(tuple((start + np.flatnonzero(label == value)).tolist()))
         start += label.size
     if not names:
         raise ValueError("Argument `free` must name a parameter to fit, but leaves none free.")
-    owners = tuple(field for field, label in labels.items() for _ in range(label.size))
-    log = np.array([parameters_of(law)[field].domain.log for field in owners])
-    return Parameters(labels, tuple(names), tuple(groups), owners, log), notes
+    log = np.array([domain_of(law, entry_of(name)[0]).log for name in names])
+    note = f"{fixed} is fixed at its start: with equal exponents only stiffness ratios matter."
+    return Parameters(labels, tuple(names), tuple(groups), log), [note] if fixed else []
+
+
+def _labels(law: Law, free: Any) -> dict[str, np.ndarray]:
+    """Of each field that `free` names: 0 where fixed, equal numbers where a value is shared."""
+    known, labels = free_parameters_of(law), {}
+    choices = free if isinstance(free, Mapping) else dict.fromkeys(_as_names(free), True)
+    for name, choice in choices.items():
+        field, entry = entry_of(name)
+        if field not in known:
+            raise ValueError(_unknown_field(law, name, list(known)))
+        shape = np.shape(value_of(law, field))
+        if entry is None:
+            labels[field] = _as_labels(field, choice, shape)
+            continue
+        if not isinstance(choice, (bool, np.bool_)):
+            raise ValueError(
+                f"Argument `free` must map `{name}` to True or False, but has value {choice!r}."
+            )
+        label = labels.setdefault(field, np.zeros(shape, int))
+        label.flat[places("free", name, shape)] = (label.max() + 1) * choice
+    return labels
 
 
 def _name(field: str, members: np.ndarray, size: int) -> str:
@@ -136,15 +202,6 @@ def _name(field: str, members: np.ndarray, size: int) -> str:
     if len(members) == size and (size > 1 or members.shape[1] == 0):
         return field
     return f"{field}[{'='.join(','.join(str(i + 1) for i in index) for index in members)}]"
-
-
-def _as_flag(name: str, choice: Any) -> bool:
-    """Whether a single entry is free."""
-    if not isinstance(choice, (bool, np.bool_)):
-        raise ValueError(
-            f"Argument `free` must map `{name}` to True or False, but has value {choice!r}."
-        )
-    return bool(choice)
 
 
 def _as_names(free: Any) -> tuple[str, ...]:
@@ -205,45 +262,72 @@ def _only_ratios(law: Law, labels: Mapping[str, np.ndarray]) -> bool:
     return law.only_stiffness_ratios and stay_equal
 
 
-def bounds_of(
-    parameters: Parameters, law: Law, bounds: Mapping[str, Any] | None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper bounds (P,): the user's, or else the field's domain."""
-    chosen = dict(bounds or {})
-    known = {parameters.field_of(i) for i in range(len(parameters.names))}
-    for field in chosen:
-        if entry_of(field)[0] not in known:
+# ---------------------------------------------------------------------------- bounds and priors
+
+
+def _check_names(argument: str, chosen: Mapping[str, Any], known: Any) -> None:
+    """Raise a ValueError unless all chosen names are those of free parameters."""
+    for name in chosen:
+        if name not in known:
             raise ValueError(
-                f"Argument `bounds` must name free parameters, {', '.join(sorted(known))}, "
-                f"but has {field!r}."
+                f"Argument `{argument}` must name free parameters, {', '.join(known)}, "
+                f"but has {name!r}."
             )
-    values = entries(law, parameters.fields)
-    ends = np.empty((2, len(values)))
-    for field in parameters.fields:
-        inside = np.array([owner == field for owner in parameters.entry_fields])
-        if field in chosen:
-            ends[:, inside] = _bound_pair(field, chosen[field], law)
-        elif parameters_of(law)[field].domain.log:
-            ends[:, inside] = values[inside] / LOG_RANGE, values[inside] * LOG_RANGE
-        else:
-            domain = parameters_of(law)[field].domain
-            ends[:, inside] = np.array(domain.bounds)[:, None]
-            searched = np.maximum(values[inside], domain.searched_high)
-            ends[1, inside] = np.minimum(ends[1, inside], searched)
-    for name, pair in chosen.items():
-        field, entry = entry_of(name)
-        if entry is not None:
-            at = places("bounds", name, entry, np.shape(value_of(law, field)))
-            first = parameters.entry_fields.index(field)
-            ends[:, first + np.array(at)] = np.array(_bound_pair(field, pair, law))[:, at]
-    low = np.array([ends[0, list(group)].max() for group in parameters.groups])
-    high = np.array([ends[1, list(group)].min() for group in parameters.groups])
-    for name, start, a, b in zip(parameters.names, values[parameters.first], low, high):
+
+
+def bounds_of(parameters: Parameters, law: Law, bounds: Mapping[str, Any] | None) -> Limits:
+    """Lower and upper bounds (P,): the user's, or else the field's domain."""
+    chosen, fields = dict(bounds or {}), sorted(set(parameters.of_fields))
+    _check_names("bounds", [entry_of(name)[0] for name in chosen], fields)  # type: ignore[arg-type]
+    ends = {field: _default_bounds(law, field) for field in parameters.fields}
+    for name in sorted(chosen, key=lambda name: entry_of(name)[1] is not None):  # fields first
+        field, _ = entry_of(name)
+        at = places("bounds", name, np.shape(value_of(law, field)))
+        ends[field][:, at] = np.array(_bound_pair(field, chosen[name], law))[:, at]
+    both = np.concatenate(list(ends.values()), axis=1)
+    low = np.array([both[0, list(group)].max() for group in parameters.groups])
+    high = np.array([both[1, list(group)].min() for group in parameters.groups])
+    starts = entries(law, parameters.fields)[parameters.first]
+    for name, start, a, b in zip(parameters.names, starts, low, high):
         if not a <= start <= b:
             raise ValueError(
                 f"Argument `bounds` must include the start of `{name}`, {start:g}, "
                 f"but is [{a:g}, {b:g}]."
             )
+    return low, high
+
+
+def _default_bounds(law: Law, field: str) -> np.ndarray:
+    """(2, size) ends of the domain of a field, or of what is searched of it."""
+    values, domain = np.ravel(np.asarray(value_of(law, field), float)), domain_of(law, field)
+    if domain.log:
+        return np.stack([values / LOG_RANGE, values * LOG_RANGE])
+    low, high = domain.bounds
+    searched = np.maximum(values, domain.searched_high)
+    return np.stack([np.full(len(values), low), np.minimum(high, searched)])
+
+
+def _bound_pair(field: str, pair: Any, law: Law) -> Limits:
+    """Bounds of a field, flattened; each end is a scalar or shaped like the field."""
+    shape = np.shape(value_of(law, field))
+    try:
+        low, high = (np.broadcast_to(np.asarray(end, float), shape).ravel() for end in pair)
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"Argument `bounds` must map `{field}` to (low, high), each a number or of shape "
+            f"{shape}, but has {pair!r}."
+        ) from None
+    domain = domain_of(law, field)
+    smallest, largest = domain.bounds
+    if not (low < high).all():
+        raise ValueError(f"Argument `bounds` must have low < high for `{field}`, but has {pair!r}.")
+    if (low < smallest).any() or (high > largest).any():
+        raise ValueError(
+            f"Argument `bounds` must lie in [{smallest:g}, {largest:g}] for `{field}`, "
+            f"but has {pair!r}."
+        )
+    if domain.log and (low <= 0).any():
+        raise ValueError(f"Argument `bounds` must be > 0 for `{field}`, but has {pair!r}.")
     return low, high
 
 
@@ -256,17 +340,13 @@ class Prior(NamedTuple):
 
 
 def priors_of(
-    parameters: Parameters, limits: tuple[np.ndarray, np.ndarray], priors: Mapping[str, Any] | None
+    parameters: Parameters, limits: Limits, priors: Mapping[str, Any] | None
 ) -> tuple[Prior, ...]:
     """The user's priors, by name of a parameter or of a field for all that belong to it."""
-    chosen = dict(priors or {})
-    fields = [parameters.field_of(i) for i in range(len(parameters.names))]
+    chosen, fields = dict(priors or {}), parameters.of_fields
     for name in chosen:
         if name not in (*parameters.names, *fields):
-            raise ValueError(
-                "Argument `priors` must name free parameters, "
-                f"{', '.join(parameters.names)}, but has {name!r}."
-            )
+            _check_names("priors", [name], parameters.names)  # type: ignore[arg-type]
     found = []
     for i, (name, field, low, high) in enumerate(zip(parameters.names, fields, *limits)):
         pair = chosen.get(name, chosen.get(field))
@@ -297,25 +377,226 @@ def _mean_and_std(name: str, pair: Any, low: float, high: float) -> tuple[float,
     return mean, std
 
 
-def _bound_pair(field: str, pair: Any, law: Law) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds of a field, flattened; each end is a scalar or shaped like the field."""
-    shape = np.shape(value_of(law, field))
-    try:
-        low, high = (np.broadcast_to(np.asarray(end, float), shape).ravel() for end in pair)
-    except (TypeError, ValueError):
+# ---------------------------------------------------------------------------- ties
+
+
+class Values:
+    """What a tie's function is given: values of a law by name, those that are tied included."""
+
+    def __init__(self, law: Law, ties: Ties):
+        self.law, self.functions = law, dict(ties)
+        self.places = tied_places(law, ties)
+        self.waiting: list[str] = []  # ties that have begun, each needed by the one before
+        self.known: dict[str, Any] = {}
+
+    def __getitem__(self, name: str) -> Any:
+        """The value of an entry, or of a whole field in its shape."""
+        field, entry = entry_of(name)
+        value = _value(self.law, name)
+        at, flat = places("ties", name, value.shape), value.ravel()
+        for other, tied in self.places.items():
+            if entry_of(other)[0] == field and set(at) & set(tied):
+                flat = flat.at[np.array(tied)].set(self._follow(other))
+        return flat.reshape(value.shape) if entry is None else flat[at[0]]
+
+    def _follow(self, name: str) -> Any:
+        """The value of what is tied, by its function."""
+        if name in self.known:
+            return self.known[name]
+        if name in self.waiting:
+            circle = [*self.waiting[self.waiting.index(name) :], name]
+            way = f"{circle[0]} needs {', which needs '.join(circle[1:])}"
+            raise ValueError(f"Argument `ties` must not go in a circle, but {way}.")
+        self.waiting.append(name)
+        old = _value(self.law, name)
+        value = jnp.asarray(self.functions[name](self)).astype(old.dtype)
+        self.waiting.pop()
+        allowed = {(), old.shape if entry_of(name)[1] is None else ()}
+        if value.shape not in allowed:
+            or_shape = f" or shape {old.shape}" if len(allowed) > 1 else ""
+            raise ValueError(
+                f"Argument `ties` must give one number for `{name}`{or_shape}, "
+                f"but its function gives shape {value.shape}."
+            )
+        self.known[name] = value.ravel() if value.ndim else value
+        return self.known[name]
+
+
+def tied(law: AnyLaw, ties: Ties) -> AnyLaw:
+    """The law with the tied entries as their functions say."""
+    values = Values(law, ties)
+    for field in dict.fromkeys(entry_of(name)[0] for name, _ in ties):
+        law = with_parameter(law, field, values[field])
+    return law
+
+
+def checked_ties(law: Law, ties: Mapping[str, Any] | None) -> Ties:
+    """The user's ties, tried at the law's own values."""
+    pairs = tuple((ties or {}).items())
+    owner: dict[tuple[str, int], str] = {}
+    for name, function in pairs:
+        if not callable(function):
+            raise ValueError(
+                f"Argument `ties` must map `{name}` to a function of the other values, as in "
+                f"lambda p: 2 * p['restitution'], but has {function!r}."
+            )
+        for place in places("ties", name, _value(law, name).shape):
+            other = owner.setdefault((entry_of(name)[0], place), name)
+            if other != name:
+                raise ValueError(
+                    f"Argument `ties` must tie an entry once, but {other} and {name} overlap."
+                )
+    start = tied(law, pairs)
+    for name, at in tied_places(law, pairs).items():
+        value = np.asarray(_value(start, name)).ravel()[at]
+        domain = domain_of(start, entry_of(name)[0])
+        if not bool(np.asarray(domain.holds(jnp.asarray(value)))):
+            low, high = domain.bounds
+            raise ValueError(
+                f"Argument `ties` must keep `{name}` in [{low:g}, {high:g}], but its function "
+                f"gives {value.tolist()} at the start."
+            )
+    return pairs
+
+
+def tied_names(law: Law, ties: Ties) -> list[str]:
+    """Names of the tied entries, one by one."""
+    names = []
+    for name, at in tied_places(law, ties).items():
+        field, entry = entry_of(name)
+        shape = _value(law, name).shape
+        if entry is None and shape:
+            members = [np.array([np.unravel_index(i, shape)]) for i in at]
+            names += [_name(field, each, len(at) + 1) for each in members]
+        else:
+            names.append(name)
+    return names
+
+
+def tied_places(law: Law, ties: Ties) -> dict[str, list[int]]:
+    """Where in their flattened fields the tied entries are, by name."""
+    return {name: places("ties", name, _value(law, name).shape) for name, _ in ties}
+
+
+def _value(law: Law, name: str) -> Any:
+    """The field of a name, a parameter that is an array."""
+    known = free_parameters_of(law)
+    field, _ = entry_of(name)
+    if field not in known:
         raise ValueError(
-            f"Argument `bounds` must map `{field}` to (low, high), each a number or of shape "
-            f"{shape}, but has {pair!r}."
-        ) from None
-    domain = parameters_of(law)[field].domain
-    smallest, largest = domain.bounds
-    if not (low < high).all():
-        raise ValueError(f"Argument `bounds` must have low < high for `{field}`, but has {pair!r}.")
-    if (low < smallest).any() or (high > largest).any():
-        raise ValueError(
-            f"Argument `bounds` must lie in [{smallest:g}, {largest:g}] for `{field}`, "
-            f"but has {pair!r}."
+            f"Argument `ties` must use parameters of {type(law).__name__}, one of "
+            f"{', '.join(known)}, but uses {name!r}."
         )
-    if domain.log and (low <= 0).any():
-        raise ValueError(f"Argument `bounds` must be > 0 for `{field}`, but has {pair!r}.")
+    return jnp.asarray(known[field].value)
+
+
+# ---------------------------------------------------------------------------- parts of a scene
+
+
+@forwards_to_law
+class LawInScene(Law):
+    """A law, and the parts of the scene that are fitted with it; None: as the scene has them.
+
+    A tilt by a turns the contact: `N cos(a) + H sin(a)`, `H cos(a) - N sin(a)`.
+    """
+
+    law: Law
+    mass: OptionalValues = parameter(low=0.0, open_low=True, per_contact=False, default=None)
+    gaps: OptionalValues = parameter(low=0.0, default=None)
+    tilt: OptionalValues = parameter(low=-np.pi, high=np.pi, default=None)
+
+    def impulses(self, contact: Contact) -> Impulses:
+        """Those of the law, in a contact of a scene with these parts."""
+        return self.law.impulses(contact)
+
+    def in_scene(self, scene: Scene) -> Scene:
+        """The scene with these parts."""
+        if self.mass is not None:
+            scene = eqx.tree_at(lambda s: s.mass, scene, self.mass)
+        if self.gaps is not None:
+            scene = with_gaps(scene, self.gaps)
+        if self.tilt is None:
+            return scene
+        normals, tangents = scene.normals, scene.tangents
+        assert tangents is not None
+        cos, sin = jnp.cos(self.tilt)[None, :], jnp.sin(self.tilt)[None, :]
+        turned = (normals * cos + tangents * sin, tangents * cos - normals * sin)
+        return eqx.tree_at(lambda s: (s._normals, s.tangents), scene, turned)
+
+
+def placed(law: Law, scenes: Scene) -> tuple[Law, Scene]:
+    """The law itself, and the stacked scenes with the parts that are fitted with it."""
+    if not isinstance(law, LawInScene):
+        return law, scenes
+    return law.law, jax.vmap(law.in_scene)(scenes)
+
+
+def plain_law(law: Any) -> Any:
+    """The law without parts of a scene."""
+    return law.law if isinstance(law, LawInScene) else law
+
+
+def with_parts_of_scene(law: Law, scene: Scene | None, own_scenes: bool, free: Any) -> Law:
+    """The law with the parts of the scene that `free` names; `own_scenes`: each shot has its own.
+
+    Raises:
+        ValueError: parts that the scene does not have, or that the shots do not share.
+    """
+    wanted = {entry_of(name)[0] for name in _as_names(free)} & set(OF_A_SCENE)
+    parts = [name for name in OF_A_SCENE if name in wanted - set(free_parameters_of(law))]
+    if not parts or isinstance(law, LawInScene):
+        return law
+    if scene is None or own_scenes:
+        raise ValueError(
+            f"Argument `free` may name `{parts[0]}` only where all shots have one `scene`, but "
+            "they have scenes of their own."
+        )
+    if isinstance(law, RestitutionMatrix):
+        raise ValueError(
+            f"Argument `free` must not name `{parts[0]}` with a RestitutionMatrix, which is "
+            "admissible in one scene only."
+        )
+    planar = scene.tangents is not None and scene.tangents.shape == scene.normals.shape
+    known = {
+        "mass": (scene.mass.ndim == 1, scene.mass, "that of `scene` is (n,)"),
+        "gaps": (scene.gaps is not None, scene.gaps, "`scene` has gaps"),
+        "tilt": (
+            planar,
+            jnp.zeros(scene.contacts, scene.mass.dtype),
+            "`scene` has one tangent for each contact",
+        ),
+    }
+    for name in parts:
+        has, _, where = known[name]
+        if not has:
+            raise ValueError(f"Argument `free` may name `{name}` only where {where}.")
+    return LawInScene(law, **{name: known[name][1] for name in parts})
+
+
+def limits_with_scene(
+    parameters: Parameters, law: Law, limits: Limits, priors: tuple[Prior, ...]
+) -> Limits:
+    """Limits of all parameters, those of the scene no farther away than their priors allow.
+
+    Raises:
+        ValueError: a part of the scene without a prior, or far from it at the start.
+    """
+    known = {prior.parameter: prior for prior in priors}
+    low, high = (end.copy() for end in limits)
+    start = entries(law, parameters.fields)[parameters.first]
+    for i, (name, field) in enumerate(zip(parameters.names, parameters.of_fields)):
+        if field not in OF_A_SCENE:
+            continue
+        if i not in known:
+            raise ValueError(
+                f"Argument `priors` must have (mean, standard deviation) for `{name}`, a part of "
+                "the scene that is fitted with the law."
+            )
+        _, mean, std = known[i]
+        low[i], high[i] = max(low[i], mean - REACH * std), min(high[i], mean + REACH * std)
+        if not low[i] <= start[i] <= high[i]:
+            raise ValueError(
+                f"Argument `priors` must have a mean for `{name}` within {REACH:g} standard "
+                f"deviations of its value in the scene, {start[i]:g}, but has {mean:g} ± {std:g}."
+            )
     return low, high

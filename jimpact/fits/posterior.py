@@ -13,8 +13,7 @@ from jimpact._checks import as_whole, needed
 from jimpact.compiling import known_options
 from jimpact.fits.fitting import Fit
 from jimpact.fits.problem import FitProblem
-from jimpact.fits.result import check_squares
-from jimpact.fits.solve import BoxRegion
+from jimpact.fits.uncertainty import check_squares
 from jimpact.montecarlo.distributions import Normal, Uniform
 
 HOW = 'pip install "jimpact[bayes]"'
@@ -82,8 +81,7 @@ def posterior(
         as_whole(name, count, 1)
     each = _priors(problem, dict(priors or {}), numpyro.distributions)
 
-    region = problem.residuals.region
-    inner = None if isinstance(region, BoxRegion) else _Inner(problem, region)
+    inner = None if problem.matrix is None else _Inner(problem, problem.matrix)
 
     def model() -> None:
         """The model that numpyro samples."""
@@ -159,8 +157,7 @@ class _Inner:
         reach = self.reach(z / r)
         move = reach * jnp.tanh(r / reach)
         y = self.region.center.at[: self.count].add(move * z / r)
-        residuals, first = self.problem.residuals, np.asarray(self.problem.parameters.first)
-        x = y[: self.count] * residuals.scale[first]
+        x = y[: self.count] * self.problem.scale[: self.count]
         # of dmove/dr = 1 / cosh^2, in a form that does not overflow
         slope = -2 * (jnp.logaddexp(r / reach, -r / reach) - jnp.log(2.0))
         return x, slope + (self.count - 1) * jnp.log(move / r)
@@ -186,13 +183,12 @@ def _priors(problem: FitProblem, chosen_priors: dict[str, Any], kinds: Any) -> d
     """A distribution of numpyro a parameter: chosen, or of the fit, or flat."""
     parameters, priors = problem.parameters, {}
     own = {i: Normal(mean, std) for i, mean, std in problem.priors}
-    for i, name in enumerate(problem.names):
-        field = parameters.field_of(i)
+    for i, (name, field) in enumerate(zip(problem.names, parameters.of_fields)):
         chosen = chosen_priors.get(name, chosen_priors.get(field, own.get(i)))
-        log = bool(parameters.log[parameters.first[i]])
+        log = bool(parameters.log[i])
         low, high = (float(end) for end in problem.domains[i])
         priors[name] = _prior(name, chosen, low, high, log, kinds)
-    known = {*problem.names, *(parameters.field_of(i) for i in range(len(problem.names)))}
+    known = {*problem.names, *parameters.of_fields}
     for name in chosen_priors:
         if name not in known:
             raise ValueError(

@@ -1,13 +1,15 @@
 """The least-squares problem of a fit: what is observed of a law, against what was measured.
 
-Shots, a motion and a user's own function are three observables. Solvers see `Residuals`: arrays
-alone, in scaled parameters, several problems side by side in the lanes of one program; people see
-`FitProblem`: the same in the parameters themselves, with their names.
+Shots, a motion and a user's own function are three observables. A point is x, the values of the P
+parameters, or y (Q,), the same in the solver's scale: of the Q entries of the fitted fields the
+first P count, so that a compiled program does not depend on which entries are free.
 """
 
+import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -17,33 +19,34 @@ import numpy as np
 
 from jimpact._checks import as_float_array, check_concrete, check_kind, check_values
 from jimpact.compiling import full_precision, quick_jit
+from jimpact.contact import contact_of
 from jimpact.files.study_file import OF_A_SCENE
-from jimpact.fits.experiments import Experiments, kept_by_corrections
-from jimpact.fits.matrix_fit import matrix_region
+from jimpact.fits.data import Experiments, kept_by_corrections
+from jimpact.fits.matrices import AdmissibleMatrices, matrix_region
 from jimpact.fits.parameters import (
     DEFAULT_FREE,
+    LawInScene,
     Parameters,
     Prior,
+    Ties,
     bounds_of,
+    checked_ties,
     entries,
+    entry_of,
     free_parameters,
-    priors_of,
-    with_entries,
-)
-from jimpact.fits.scene_parameters import (
-    REACH,
-    LawInScene,
+    limits_with_scene,
     placed,
     plain_law,
+    priors_of,
+    tied,
+    with_entries,
     with_parts_of_scene,
 )
-from jimpact.fits.solve import EXACT, BoxRegion, Region
-from jimpact.fits.ties import Ties, checked_ties, entry_of, tied
-from jimpact.fits.tolerances import tolerated
+from jimpact.fits.solve import EXACT, BoxRegion, Evaluated
 from jimpact.impacts import impact
-from jimpact.law import Law
+from jimpact.law import AnyLaw, Law
 from jimpact.scene import Scene, dense_mass, stackable
-from jimpact.status import CODE
+from jimpact.status import CODE, sign_tolerance
 
 # Outcomes whose velocities are meaningless. A trial with one of them gets a residual far above any
 # honest one, so that a solver turns back; inadmissible or energetic outcomes are only reported.
@@ -56,6 +59,14 @@ FEWEST, FEW = 4, 64
 # Problems that a program solves side by side: starts of one, and many problems. With ten times
 # more of them, all wait for the one whose impacts take longest.
 LANES, LANES_OF_MANY = 4, 64
+
+# Error of computed gap velocities, as a part of their noise. Ten times more: as large as the noise
+# itself, and the same in all shots.
+PART_OF_NOISE = 0.1
+# Tolerance for such data: one, since each compiles a program. Standard errors move by .1 %; at one
+# ten times more derivatives lose another digit.
+COARSE_RTOL = 1e-4
+_CONTACT = jax.jit(contact_of)  # remembers the shapes that it has seen; only these are asked for
 
 
 class Prediction(NamedTuple):
@@ -77,14 +88,9 @@ class Shots(eqx.Module):
         """Velocities after every shot, and the status of its impact."""
         law, scenes = placed(law, self.scenes)
         out = jax.vmap(impact, in_axes=(None, 0, 0))(law, scenes, self.pre)
-        bad = meaningless(out.status)
+        unusable = jnp.asarray([CODE[name] for name in UNUSABLE], out.status.dtype)
+        bad = jnp.any(out.status[:, None] == unusable[None, :], axis=1)
         return Prediction(out.velocity[:, : self.bodies], bad[:, None], out.status)
-
-
-def meaningless(status: jax.Array) -> jax.Array:
-    """Whether velocities with these codes (K,) are meaningless."""
-    codes = jnp.asarray([CODE[name] for name in UNUSABLE], status.dtype)
-    return jnp.any(status[:, None] == codes[None, :], axis=1)
 
 
 class Observed(eqx.Module):
@@ -102,121 +108,18 @@ class Observed(eqx.Module):
         return Prediction(value, ~jnp.isfinite(value), jnp.zeros(1, jnp.int32))
 
 
-Observable = Callable[[Law], Prediction]
+_ARRAYS = (
+    *("law", "observe", "owner", "fixed", "scale", "log", "low", "high", "matrix", "measured"),
+    *("weight", "unit", "size", "prior_mean", "prior_weight", "mixing"),
+)
+_STATIC = ("fields", "ties")
+_ON_HOST: dict[str, Any] = dict.fromkeys(
+    ("parameters", "domains", "sigma", "values", "priors", "notes", "experiments", "scene")
+)
+_ON_HOST["left_out"] = None
 
 
-class Residuals(eqx.Module):
-    """Law, observable and region of a fit: a pytree that compiled functions take as argument.
-
-    Solvers work on y (Q,), of which the first P count, the rest is 0. The entries of the law's
-    fields in scaled form are `offset + mix y`; an entry is `scale` times that, or its exponential
-    where `log` is set. Entries that are tied follow from these. A prior weighs the value of the
-    entry that stands for its parameter.
-    """
-
-    law: Law
-    mix: jax.Array
-    offset: jax.Array
-    scale: jax.Array
-    log: jax.Array
-    low: jax.Array  # bounds of y
-    high: jax.Array
-    region: Region  # where y may lie: the box, or a part of it
-    observe: Observable
-    measured: jax.Array  # 0 where not measured
-    weight: jax.Array  # 0 where not measured; makes |r|^2 a mean square relative to `unit`
-    size: jax.Array  # () size r is (prediction - measured) / sigma, with sigma = 1 where unknown
-    unit: jax.Array  # () the largest measured value
-    prior_mean: jax.Array  # (Q,) of entries
-    prior_weight: jax.Array  # (Q,) 1 / standard deviation, 0 where there is no prior
-    fields: tuple[str, ...] = eqx.field(static=True)
-    mixing: jax.Array | None = None  # (K, n, n): makes correlated errors of a shot independent
-    ties: Ties = eqx.field(static=True, default=())
-
-    @full_precision
-    def entries_at(self, y: jax.Array) -> jax.Array:
-        """The entries (Q,) of scaled parameters y, before those that are tied follow."""
-        scaled = self.offset + self.mix @ y
-        exponential = jnp.exp(jnp.where(self.log, scaled, 0.0))
-        return jnp.where(self.log, exponential, scaled * self.scale)
-
-    def law_of(self, values: Any) -> Law:
-        """The law of entries (Q,)."""
-        return tied(with_entries(self.law, self.fields, values), self.ties)
-
-    def law_at(self, y: jax.Array) -> Law:
-        """The law of scaled parameters y."""
-        return self.law_of(self.entries_at(y))
-
-    def prior_residual(self, y: jax.Array) -> jax.Array:
-        """Weighted distances (Q,) from the priors."""
-        return (self.entries_at(y) - self.prior_mean) * self.prior_weight / self.size
-
-    def residual(self, y: jax.Array) -> tuple[jax.Array, Prediction]:
-        """Weighted residual (R,) of what was measured, and what the law makes visible."""
-        prediction = self.observe(self.law_at(y))
-        bad = jnp.broadcast_to(prediction.bad, self.measured.shape)
-        harmless = jnp.where(bad, self.measured, prediction.value)
-        error = jnp.where(bad, PENALTY * self.unit, harmless - self.measured)
-        error = jnp.where(self.weight > 0, error, 0.0)  # its derivatives may be NaN
-        return self.mixed(error * self.weight).reshape(-1), prediction
-
-    @full_precision
-    def mixed(self, weighted: Any) -> Any:
-        """Weighted errors, shaped like what was measured, as independent ones."""
-        if self.mixing is None:
-            return weighted
-        return (self.mixing @ weighted[..., None])[..., 0]
-
-    def evaluate(self, y: jax.Array) -> tuple[jax.Array, jax.Array, Any]:
-        """Weighted residual (R + Q,), its Jacobian (R + Q, Q), and (predicted values, status).
-
-        The last Q are those of the priors. Where errors of v- are passed on, `dv+/dv-` (K, n, n)
-        of the shots comes last: one program compiles an impact once.
-        """
-        count, passed = y.shape[0], 0 if self.mixing is None else self.mixing.shape[-1]
-
-        def outcome(y_and_shift: jax.Array) -> tuple[tuple[jax.Array, jax.Array], Any]:
-            """Residual and prediction of y and a change of v-, and all not differentiated."""
-            y, shift = y_and_shift[:count], y_and_shift[count:]
-            data, prediction = (self.shifted(shift) if passed else self).residual(y)
-            residual = jnp.concatenate([data, self.prior_residual(y)])
-            out = residual, prediction.value
-            return out, (*out, prediction.status)
-
-        both = jnp.concatenate([y, jnp.zeros(passed, y.dtype)])
-        (jacobian, slopes), (residual, *aux) = jax.jacfwd(outcome, has_aux=True)(both)
-        if passed:
-            aux.append(slopes[..., count:])
-        return residual, jacobian[:, :count], tuple(aux)
-
-    def blank(self, y: np.ndarray) -> tuple[Any, Any, Any]:
-        """Zeros shaped like what `evaluate` gives of S such problems at y (S, Q), on the host."""
-        (count, q), shape, dtype = y.shape, self.measured.shape[1:], y.dtype
-        size = math.prod(shape) + q
-        statuses = shape[0] if isinstance(self.observe, Shots) else 1
-        aux: Any = (np.zeros((count, *shape), dtype), np.zeros((count, statuses), np.int32))
-        if self.mixing is not None:
-            aux += (np.zeros(np.shape(self.mixing), dtype),)
-        return np.zeros((count, size), dtype), np.zeros((count, size, q), dtype), aux
-
-    def lanes(self, count: int) -> int:
-        """How many of `count` such problems are solved side by side.
-
-        Fits of few shots, or of few values in a row, share the program for all; motions take too
-        long for that.
-        """
-        listed = isinstance(self.observe, Shots) or self.measured.ndim == 2
-        if listed and self.measured.shape[1] <= FEW:
-            return LANES if count <= LANES_OF_MANY else LANES_OF_MANY
-        return LANES if count > 1 else 1
-
-    def shifted(self, shift: jax.Array) -> "Residuals":
-        """With this change (n,) of the velocities before all shots."""
-        pre = self.observe.pre  # type: ignore[attr-defined]
-        return eqx.tree_at(lambda r: r.observe.pre, self, pre.at[:, : shift.shape[0]].add(shift))
-
-
+@partial(jax.tree_util.register_dataclass, data_fields=_ARRAYS, meta_fields=(*_STATIC, *_ON_HOST))
 @dataclass(frozen=True, eq=False)
 class FitProblem:
     """The least-squares problem behind a fit, in the parameters x (P,) themselves.
@@ -236,7 +139,7 @@ class FitProblem:
     Make one with `from_shots` or `from_observable`. It holds what was `measured` (NaN where no
     value was), `sigma`, `experiments` and `scene` or None, how many independent `values`
     were measured or are priors; in words, `notes` on what was fixed instead of fitted, and shots
-    `left_out`; and for the solvers `residuals` and `parameters`.
+    `left_out`.
 
     >>> import jimpact as ji
     >>> data = ji.Experiments(pre=[[1.0, 0.0], [2.0, 0.0]], post=[[0.3, 0.7], [0.6, 1.4]])
@@ -247,17 +150,37 @@ class FitProblem:
     [-0.25, 0.25, -0.5, 0.5]
     """
 
-    residuals: Residuals
+    law: Law  # with its start values, and with the parts of the scene that are fitted
+    observe: Callable[[Law], Prediction]
+    owner: Any  # (Q,) the parameter that each entry of the fields has, -1 where it is fixed
+    fixed: Any  # (Q,) the entries at the start
+    # (Q,) of the parameters: the size of a change of order 1; whether they are fitted in their
+    # logarithm; bounds of y
+    scale: Any
+    log: Any
+    low: Any
+    high: Any
+    matrix: AdmissibleMatrices | None  # the part of these bounds in which a matrix is admissible
+    measured: Any  # NaN where not
+    weight: Any  # 1 / sigma, 0 where no value was measured
+    unit: Any  # () the largest measured value
+    size: Any  # () the norm of the weights times `unit`: residuals over it are of order 1
+    prior_mean: Any  # (Q,) of the parameters
+    prior_weight: Any  # (Q,) 1 / standard deviation, 0 where there is no prior
+    fields: tuple[str, ...]
+    ties: Ties
     parameters: Parameters
-    notes: tuple[str, ...]  # what was fixed instead of fitted
     domains: np.ndarray
-    measured: np.ndarray  # NaN where not
     sigma: np.ndarray | None
-    values: int  # independent measured values, and priors
+    values: int
+    priors: tuple[Prior, ...]
+    notes: tuple[str, ...]
     experiments: Experiments | None = None
     scene: Scene | None = None
-    left_out: tuple[str, ...] = ()  # which shots, in words
-    priors: tuple[Prior, ...] = ()
+    left_out: tuple[str, ...] = ()
+    mixing: Any = None  # (K, n, n): makes correlated errors of a shot independent
+
+    # ------------------------------------------------------------------ how problems are made
 
     @classmethod
     def from_shots(
@@ -282,43 +205,7 @@ class FitProblem:
             ties: as in `fit`.
         """
         problem = of_shots(law, scene, experiments, free, bounds, priors, ties)
-        return problem.passing_errors_at(problem.point(problem.start))
-
-    def with_errors_before(self, slopes: np.ndarray | None) -> "FitProblem":
-        """With the errors of v-, if there are any, passed on to v+ by slopes.
-
-        Args:
-            slopes: `dv+/dv-` of the shots (K or more, n, n); None: nothing changes.
-        """
-        data, r = self.experiments, self.residuals
-        if slopes is None or data is None or data.sigma_pre is None:
-            return self
-        count, n = self.measured.shape
-        slope = np.asarray(slopes[:count], float)
-        slope = np.where(np.isfinite(slope).all(axis=(1, 2), keepdims=True), slope, np.eye(n))
-        for k, kept in enumerate(kept_by_corrections(data, self.scene)):
-            if kept is not None:  # a residual that conserves momentum shows that part of the errors
-                slope[k] = kept @ slope[k]
-        here = ~np.isnan(self.measured)
-        before = slope * np.asarray(data.sigma_pre, float)[:, None, :]
-        variance = np.where(here, np.asarray(data.sigma, float), 1.0) ** 2
-        both = np.where(here[:, :, None] & here[:, None, :], before @ before.swapaxes(1, 2), 0.0)
-        covariance = both + variance[:, :, None] * np.eye(n)
-        sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-        factor = np.linalg.cholesky(covariance / (sigma[:, :, None] * sigma[:, None, :]))
-        # factors that a weight already has (shots left out) stay
-        old = np.where(here, np.asarray(self.sigma, float), 1.0)
-        weight = self.weight * old / sigma
-        size = float(r.unit) * np.linalg.norm(weight)
-        mixing = jnp.asarray(np.linalg.inv(factor), r.weight.dtype)
-        arrays = (jnp.asarray(weight / size, r.weight.dtype), jnp.asarray(size, r.size.dtype))
-        residuals = eqx.tree_at(
-            lambda r: (r.weight, r.size, r.mixing),
-            r,
-            (*arrays, mixing),
-            is_leaf=lambda x: x is None,
-        )
-        return replace(self, residuals=residuals, sigma=np.where(here, sigma, np.nan))
+        return problem.passing_errors_at(problem.start)
 
     @classmethod
     def from_observable(
@@ -367,14 +254,11 @@ class FitProblem:
             sigma = np.where(np.isnan(post), 1.0, np.asarray(as_float_array("sigma", sigma)))
             check_values("sigma", sigma, low=0.0, open_low=True)
         # a stiffness that the user names is one that the function sees
-        absolute = free is not DEFAULT_FREE
         own = isinstance(observe, eqx.Module)
-        observable = observe if own else Observed(observe, absolute)
-        unit = np.nanmax(np.abs(post)) or 1.0
-        dtype = _dtype(law, observable, post)
+        observable = observe if own else Observed(observe, free is not DEFAULT_FREE)
         errors = np.ones(()) if sigma is None else sigma
-        choice = _choice(law, observable, free, bounds, priors, ties)
-        problem = _build(choice, observable, post, sigma, errors, dtype, unit, 1.0, [])
+        choice = (free, bounds, priors, ties)
+        problem = _build(law, observable, post, sigma, errors, np.nanmax(np.abs(post)), choice)
         shape = eqx.filter_eval_shape(observable, law).value.shape
         if shape != post.shape:
             raise ValueError(
@@ -383,25 +267,82 @@ class FitProblem:
             )
         return problem
 
-    @property
-    def law(self) -> Law:
-        """The law with its start values, and with the parts of the scene that are fitted."""
-        return self.residuals.law
+    def weighed(self, factor: np.ndarray) -> "FitProblem":
+        """With factors on the independent errors.
 
-    @property
-    def value_name(self) -> str:
-        """What one of the measured values is."""
-        return "value" if self.experiments is None else "velocity"
+        Args:
+            factor: shaped like `measured`; 0 leaves a value out.
+        """
+        used, mixing, weight = factor > 0, self.mixing, self.weight * factor
+        if mixing is not None:  # which comes before the factors
+            weight = self.weight * used
+            mixing = np.where(used, factor, 1.0)[..., None] * mixing
+        measured = np.where(used, self.measured, np.nan)
+        lost = int(np.isnan(measured).sum() - np.isnan(self.measured).sum())
+        if self.experiments is not None:  # whole shots are left out, with what a correction took
+            gone = np.isnan(measured).all(axis=1) & ~np.isnan(self.measured).all(axis=1)
+            lost -= int(np.array(self.experiments.lost)[gone].sum())
+        values = self.values - lost
+        return replace(self, **self._weights(weight, mixing), measured=measured, values=values)
 
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """Of the shots, or of the rows of what was measured."""
-        if self.experiments is not None:
-            return self.experiments.shots
-        rows = self.measured.shape[0] if self.measured.ndim else 1
-        return getattr(self.residuals.observe, "labels", None) or tuple(
-            str(k + 1) for k in range(rows)
-        )
+    def _weights(self, weight: np.ndarray, mixing: Any) -> dict[str, Any]:
+        """The fields that follow from weights and mixing."""
+        size = float(self.unit) * np.linalg.norm(weight)
+        arrays = {"weight": weight, "size": np.asarray(size), "mixing": mixing}
+        return _in(self.low.dtype, arrays)
+
+    def with_errors_before(self, slopes: np.ndarray | None) -> "FitProblem":
+        """With the errors of v-, if there are any, passed on to v+ by slopes.
+
+        Args:
+            slopes: `dv+/dv-` of the shots (K or more, n, n); None: nothing changes.
+        """
+        data = self.experiments
+        if slopes is None or data is None or data.sigma_pre is None:
+            return self
+        count, n = self.measured.shape
+        slope = np.asarray(slopes[:count], float)
+        slope = np.where(np.isfinite(slope).all(axis=(1, 2), keepdims=True), slope, np.eye(n))
+        for k, kept in enumerate(kept_by_corrections(data, self.scene)):
+            if kept is not None:  # a residual that conserves momentum shows that part of the errors
+                slope[k] = kept @ slope[k]
+        here = ~np.isnan(self.measured)
+        before = slope * np.asarray(data.sigma_pre, float)[:, None, :]
+        variance = np.where(here, np.asarray(data.sigma, float), 1.0) ** 2
+        both = np.where(here[:, :, None] & here[:, None, :], before @ before.swapaxes(1, 2), 0.0)
+        covariance = both + variance[:, :, None] * np.eye(n)
+        sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+        factor = np.linalg.cholesky(covariance / (sigma[:, :, None] * sigma[:, None, :]))
+        # factors that a weight already has (shots left out) stay
+        old = np.where(here, np.asarray(self.sigma, float), 1.0)
+        weights = self._weights(self.weight * old / sigma, np.linalg.inv(factor))
+        return replace(self, **weights, sigma=np.where(here, sigma, np.nan))
+
+    def passing_errors_at(self, x: Any) -> "FitProblem":
+        """With errors of v-, if there are any, passed on as the law of x (P,) does."""
+        if self.mixing is None:
+            return self
+        shots: Any = self.program().observe
+        law = _in(self.low.dtype, self.law_in_scene(x))
+        slopes = np.asarray(_slopes_before(law, shots), float)
+        return self.with_errors_before(slopes[:, : shots.bodies, : shots.bodies])
+
+    def program(self) -> "FitProblem":
+        """As compiled functions take it: without what differs between fits of one program.
+
+        Shots are filled up with copies of the last one, of no weight.
+        """
+        bare = replace(self, **_ON_HOST)
+        if not isinstance(self.observe, Shots):
+            return bare
+        count = len(self.measured)
+        last = np.minimum(np.arange(filled_count(count)), count - 1)
+        parts = (self.observe, self.measured, self.weight, self.mixing)
+        observe, measured, weight, mixing = jax.tree.map(lambda x: np.asarray(x)[last], parts)
+        weight[count:] = 0.0
+        return replace(bare, observe=observe, measured=measured, weight=weight, mixing=mixing)
+
+    # ------------------------------------------------------------------ functions of x
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -411,7 +352,14 @@ class FitProblem:
     @property
     def start(self) -> np.ndarray:
         """x of the law itself."""
-        return entries(self.law, self.parameters.fields)[self.parameters.first]
+        return entries(self.law, self.fields)[self.parameters.first]
+
+    @full_precision
+    def law_in_scene(self, x: Any) -> Law:
+        """The law with parameters x (P,), and with the parts of the scene that are fitted."""
+        x = jnp.asarray(x, self.fixed.dtype)
+        values = jnp.where(self.owner >= 0, x[self.owner], self.fixed)
+        return tied(with_entries(self.law, self.fields, values), self.ties)
 
     def to_law(self, x: Any) -> Law:
         """The law with parameters x (P,)."""
@@ -424,30 +372,24 @@ class FitProblem:
             return self.scene
         return law.in_scene(self.scene)
 
-    def law_in_scene(self, x: Any) -> Law:
-        """The law with parameters x (P,), and with the parts of the scene that are fitted."""
-        return self.residuals.law_at(self._scaled(x))
-
     def residual(self, x: Any) -> jax.Array:
         """(R,) `(observed - measured) / sigma` at x (P,), then those of the priors.
 
         Where the law fails, a large number.
         """
-        return jnp.concatenate([self._of_data(x), self._of_priors(x)])
+        x = jnp.asarray(x, self.low.dtype)
+        which = np.array([prior.parameter for prior in self.priors], int)
+        of_priors = (x[which] - self.prior_mean[which]) * self.prior_weight[which]
+        return jnp.concatenate([self._of_data(x), of_priors])
 
     def _of_data(self, x: Any) -> jax.Array:
         """The residual of what was measured."""
-        residual, _ = self.residuals.residual(self._scaled(x))
-        return self.residuals.size * residual[np.flatnonzero(~np.isnan(self.measured))]
-
-    def _of_priors(self, x: Any) -> jax.Array:
-        """The residual of the priors."""
-        first = np.array([self.parameters.first[p.parameter] for p in self.priors], int)
-        return self.residuals.size * self.residuals.prior_residual(self._scaled(x))[first]
+        residual, _ = self._errors(self.law_in_scene(x))
+        return residual[np.flatnonzero(~np.isnan(self.measured))]
 
     def jacobian(self, x: Any) -> jax.Array:
         """(R, P) derivatives of `residual` at x (P,), by forward mode."""
-        return jax.jacfwd(self.residual)(jnp.asarray(x, self.residuals.offset.dtype))
+        return jax.jacfwd(self.residual)(jnp.asarray(x, self.low.dtype))
 
     def project(self, x: Any) -> jax.Array:
         """The allowed parameters (P,) nearest to x (P,): within bounds, as an admissible matrix.
@@ -456,9 +398,11 @@ class FitProblem:
         parameter, and what is fitted in its logarithm is measured in that. For gradient descent
         of your own (docs/gradient_descent.md). Not differentiable.
         """
-        y = self._scaled(jax.lax.stop_gradient(jnp.asarray(x, self.residuals.offset.dtype)))
-        first = np.array(self.parameters.first)
-        return self.residuals.entries_at(self.residuals.region.nearest(y))[first]
+        x = jax.lax.stop_gradient(jnp.asarray(x, self.low.dtype))
+        rest = len(self.low) - len(x)
+        x = jnp.pad(x, (0, rest))
+        y = jnp.where(self.log, jnp.log(jnp.where(self.log, x, 1.0)), x / self.scale)
+        return self._values(self.region.nearest(y))[: len(x) - rest]
 
     def log_density(self, x: Any) -> jax.Array:
         """Logarithm () of the probability density of the data at x (P,), normally distributed.
@@ -471,12 +415,110 @@ class FitProblem:
         squares = jnp.sum(self._of_data(x) ** 2)
         if self.sigma is None:
             return -0.5 * self.values * jnp.log(squares)
-        sigma = np.broadcast_to(self.sigma, self.measured.shape)[~np.isnan(self.measured)]
-        other = np.zeros_like(self.measured)
-        if self.residuals.mixing is not None:
-            other = np.log(np.diagonal(self.residuals.mixing, axis1=1, axis2=2))
-        constant = np.log(sigma * math.sqrt(2 * math.pi)) - other[~np.isnan(self.measured)]
+        here = ~np.isnan(self.measured)
+        sigma, other = np.broadcast_to(self.sigma, here.shape), np.zeros(here.shape)
+        if self.mixing is not None:
+            other = np.log(np.diagonal(self.mixing, axis1=1, axis2=2))
+        constant = np.log(sigma[here] * math.sqrt(2 * math.pi)) - other[here]
         return -0.5 * squares - float(np.sum(constant))
+
+    # ------------------------------------------------------------------ for solvers
+
+    @property
+    def region(self) -> Any:
+        """Where y may lie."""
+        return BoxRegion(self.low, self.high) if self.matrix is None else self.matrix
+
+    @full_precision
+    def _values(self, y: jax.Array) -> jax.Array:
+        """x (Q,) of y (Q,)."""
+        return jnp.where(self.log, jnp.exp(jnp.where(self.log, y, 0.0)), y * self.scale)
+
+    def _errors(self, law: Law) -> tuple[jax.Array, Prediction]:
+        """Residual of what was measured, 0 elsewhere, and what the law makes visible."""
+        prediction = self.observe(law)
+        bad = jnp.broadcast_to(prediction.bad, self.measured.shape)
+        error = jnp.where(bad, 0.0, prediction.value) - jnp.where(bad, 0.0, self.measured)
+        error = jnp.where(bad, PENALTY * self.unit, error)
+        error = jnp.where(self.weight > 0, error, 0.0)  # its derivatives may be NaN
+        return self._mixed(error * self.weight).reshape(-1), prediction
+
+    @full_precision
+    def _mixed(self, weighted: Any) -> Any:
+        """Weighted errors, shaped like what was measured, as independent ones."""
+        if self.mixing is None:
+            return weighted
+        return (self.mixing @ weighted[..., None])[..., 0]
+
+    def evaluate(self, y: jax.Array) -> Evaluated:
+        """Residual (R + Q,) over `size`, its Jacobian (R + Q, Q), (predicted values, status).
+
+        The last Q are those of the priors. Where errors of v- are passed on, `dv+/dv-` (K, n, n)
+        of the shots comes last: one program compiles an impact once.
+        """
+        count, passed = y.shape[0], 0 if self.mixing is None else self.mixing.shape[-1]
+
+        def outcome(both: jax.Array) -> tuple[tuple[jax.Array, jax.Array], Any]:
+            """Residual and prediction of y and a change of v-, and all not differentiated."""
+            x = self._values(both[:count])
+            moved = self._shifted(both[count:]) if passed else self
+            data, prediction = moved._errors(self.law_in_scene(x))
+            of_priors = (x - self.prior_mean) * self.prior_weight
+            residual = jnp.concatenate([data, of_priors]) / self.size
+            out = residual, prediction.value
+            return out, (*out, prediction.status)
+
+        both = jnp.concatenate([y, jnp.zeros(passed, y.dtype)])
+        (jacobian, slopes), (residual, *aux) = jax.jacfwd(outcome, has_aux=True)(both)
+        if passed:
+            aux.append(slopes[..., count:])
+        return residual, jacobian[:, :count], tuple(aux)
+
+    def blank(self, y: np.ndarray) -> Evaluated:
+        """Zeros shaped like what `evaluate` gives of S such problems at y (S, Q), on the host."""
+        (count, q), shape, dtype = y.shape, self.measured.shape[1:], y.dtype
+        size = math.prod(shape) + q
+        statuses = shape[0] if isinstance(self.observe, Shots) else 1
+        aux: Any = (np.zeros((count, *shape), dtype), np.zeros((count, statuses), np.int32))
+        if self.mixing is not None:
+            aux += (np.zeros(np.shape(self.mixing), dtype),)
+        return np.zeros((count, size), dtype), np.zeros((count, size, q), dtype), aux  # type: ignore[return-value]
+
+    def lanes(self, count: int) -> int:
+        """How many of `count` such problems are solved side by side.
+
+        Fits of few shots, or of few values in a row, share the program for all; motions take too
+        long for that.
+        """
+        listed = isinstance(self.observe, Shots) or self.measured.ndim == 2
+        if listed and self.measured.shape[1] <= FEW:
+            return LANES if count <= LANES_OF_MANY else LANES_OF_MANY
+        return LANES if count > 1 else 1
+
+    def _shifted(self, shift: jax.Array) -> "FitProblem":
+        """With this change (n,) of the velocities before all shots."""
+        observe: Any = self.observe
+        pre = observe.pre.at[:, : shift.shape[0]].add(shift)
+        return replace(self, observe=eqx.tree_at(lambda o: o.pre, observe, pre))
+
+    def point(self, x: np.ndarray) -> np.ndarray:
+        """y (..., Q) of x (..., P), on the host."""
+        p = x.shape[-1]
+        y, log = np.zeros((*x.shape[:-1], len(self.low))), np.asarray(self.log)[:p]
+        y[..., :p] = scaled(x, np.asarray(self.scale, float)[:p], log)
+        return y
+
+    def values_at(self, y: np.ndarray) -> np.ndarray:
+        """x (..., P) of y (..., Q), on the host."""
+        p = len(self.names)
+        y, log = np.asarray(y, float)[..., :p], np.asarray(self.log)[:p]
+        return np.where(log, np.exp(np.where(log, y, 0.0)), y * np.asarray(self.scale, float)[:p])
+
+    def steps_at(self, x: np.ndarray) -> np.ndarray:
+        """(P,) dx/dy: the natural size of a change of each parameter at x."""
+        return np.where(self.parameters.log, x, np.asarray(self.scale, float)[: len(x)])
+
+    # ------------------------------------------------------------------ for judging a fit
 
     @property
     def shot_of_value(self) -> np.ndarray:
@@ -484,21 +526,19 @@ class FitProblem:
         here = ~np.isnan(self.measured)
         return np.nonzero(here)[0] if here.ndim else np.zeros(1, int)
 
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Of the shots, or of the rows of what was measured."""
+        if self.experiments is not None:
+            return self.experiments.shots
+        rows = self.measured.shape[0] if self.measured.ndim else 1
+        return getattr(self.observe, "labels", None) or tuple(str(k + 1) for k in range(rows))
+
     def prior_errors(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Of each prior: its mean less x (P,), and the derivatives of x (., P), over its std."""
         means, stds = (np.array([p[k] for p in self.priors], float) for k in (1, 2))
         which = np.array([p.parameter for p in self.priors], int)
         return (means - x[which]) / stds, np.eye(len(self.names))[which] / stds[:, None]
-
-    @property
-    def ties(self) -> Ties:
-        """What follows from parameters by the user's functions."""
-        return self.residuals.ties
-
-    @property
-    def weight(self) -> np.ndarray:
-        """1 / sigma, shaped like `measured`; 0 where no value was measured."""
-        return np.asarray(self.residuals.weight, float) * self.size
 
     def independent(self, errors: np.ndarray) -> np.ndarray:
         """Errors of what was measured, in units of sigma and as independent ones.
@@ -506,94 +546,34 @@ class FitProblem:
         Args:
             errors: (K, n, ...), shaped like `measured`, in its units.
         """
-        more = (1,) * (errors.ndim - self.measured.ndim)
-        scaled = np.nan_to_num(errors) * self.weight.reshape((*self.measured.shape, *more))
-        mixing = self.residuals.mixing
-        return scaled if mixing is None else np.einsum("kij,kj...->ki...", mixing, scaled)
+        return self._times_mixing(np.nan_to_num(errors) * self._weight_of(errors), self.mixing)
 
     def errors_of(self, independent: np.ndarray) -> np.ndarray:
         """The errors (K, n, ...) that are these as independent ones; NaN where not measured."""
-        more = (1,) * (independent.ndim - self.measured.ndim)
-        weight = self.weight.reshape((*self.measured.shape, *more))
-        if self.residuals.mixing is not None:
-            back = np.linalg.inv(np.asarray(self.residuals.mixing, float))
-            independent = np.einsum("kij,kj...->ki...", back, independent)
-        return np.where(weight > 0, independent / np.where(weight > 0, weight, 1.0), np.nan)
+        weight = self._weight_of(independent)
+        back = None if self.mixing is None else np.linalg.inv(np.asarray(self.mixing, float))
+        errors = self._times_mixing(independent, back)
+        return np.where(weight > 0, errors / np.where(weight > 0, weight, 1.0), np.nan)
 
-    def passing_errors_at(self, y: Any) -> "FitProblem":
-        """With errors of v-, if there are any, passed on as the law of y (Q,) does."""
-        if self.residuals.mixing is None:
-            return self
-        law = self.residuals.law_at(jnp.asarray(y, self.residuals.offset.dtype))
-        return self.with_errors_before(slopes_before(law, filled_up(self.residuals).observe))
+    def _weight_of(self, errors: np.ndarray) -> np.ndarray:
+        """The weights, with as many axes as these errors."""
+        more = (1,) * (errors.ndim - self.measured.ndim)
+        return np.asarray(self.weight, float).reshape((*self.measured.shape, *more))
 
-    def weighed(self, factor: np.ndarray) -> "FitProblem":
-        """With factors on the independent errors.
-
-        Args:
-            factor: shaped like `measured`; 0 leaves a value out.
-        """
-        r, used = self.residuals, factor > 0
-        mixing: Any = r.mixing
-        weight = self.weight * factor
-        if mixing is not None:  # which comes before the factors
-            weight = self.weight * used
-            mixing = np.asarray(np.where(used, factor, 1.0)[..., None] * mixing, r.weight.dtype)
-        size = float(r.unit) * np.linalg.norm(weight)
-        arrays = (np.asarray(weight / size, r.weight.dtype), np.asarray(size, r.size.dtype), mixing)
-        measured = np.where(used, self.measured, np.nan)
-        lost = int(np.isnan(measured).sum() - np.isnan(self.measured).sum())
-        if self.experiments is not None:  # whole shots are left out, with what a correction took
-            gone = np.isnan(measured).all(axis=1) & ~np.isnan(self.measured).all(axis=1)
-            lost -= int(np.array(self.experiments.lost)[gone].sum())
-        residuals = eqx.tree_at(
-            lambda r: (r.weight, r.size, r.mixing), r, arrays, is_leaf=lambda x: x is None
-        )
-        return replace(self, residuals=residuals, measured=measured, values=self.values - lost)
-
-    @property
-    def size(self) -> float:
-        """Weighted residuals of the solvers times this are in units of sigma."""
-        return float(self.residuals.size)
+    @staticmethod
+    def _times_mixing(errors: np.ndarray, mixing: Any) -> np.ndarray:
+        """These errors (K, n, ...) mixed within each shot."""
+        return errors if mixing is None else np.einsum("kij,kj...->ki...", mixing, errors)
 
     @property
     def precision(self) -> str:
         """'float64' or 'float32', in which all is computed."""
-        return str(self.residuals.offset.dtype)
+        return str(self.low.dtype)
 
     @property
     def exact_squares(self) -> float:
         """Sum of squares (in units of sigma) up to which data count as reproduced exactly."""
-        return EXACT[self.precision] * self.size**2
-
-    @property
-    def log(self) -> np.ndarray:
-        """(P,) whether a parameter is fitted in its logarithm."""
-        return np.asarray(self.residuals.log)[self.parameters.first]
-
-    @property
-    def scale(self) -> np.ndarray:
-        """(P,) the size of a change of order 1; 1 where fitted in the logarithm."""
-        return np.asarray(self.residuals.scale, float)[self.parameters.first]
-
-    def point(self, values: np.ndarray) -> np.ndarray:
-        """y (..., Q) of values (..., P), on the host."""
-        y = np.zeros((*values.shape[:-1], len(self.residuals.offset)))
-        y[..., : len(self.names)] = to_scaled(values, self.scale, self.log)
-        return y
-
-    def values_at(self, y: np.ndarray) -> np.ndarray:
-        """Values (..., P) of y (..., Q), on the host."""
-        y = np.asarray(y, float)
-        return from_scaled(y[..., : len(self.names)], self.scale, self.log)
-
-    def _scaled(self, x: Any) -> jax.Array:
-        """y (Q,) of x (P,)."""
-        r, first = self.residuals, np.asarray(self.parameters.first)
-        x = jnp.asarray(x, r.offset.dtype)
-        log = r.log[first]
-        y = jnp.where(log, jnp.log(jnp.where(log, x, 1.0)), x / r.scale[first])
-        return jnp.zeros_like(r.offset).at[: len(first)].set(y)
+        return float(EXACT[self.precision] * self.size**2)
 
 
 def of_shots(
@@ -610,9 +590,8 @@ def of_shots(
     law, of_tolerance = tolerated(law, scene, experiments)
     scenes = experiments.each(scene, lambda s: s)
     same = experiments.scenes is None
-    fixed, law = law, with_parts_of_scene(law, scene, not same, free)
+    law = with_parts_of_scene(law, scene, not same, free)
     alike, extra = stackable(scenes[:1] if same else scenes)
-    dtype = _dtype(law, alike, experiments.pre)
     pre, post = np.asarray(experiments.pre), np.asarray(experiments.post)
     unit = max(np.abs(pre).max(), np.nanmax(np.abs(post))) or 1.0
     count, n = pre.shape
@@ -622,200 +601,108 @@ def of_shots(
         lambda *x: np.repeat(np.stack(x), count, axis=0) if same else np.stack(x), *alike
     )
     filled = np.pad(pre, ((0, 0), (0, extra)), constant_values=unit)
-    observe = Shots(_in(dtype, stacked), np.asarray(filled, dtype), n)  # type: ignore[arg-type]
+    observe = Shots(stacked, filled, n)  # type: ignore[arg-type]
     sigma = None if experiments.sigma is None else np.asarray(experiments.sigma)
     errors = experiments.natural_errors(scene) if sigma is None else sigma
-    choice = _choice(law, observe, free, *known)
-    if law is not fixed:
-        choice = choice._replace(limits=_limits_of_scene(choice))
-    problem = _build(choice, observe, post, sigma, errors, dtype, unit, energy, alike)
-    values = problem.values - experiments.lost_freedom
-    notes = (*problem.notes, *of_tolerance)
-    problem = replace(problem, notes=notes, values=values, experiments=experiments, scene=scene)
+    choice = (free, *known)
+    problem = _build(law, observe, post, sigma, errors, unit, choice, energy, alike)
+    problem = replace(
+        problem,
+        notes=(*problem.notes, *of_tolerance),
+        values=problem.values - experiments.lost_freedom,
+        experiments=experiments,
+        scene=scene,
+    )
     return problem.with_errors_before(np.tile(np.eye(n), (count, 1, 1)))
 
 
-def _dtype(*trees: Any) -> np.dtype:
-    """The type of all floating numbers in these trees."""
-    leaves = [x for x in jax.tree.leaves(trees) if eqx.is_inexact_array(x)]
-    return np.result_type(*(x.dtype for x in leaves))
-
-
-def _in(dtype: np.dtype, tree: Any) -> Any:
+def _in(dtype: Any, tree: Any) -> Any:
     """The tree with all numbers of this type, in arrays on the host."""
     return jax.tree.map(lambda x: np.asarray(x, dtype) if eqx.is_inexact_array(x) else x, tree)
 
 
-class _Choice(NamedTuple):
-    """What is fitted of a law: parameters, their limits and priors, and what follows from them."""
-
-    law: Law  # with the values at the start
-    parameters: Parameters
-    notes: list[str]
-    limits: tuple[np.ndarray, np.ndarray]
-    priors: tuple[Prior, ...]
-    ties: Ties
-
-
-def _choice(
-    law: Law,
-    observe: Observable,
-    free: Any,
-    bounds: Mapping[str, Any] | None = None,
-    priors: Mapping[str, Any] | None = None,
-    ties: Mapping[str, Any] | None = None,
-) -> _Choice:
-    """The user's choices, checked."""
-    functions = checked_ties(law, ties)
-    law = tied(law, functions)
-    absolute = getattr(observe, "absolute", False)
-    parameters, notes = free_parameters(law, free, absolute, functions)
-    limits = bounds_of(parameters, law, bounds)
-    return _Choice(law, parameters, notes, limits, priors_of(parameters, limits, priors), functions)
-
-
-def _limits_of_scene(choice: _Choice) -> tuple[np.ndarray, np.ndarray]:
-    """Limits of all parameters, those of the scene no farther away than their priors allow.
-
-    Raises:
-        ValueError: a part of the scene without a prior, or far from it at the start.
-    """
-    parameters, priors = choice.parameters, {prior.parameter: prior for prior in choice.priors}
-    low, high = (end.copy() for end in choice.limits)
-    start = entries(choice.law, parameters.fields)[parameters.first]
-    for i, name in enumerate(parameters.names):
-        if parameters.field_of(i) not in OF_A_SCENE:
-            continue
-        if i not in priors:
-            raise ValueError(
-                f"Argument `priors` must have (mean, standard deviation) for `{name}`, a part of "
-                "the scene that is fitted with the law."
-            )
-        _, mean, std = priors[i]
-        low[i], high[i] = max(low[i], mean - REACH * std), min(high[i], mean + REACH * std)
-        if not low[i] <= start[i] <= high[i]:
-            raise ValueError(
-                f"Argument `priors` must have a mean for `{name}` within {REACH:g} standard "
-                f"deviations of its value in the scene, {start[i]:g}, but has {mean:g} ± {std:g}."
-            )
-    return low, high
-
-
 def _build(
-    choice: _Choice,
-    observe: Observable,
+    law: Law,
+    observe: Any,
     measured: np.ndarray,
     sigma: np.ndarray | None,
     errors: np.ndarray,
-    dtype: np.dtype,
     unit: float,
-    energy: float,
-    scenes: list[Scene],
+    choice: tuple[Any, ...],
+    energy: float = 1.0,
+    scenes: list[Scene] | None = None,
 ) -> FitProblem:
-    """Arrays, weights and natural scales of a fit."""
-    law, parameters, notes, limits, priors, ties = choice
+    """Arrays, weights and natural scales of a fit; `choice`: free, bounds, priors, ties."""
+    leaves = [x for x in jax.tree.leaves((law, observe, measured)) if eqx.is_inexact_array(x)]
+    dtype = np.result_type(*(x.dtype for x in leaves))
+    free, bounds, prior, tie = (*choice, *[None] * 4)[:4]
+    ties = checked_ties(law, tie)
+    law = tied(law, ties)
+    parameters, notes = free_parameters(law, free, getattr(observe, "absolute", False), ties)
+    limits = bounds_of(parameters, law, bounds)
+    priors = priors_of(parameters, limits, prior)
+    if isinstance(law, LawInScene):
+        limits = limits_with_scene(parameters, law, limits, priors)
     if priors and sigma is None:
         raise ValueError(
             "Argument `priors` must be left out where no `sigma` (or `resolution`) of the measured "
             "values is known: priors and data weigh against each other by their errors."
         )
-    law = _in(dtype, law)
+    fixed, count = entries(law, parameters.fields), len(parameters.names)
+    owner, starts = np.full(len(fixed), -1), fixed[parameters.first]
+    arrays: Any = {name: np.zeros(len(fixed)) for name in ("low", "high", "scale")}
+    arrays |= {name: np.zeros(len(fixed)) for name in ("prior_mean", "prior_weight")}
+    arrays |= {"scale": np.ones(len(fixed)), "log": np.zeros(len(fixed), bool)}
+    arrays["log"][:count] = parameters.log
+    natural = np.where(parameters.log, 1.0, np.maximum(np.abs(starts), 1.0))
+    for i, (group, field) in enumerate(zip(parameters.groups, parameters.of_fields)):
+        owner[list(group)] = i
+        natural[i] = energy if field == "initial_energy" else natural[i]
+    for i, mean, std in priors:
+        arrays["prior_mean"][i], arrays["prior_weight"][i] = mean, 1 / std
+        if parameters.of_fields[i] in OF_A_SCENE:  # a gap is far smaller than 1 m
+            natural[i] = std
+    arrays["scale"][:count] = natural
+    for name, end in zip(("low", "high"), limits):
+        arrays[name][:count] = scaled(end, natural, parameters.log)
     here = ~np.isnan(measured)
-    weight = np.where(here, 1 / np.where(here, errors, 1.0), 0.0)
-    size = unit * np.linalg.norm(weight)
-    values = entries(law, parameters.fields)
-    scale, log = _scales(parameters, values, energy)
-    for prior in priors:
-        if parameters.field_of(prior.parameter) in OF_A_SCENE:  # a gap is far smaller than 1 m
-            scale[list(parameters.groups[prior.parameter])] = prior.std
-    offset, mix = to_scaled(values, scale, log), np.zeros((len(values), len(values)))
-    for i, group in enumerate(parameters.groups):
-        mix[list(group), i], offset[list(group)] = 1.0, 0.0
-    ends = np.zeros((2, len(values)))
-    first, count = parameters.first, len(parameters.names)
-    ends[:, :count] = [to_scaled(end, scale[first], log[first]) for end in limits]
-    arrays = _prior_arrays(priors, first, len(values)) | {"size": size, "unit": unit}
-    arrays |= {"mix": mix, "offset": offset, "scale": scale, "low": ends[0], "high": ends[1]}
-    arrays |= {"measured": np.nan_to_num(measured), "weight": weight / size}
-    region = matrix_region(law, scenes, scale * offset, scale[:, None] * mix, ends)
-    if region is not None and any(entry_of(name)[0] == "matrix" for name, _ in ties):
+    arrays["weight"] = np.where(here, 1 / np.where(here, errors, 1.0), 0.0)
+    unit = unit or 1.0
+    arrays |= {
+        "unit": np.asarray(unit),
+        "size": np.asarray(unit * np.linalg.norm(arrays["weight"])),
+    }
+    moves = np.where(owner[:, None] == np.arange(len(fixed)), arrays["scale"], 0.0)
+    origin, ends = np.where(owner < 0, fixed, 0.0), np.stack([arrays["low"], arrays["high"]])
+    matrix = matrix_region(law, scenes or [], origin, moves, ends)
+    if matrix is not None and any(entry_of(name)[0] == "matrix" for name, _ in ties):
         raise ValueError("Argument `ties` must not tie a `matrix` that has to stay admissible.")
-    host: dict[str, Any] = {name: np.asarray(array, dtype) for name, array in arrays.items()}
-    residuals = Residuals(
-        law=law,
-        region=region or BoxRegion(host["low"], host["high"]),
-        log=log,  # type: ignore[arg-type]
-        observe=observe,
+    return FitProblem(
+        law=_in(dtype, law),
+        observe=_in(dtype, observe),
+        owner=owner,
+        matrix=matrix,
+        **_in(dtype, arrays | {"fixed": fixed, "measured": measured}),
         fields=parameters.fields,
         ties=ties,
-        **host,
-    )
-    domains, values_known = np.stack(limits, axis=1), int(here.sum()) + len(priors)
-    return FitProblem(
-        residuals,
-        parameters,
-        tuple(notes),
-        domains,
-        measured,
-        sigma,
-        values_known,
+        parameters=parameters,
+        domains=np.stack(limits, axis=1),
+        sigma=sigma,
+        values=int(here.sum()) + len(priors),
         priors=priors,
+        notes=tuple(notes),
     )
 
 
-def _prior_arrays(priors: tuple[Prior, ...], first: Any, count: int) -> dict[str, np.ndarray]:
-    """Mean and 1 / std (count,) of the priors, each at its parameter's first entry."""
-    mean, weight = np.zeros((2, count))
-    for prior in priors:
-        mean[first[prior.parameter]], weight[first[prior.parameter]] = prior.mean, 1 / prior.std
-    return {"prior_mean": mean, "prior_weight": weight}
-
-
-def _scales(
-    parameters: Parameters, values: np.ndarray, energy: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Of each entry: the size of a change of order 1 (or 1, where fitted in its logarithm), log."""
-    log = parameters.log
-    of_energy = np.array([field == "initial_energy" for field in parameters.entry_fields])
-    scale = np.where(of_energy, energy, np.maximum(np.abs(values), 1.0))
-    return np.where(log, 1.0, scale), log
-
-
-def to_scaled(values: np.ndarray, scale: np.ndarray, log: np.ndarray) -> np.ndarray:
-    """Scaled form of entries, on the host."""
+def scaled(x: np.ndarray, scale: np.ndarray, log: np.ndarray) -> np.ndarray:
+    """y of values x, on the host."""
     with np.errstate(divide="ignore"):
-        return np.where(log, np.log(np.where(log, values, 1.0)), values / scale)
-
-
-def from_scaled(scaled: np.ndarray, scale: np.ndarray, log: np.ndarray) -> np.ndarray:
-    """Entries of their scaled form, on the host."""
-    return np.where(log, np.exp(np.where(log, scaled, 0.0)), scaled * scale)
+        return np.where(log, np.log(np.where(log, x, 1.0)), x / scale)
 
 
 def filled_count(count: int) -> int:
     """How many shots a program has that serves so many."""
     return FEWEST if count <= FEWEST else 2 ** math.ceil(math.log2(count))
-
-
-def filled_up(residuals: Residuals) -> Residuals:
-    """With copies of the last shot, of no weight, up to a number that other fits have, too."""
-    if not isinstance(residuals.observe, Shots):
-        return residuals
-    count = len(residuals.measured)
-    goal = FEWEST
-    while goal < count:
-        goal *= 2
-
-    last = np.minimum(np.arange(goal), count - 1)
-    parts = (residuals.observe, residuals.measured, residuals.weight, residuals.mixing)
-    observe, measured, weight, mixing = jax.tree.map(lambda x: np.asarray(x)[last], parts)
-    weight[count:] = 0.0
-    return eqx.tree_at(
-        lambda r: (r.observe, r.measured, r.weight, r.mixing),
-        residuals,
-        (observe, measured, weight, mixing),
-        is_leaf=lambda x: x is None,
-    )
 
 
 @quick_jit
@@ -830,7 +717,28 @@ def _slopes_before(law: Law, shots: Shots) -> jax.Array:
     return jax.vmap(jax.jacfwd(after))(shots.pre, scenes)
 
 
-def slopes_before(law: Law, shots: Any) -> np.ndarray:
-    """`dv+/dv-` (K, n, n) of every shot."""
-    n = shots.bodies
-    return np.asarray(_slopes_before(_in(_dtype(shots), law), shots), float)[:, :n, :n]
+def tolerated(
+    law: AnyLaw, scene: Scene | None, data: Experiments
+) -> tuple[AnyLaw, tuple[str, ...]]:
+    """The law at a tolerance that the noise of the data allows, and a sentence that says so.
+
+    Of a law without `rtol` that errs by more than signs do (`Law.accuracy`), where `sigma` is
+    known.
+    """
+    if data.sigma is None or getattr(law, "rtol", COARSE_RTOL) is not None:
+        return law, ()
+    pre, sigma = np.asarray(data.pre), np.asarray(data.sigma)
+    shapes = _CONTACT.eval_shape(data.largest_scene(scene), pre[0])
+    if not sign_tolerance(pre.dtype) < law.accuracy(shapes) < COARSE_RTOL:
+        return law, ()
+    normals = data.each(scene, lambda each: np.asarray(each.normals))
+    fastest = [np.abs(n.T @ v).max() for n, v in zip(normals, pre)]
+    noise = [np.sqrt(np.square(n.T) @ s**2).min() for n, s in zip(normals, sigma)]
+    # a noise of NaN, where a value was not measured, allows nothing
+    if not all(PART_OF_NOISE * s >= COARSE_RTOL * v for s, v in zip(noise, fastest)):
+        return law, ()
+    line = (
+        f"Velocities finer than {COARSE_RTOL:g} of the fastest approach: the law is computed with "
+        f"`rtol` = {COARSE_RTOL:g}, a tenth of the noise or less; give it an `rtol` to change that."
+    )
+    return dataclasses.replace(law, **{"rtol": COARSE_RTOL}), (line,)

@@ -1,35 +1,108 @@
-"""Profile likelihoods: how well the data are fitted with one parameter fixed, all others free.
+"""Profiles and contours: how well the data are fitted with one or two parameters fixed.
 
 A standard error is half the width of a parabola. Where the sum of squares is not a parabola (at a
 bound, in a flat valley, with several minima), the profile gives the interval: one-sided, or of
 several pieces.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from jimpact._checks import as_whole, check_choice
-from jimpact.fits.intervals import Profile, check_level
-from jimpact.fits.problem import FEW
-from jimpact.fits.result import FitResult
-from jimpact.fits.scaled import ScaledFit, check_profiled, with_entry
-from jimpact.fits.solve import DEFAULT_STEPS, SolverState
+from jimpact._checks import as_whole, check_choice, check_kind
+from jimpact.fits.problem import scaled
+from jimpact.fits.solve import START_SCALES, Ends, Search, minimize_with, repeated
+from jimpact.fits.uncertainty import FitResult, Profile, check_level
 from jimpact.progress import Show, progress_bar
 
-NEAR = np.array([-2, -1.5, -1, -0.5, 0.5, 1, 1.5, 2])  # half-widths of the interval of a parabola
+# Deviances are right to this (see `solve.FINE`): the ends of an interval move by a hundred
+# thousandth. A search that goes on after so many passes creeps along a kink.
+_STOP, PASSES = 1e-5, 24
+STEP, WIDEST = 0.4, 2.0  # of a walk: rise of the root of the deviance, over the limit's; growth
+FIRST_SHARE = 1 / 16  # of what can be reached: the first step where the error is infinite
+LONGEST = 2.0  # steps by which a walk is extrapolated
+FAR = 2.0  # times the limit, where a walk ends
+MOST_STEPS = 40  # of a walk: it then moves along a valley without end
+ROUGH = 2  # passes of a value that is only looked at
 SAME = 1e-6  # relative sums of squares that are equal
 END = 1e-3  # of the root of the limit: how near to it an end is searched for
-FAR, ROUGH = 2.0, 2  # times the limit beyond which only ROUGH passes are spent
-MANY = 256  # shots up to which they take half as long as a fit with eight starts
-# Parameters up to which `fit` profiles of itself: with four of LZB that takes several times as long
-# as the search, and the report names `ji.profile` in its place.
-MOST_PARAMETERS = 3
-QUICK_POINTS, QUICK_LEVEL = 17, 0.95  # of the profiles that `fit` computes by default: fixed values
-LONGEST = 2.0  # steps by which a scan is extrapolated
-ROUNDS = 8  # of the search for an end: it is then right to a millionth of a grid cell, mostly
+ROUNDS = 8  # of the search for an end: it is then right to a millionth of a step, mostly
+# Shots up to which `fit` profiles of itself, with one start and with several: as long as half of
+# the fit. Parameters: with four of LZB it takes longer than the search.
+FEW_SHOTS, MANY_SHOTS, MOST_PARAMETERS = 64, 256, 3
+_BEYOND = 1.3  # how far a contour's picture goes, in half-widths of the region of a parabola
+
+
+class Deviances:
+    """Sums of squares of a fit with some of its parameters fixed, in the solver's scale."""
+
+    def __init__(self, fit: FitResult, show: Show):
+        self.fit, self.problem, self.show = fit, fit.problem, show
+        self.low, self.high = (np.asarray(x, float) for x in (self.problem.low, self.problem.high))
+        # if the noise is undetermined, that of an exact fit up to rounding
+        known = np.isfinite(fit.noise) and fit.noise > 0
+        self.variance = float(fit.noise**2) if known else self.problem.exact_squares
+        self.least = fit.starts[0].sum_of_squares
+        self.best = self.problem.point(fit.value)
+
+    def minimize(
+        self,
+        fixed: Sequence[Sequence[int]],
+        y: Sequence[np.ndarray],
+        steps: int = PASSES,
+    ) -> Ends:
+        """Minima from each y (A, Q) with these of its parameters fixed, all side by side."""
+        held = np.zeros((len(y), len(self.best)), bool)
+        for row, which in zip(held, fixed):
+            row[list(which)] = True
+        held[:, len(self.fit.names) :] = True
+        search = Search(max_steps=steps, show=self.show)
+        return minimize_with(repeated(self.problem, len(y)), np.array(y), held, search, _STOP)
+
+    def of(self, squares: Any) -> Any:
+        """Sums of squares above the least, over the noise variance."""
+        return np.maximum((squares - self.least) / self.variance, 0.0)
+
+    def values(self, i: int, y: np.ndarray) -> np.ndarray:
+        """Values of the i-th parameter of scaled ones."""
+        points = np.tile(self.best, (len(y), 1))
+        points[:, i] = y
+        return self.problem.values_at(points)[:, i]
+
+    def reach(self, i: int, pieces: Any = None) -> tuple[float, float]:
+        """The bounds of the i-th parameter or the outer ends of pieces, scaled.
+
+        An infinite end is cut at as many natural scales as starts reach.
+        """
+        low, high = self.low[i], self.high[i]
+        if pieces is not None:
+            outer = np.array([pieces[0][0], pieces[-1][1]])
+            outer = scaled(outer, np.asarray(self.problem.scale)[i], self.problem.parameters.log[i])
+            low, high = max(low, outer[0]), min(high, outer[1])
+        low = low if np.isfinite(low) else self.best[i] - START_SCALES
+        return float(low), float(high if np.isfinite(high) else self.best[i] + START_SCALES)
+
+
+def _check_profiled(fit: FitResult) -> None:
+    """Raise an error unless this is a fit, of parameters that can be fixed."""
+    check_kind("fit", fit, FitResult)
+    if not fit.can_be_profiled:
+        raise ValueError(
+            "Argument `fit` must be by least squares, and not of a matrix that must be admissible."
+        )
+
+
+def with_entry(y: np.ndarray, i: int, value: float) -> np.ndarray:
+    """A copy of y with another i-th entry."""
+    changed = np.array(y, float)
+    changed[i] = value
+    return changed
+
+
+# ---------------------------------------------------------------------------- profiles
 
 
 def profile(
@@ -37,7 +110,7 @@ def profile(
     names: str | Iterable[str] | None = None,
     *,
     level: float = 0.95,
-    points: int = 33,
+    points: int = 17,
     progress: float | None = None,
 ) -> tuple[Profile, ...]:
     """Profile likelihoods of parameters: intervals without the assumption of a parabola.
@@ -45,17 +118,17 @@ def profile(
     Equation: `D(x_i) = (min over the others of |r|^2 - least |r|^2) / s^2 <= q^2`, q the quantile
     of the normal law where sigma is known (s = 1), else of Student's t (s = `fit.noise`).
 
-    Fixed values cover the whole domain and the neighbourhood of the minima; from each minimum they
-    are reached one after the other in both directions, all parameters side by side; far above the
-    limit they are computed only roughly. Where a scan finds a further valley, it is followed to its
-    minimum. Without sigma and with no degree of freedom left, the interval is that of the values
-    which reproduce the data exactly.
+    From each minimum a walk goes in both directions, each value from where the last two lead, in
+    steps that raise the root of D by .4 of the limit's, all parameters side by side. The rest of
+    the domain is only looked at; where a further valley shows, it is followed to its minimum.
+    Without sigma and with no degree of freedom left, the interval is that of the values which
+    reproduce the data exactly.
 
     Args:
         fit: by least squares.
         names: of parameters; None: all.
         level: of the confidence intervals, in (0, 1).
-        points: fixed values across the domain, besides those near the minimum, at least 3.
+        points: fixed values across the domain, besides those of the walks, at least 3.
         progress: bar on stderr; None: on a terminal, once it takes longer than two seconds.
 
     Returns:
@@ -72,226 +145,206 @@ def profile(
     """
     check_level(level)
     as_whole("points", points, 3)
-    check_profiled(fit)
+    _check_profiled(fit)
     wanted = fit.names if names is None else (names,) if isinstance(names, str) else tuple(names)
     for name in wanted:
         check_choice("names", name, fit.names)
+    return walked_profiles(fit, [fit.names.index(name) for name in wanted], level, points, progress)
+
+
+def walked_profiles(
+    fit: FitResult, which: Sequence[int], level: float, points: int, progress: float | None
+) -> tuple[Profile, ...]:
+    """Profiles of these parameters; points: looked at across the domain, 0: none."""
     with progress_bar(progress) as show:
-        scans = _Scans(fit, [fit.names.index(name) for name in wanted], level, show)
-        scans.scan(points, FAR, whole=True)
-        scans.follow_valleys()
-        scans.finish(FAR)
-    return tuple(scans.profile(i) for i in scans.which)
+        scans = _Scans(fit, which, level, show)
+        scans.walk(scans.minima())
+        if points:
+            scans.look(points)
+        scans.finish()
+    return tuple(scans.profile(i) for i in which)
 
 
-def quick_profiles(fit: FitResult, progress: float | None) -> tuple[Profile, ...]:
-    """Profiles of all parameters around the minima that are known, no farther than is needed."""
-    with progress_bar(progress) as show:
-        scans = _Scans(fit, range(len(fit.names)), QUICK_LEVEL, show)
-        scans.scan(QUICK_POINTS, 1.0)
-        scans.finish(1.0)
-    return tuple(scans.profile(i) for i in scans.which)
+class _Known(NamedTuple):
+    """The least sum of squares that is known with a value fixed, and where."""
+
+    squares: float
+    y: np.ndarray
+    rough: bool = False
 
 
-class _Scans(ScaledFit):
-    """Held values of parameters and the minima with them, in scaled form, as far as known."""
+class _Walk(NamedTuple):
+    """How far the walk along the i-th parameter has come in one direction, and its next step."""
+
+    i: int
+    step: float
+    last: np.ndarray
+    height: float  # the root of the deviance over the limit
+    before: np.ndarray | None = None
+
+
+class _Scans(Deviances):
+    """Fixed values of parameters and the minima with them, in scaled form, as far as known."""
 
     def __init__(self, fit: FitResult, which: Sequence[int], level: float, show: Show):
-        super().__init__(fit)
-        self.which, self.level, self.show = which, level, show
+        super().__init__(fit, show)
+        self.which, self.level = which, level
         self.limit = fit.quantile(level) ** 2  # deviance at the ends of an interval
-        # of each parameter: fixed value -> (sum of squares, y)
-        self.solved: dict[int, dict[float, tuple[float, np.ndarray]]] = {
-            i: {float(self.best[i]): (self.least, self.best)} for i in which
-        }
-        for start in fit.starts[1:]:
+        self.walked: dict[tuple[int, float], float] = {}  # sums of squares where walks have been
+        self.lower: np.ndarray | None = None  # a point below the minimum of the fit
+        self.known: dict[int, dict[float, _Known]] = {i: {} for i in which}
+        for start in fit.starts:
             y = self.problem.point(start.value)
             for i in which:
-                self.solved[i].setdefault(float(y[i]), (start.sum_of_squares, y))
-        self.lower: np.ndarray | None = None  # a point below the minimum of the fit
-        self.grid: dict[int, np.ndarray] = {}  # values to hold
-        self.rough: set[tuple[int, float]] = set()  # what was not solved to its end
+                self.known[i].setdefault(float(y[i]), _Known(start.sum_of_squares, y))
 
     def minima(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """y (Q,) of the minima that fit well enough, and scaled standard errors (P,)."""
         fit = self.fit
-        minima: list[tuple[np.ndarray, np.ndarray | None]] = [(fit.value, fit.standard_error)]
+        minima: list[tuple[Any, Any]] = [(fit.value, fit.standard_error)]
         if fit.rank == len(fit.names):  # else they are ends in one valley
-            minima += [(end.value, end.standard_error) for end in fit.starts[1:]]
+            near = [end for end in fit.starts[1:] if self.of(end.sum_of_squares) <= self.limit]
+            minima += [(end.value, end.standard_error) for end in near]
         return [
-            (self.problem.point(value), error / np.where(self.log, value, self.scale))
+            (self.problem.point(value), error / self.problem.steps_at(value))
             for value, error in minima
-            if error is not None
         ]
 
-    def near(self, i: int, y: np.ndarray, error: float) -> np.ndarray:
-        """Values to hold near a minimum."""
-        if not np.isfinite(error):
-            return np.zeros(0)
-        reach = error * np.sqrt(self.limit)
-        return np.clip(y[i] + reach * NEAR, self.low[i], self.high[i])
-
-    def scan(self, points: int, far: float, whole: bool = False) -> None:
-        """Deviances across the domains, as far as they are at most `far` times the limit.
-
-        The whole domain: beyond, too, but only roughly: enough to see other valleys.
-        """
-        values: dict[int, np.ndarray] = {}
-        fronts: list[_Front] = []
-        for i in self.which:
-            parts = [np.linspace(*self.reach(i), points)]
-            for y, error in self.minima():
-                parts.append(self.near(i, y, float(error[i])))
-                fronts += [_Front(i, step, y) for step in (-1, 1)]
-            values[i] = np.unique(np.concatenate(parts))
-        self.grid = values
-        alone = len(self.fit.names) == 1  # no other parameter to solve for
-        if not (whole and alone):
-            self.advance(fronts, values, far * self.limit)
-        if whole:
-            left = [(i, x) for i in self.which for x in values[i] if x not in self.solved[i]]
-            rough = [(i, with_entry(self._nearest(i, x), i, x)) for i, x in left]
-            if alone:
-                self._solve(rough)
-            else:
-                self._solve(rough, ROUGH)
-                self.rough = {(i, float(x)) for i, x in left}
-
-    def advance(self, fronts: list["_Front"], values: Mapping[int, np.ndarray], far: float) -> None:
-        """From value to value, each from its neighbour's minimum, until others have been there."""
-        while True:
-            ahead = [(f, f.next(values[f.i], self.low, self.high)) for f in fronts]
-            moving = [(f, y) for f, y in ahead if y is not None]
-            if not moving:
+    def walk(self, starts: Sequence[tuple[np.ndarray, np.ndarray]]) -> None:
+        """Walks from these y (Q,), of these scaled errors (P,), along every parameter."""
+        walks, height = [], np.sqrt(self.limit)
+        for y, error in starts:
+            for i in self.which:
+                low, high = self.reach(i)
+                widest = (high - low) * FIRST_SHARE
+                first = STEP * height * error[i] if np.isfinite(error[i]) else widest
+                first = min(first, (high - low) / 2) or widest
+                walks += [_Walk(i, sign * first, y, 0.0) for sign in (-1, 1)]
+        for _ in range(MOST_STEPS):
+            aims = [(walk, aim) for walk in walks if (aim := self._next(walk)) is not None]
+            if not aims:
                 return
-            known = [self.solved[f.i].get(float(y[f.i]), (np.inf, y))[0] for f, y in moving]
-            ends = self._solve([(f.i, y) for f, y in moving])
-            # where a scan leaves the interval it may be on a ridge: once more from the fit
-            leaving = [
-                k
-                for k, ((f, _), (squares, _)) in enumerate(zip(moving, ends))
-                if self.deviance_of(squares) > self.limit >= self._deviance_at(f)
-            ]
-            again = [(moving[k][0].i, moving[k][1]) for k in leaving]
+            places = [(walk.i, float(y[walk.i])) for walk, y in aims]
+            before = [self.walked.get(place, np.inf) for place in places]
+            ends = self.solve([(walk.i, y) for walk, y in aims])
+            heights = np.sqrt(self.of(np.array([end.squares for end in ends])) / self.limit)
+            # where a walk leaves the interval it may be on a ridge: once more from the fit
+            leaving = [k for k, (walk, _) in enumerate(aims) if heights[k] > 1 >= walk.height]
+            again = [(aims[k][0].i, aims[k][1]) for k in leaving]
             again = [(i, with_entry(self.best, i, y[i])) for i, y in again]
-            for k, end in zip(leaving, self._solve(again)):
+            for k, end in zip(leaving, self.solve(again)):
                 ends[k] = min(ends[k], end, key=_squares)
-            fronts = []
-            for (f, _), before, end in zip(moving, known, ends):
-                squares, y = end
-                first = squares < (1 - SAME) * before and self.solved[f.i][float(y[f.i])] is end
-                if first and self.deviance_of(squares) <= far:
-                    fronts.append(_Front(f.i, f.step, y, f.last))
+                heights[k] = np.sqrt(self.of(ends[k].squares) / self.limit)
+            walks = [
+                _Walk(walk.i, walk.step * _growth(h - walk.height), end.y, h, walk.last)
+                for (walk, _), known, end, h in zip(aims, before, ends, heights)
+                # others have been there, or it is far from the interval
+                if h <= np.sqrt(FAR) and end.squares < (1 - SAME) * known
+            ]
+            self.walked |= dict(zip(places, (end.squares for end in ends)))
 
-    def _solve(
-        self,
-        fixed: Sequence[tuple[int, np.ndarray]],
-        steps: int = DEFAULT_STEPS["levenberg-marquardt"],
-    ) -> list[tuple[float, np.ndarray]]:
-        """Minimize with the i-th entry of each y fixed, and store what improves on the known."""
+    def _next(self, walk: _Walk) -> np.ndarray | None:
+        """Where the next minimum of a walk is searched from; None at the end of the domain."""
+        i, last = walk.i, walk.last
+        low, high = self.reach(i)
+        value = float(np.clip(last[i] + walk.step, low, high))
+        if value == last[i]:
+            return None
+        known = [x for j, x in self.walked if j == i]
+        between = [x for x in known if 0 < (x - last[i]) / (value - last[i]) < 1]
+        value = min(between, key=lambda x: abs(x - last[i]), default=value)
+        if walk.before is None:
+            return with_entry(last, i, value)
+        share = (value - last[i]) / (last[i] - walk.before[i])
+        ahead = last + np.clip(share, 0.0, LONGEST) * (last - walk.before)
+        return with_entry(np.clip(ahead, self.low, self.high), i, value)
+
+    def solve(
+        self, fixed: Sequence[tuple[int, np.ndarray]], steps: int | None = None
+    ) -> list[_Known]:
+        """Minima with the i-th entry of each y fixed; what improves on the known is kept."""
         if not fixed:
             return []
-        squares, states = self.minimize(fixed, self.show, steps)
+        rough, limits = steps is not None, {} if steps is None else {"steps": steps}
+        solved = self.minimize([(i,) for i, _ in fixed], [y for _, y in fixed], **limits)
         ends = []
-        for k, (i, y) in enumerate(fixed):
-            ends.append((float(squares[k]), with_entry(np.asarray(states.y[k]), i, y[i])))
-            if not squares[k] >= self.solved[i].get(float(y[i]), (np.inf, y))[0]:
-                self.solved[i][float(y[i])] = ends[-1]
-        all_ends = (end for solved in self.solved.values() for end in solved.values())
-        best = min(all_ends, key=_squares)
-        if best[0] < self.least * (1 - SAME) - self.problem.exact_squares:
-            self._lower(*best)
+        for (i, y), squares, at in zip(fixed, solved.squares, solved.y):
+            end = _Known(float(squares), with_entry(at, i, y[i]), rough)
+            ends.append(end)
+            known = self.known[i].setdefault(float(y[i]), end)
+            if end.squares < known.squares:
+                self.known[i][float(y[i])] = end
+        best = min(ends, key=_squares)
+        if best.squares < self.least * (1 - SAME) - self.problem.exact_squares:
+            self._lower(best.squares, best.y)
         return ends
 
     def _lower(self, squares: float, y: np.ndarray) -> None:
         """A point below all others: all parameters get it, whichever's scan found it."""
         self.least, self.lower = squares, y
         for i in self.which:
-            self.solved[i][float(y[i])] = (squares, y)
-
-    def _nearest(self, i: int, y: float) -> np.ndarray:
-        """The minimum with the fixed value that is nearest to y."""
-        return self.solved[i][min(self.solved[i], key=lambda known: abs(known - y))][1]
+            self.known[i][float(y[i])] = _Known(squares, y)
 
     def deviance(self, i: int) -> tuple[np.ndarray, np.ndarray]:
         """Fixed values and their deviances."""
-        values = np.array(sorted(self.solved[i]))
-        squares = np.array([self.solved[i][y][0] for y in values])
-        return values, np.maximum(self.deviance_of(squares), 0.0)
+        values = np.array(sorted(self.known[i]))
+        return values, self.of(np.array([self.known[i][y].squares for y in values]))
 
-    def _deviance_at(self, front: "_Front") -> float:
-        """The least deviance known where a front has come to."""
-        known = self.solved[front.i].get(float(front.last[front.i]))
-        return self.deviance_of(self.least if known is None else known[0])
-
-    def follow_valleys(self) -> None:
-        """Held values around the minima that further valleys of the scans lead to."""
+    def look(self, points: int) -> None:
+        """Values across the domain, roughly; further valleys are followed."""
+        trials = []
+        for i in self.which:
+            values, d = self.deviance(i)
+            inside = [
+                (a, b) for (a, p), (b, q) in pairwise(zip(values, d)) if max(p, q) <= self.limit
+            ]
+            trials += [
+                (i, with_entry(self._nearest(i, x), i, x))
+                for x in np.linspace(*self.reach(i), points)
+                if not any(a <= x <= b for a, b in inside)
+            ]
+        # of one parameter there are no others to solve for
+        self.solve(trials, None if len(self.fit.names) == 1 else ROUGH)
         starts = []
         for i in self.which:
             values, d = self.deviance(i)
-            inside = np.flatnonzero((d[1:-1] < d[:-2]) & (d[1:-1] <= d[2:])) + 1
-            starts += [
-                (i, self.solved[i][values[k]][1])
-                for k in inside
-                if d[k] > self.limit or (i, values[k]) in self.rough
-            ]
+            dips = np.flatnonzero((d[1:-1] < d[:-2]) & (d[1:-1] <= d[2:])) + 1
+            known = [self.known[i][values[k]] for k in dips]
+            starts += [end.y for end, k in zip(known, dips) if end.rough or d[k] > self.limit]
+        self._walk_from_minima(starts)
+
+    def _walk_from_minima(self, starts: Sequence[np.ndarray]) -> None:
+        """Walks from the minima next to these points that fit well enough."""
         if not starts:
             return
-        squares, states = self.minimize([((), y) for _, y in starts], self.show)
-        fronts: list[_Front] = []
-        near: dict[int, np.ndarray] = {}
-        for k, (i, _) in enumerate(starts):
-            y = np.asarray(states.y[k], float)
-            if self.deviance_of(squares[k]) <= self.limit:
-                self.solved[i].setdefault(float(y[i]), (float(squares[k]), y))
-                more = self.near(i, y, self._error(i, states, k))
-                near[i] = np.unique(np.concatenate([near.get(i, np.zeros(0)), more]))
-                fronts += [_Front(i, step, y) for step in (-1, 1)]
-        self.advance(fronts, near, np.inf)
+        ends = self.minimize([()] * len(starts), starts)
+        best = int(np.argmin(ends.squares))
+        if ends.squares[best] < self.least * (1 - SAME) - self.problem.exact_squares:
+            self._lower(float(ends.squares[best]), ends.y[best])
+        found = []
+        for k in np.flatnonzero(self.of(ends.squares) <= self.limit):
+            jacobian = ends.jacobian[k][:, : len(self.fit.names)]
+            inverse = np.linalg.pinv(jacobian.T @ jacobian)
+            found.append((ends.y[k], np.sqrt(self.variance * np.diag(inverse))))
+            for i in self.which:
+                end = _Known(float(ends.squares[k]), ends.y[k])
+                self.known[i].setdefault(float(ends.y[k][i]), end)
+        self.walk(found)
 
-    def _error(self, i: int, states: SolverState, k: int) -> float:
-        """Scaled standard error of the i-th parameter at the k-th of these ends."""
-        jacobian = np.asarray(states.jacobian[k], float)[:, : len(self.fit.names)]
-        inverse = np.linalg.pinv(self.size**2 * jacobian.T @ jacobian)
-        return float(np.sqrt(self.variance * inverse[i, i]))
+    def _nearest(self, i: int, y: float) -> np.ndarray:
+        """The minimum with the fixed value that is nearest to y."""
+        return self.known[i][min(self.known[i], key=lambda known: abs(known - y))].y
 
-    def finish(self, far: float) -> None:
+    def finish(self) -> None:
         """The ends of the intervals, and what lies around a minimum below that of the fit."""
         followed = None
         for _ in range(ROUNDS):
             if self.lower is not None and self.lower is not followed:
-                self._scan_from_lower(far)
                 followed = self.lower
+                self._walk_from_minima([followed])
             self.find_ends()
             if not self.fill_holes() and self.lower is followed:
                 return
-
-    def _scan_from_lower(self, far: float) -> None:
-        """Scan all parameters from the minimum that a scan of one of them has led to."""
-        assert self.lower is not None
-        squares, states = self.minimize([((), self.lower)], self.show)
-        if squares[0] < self.least:
-            self._lower(float(squares[0]), np.asarray(states.y[0], float))
-        fronts, values = [], {}
-        for i in self.which:
-            near = self.near(i, self.lower, self._error(i, states, 0))
-            values[i] = np.unique(np.concatenate([self.grid[i], near]))
-            fronts += [_Front(i, step, self.lower) for step in (-1, 1)]
-        self.advance(fronts, values, far * self.limit)
-
-    def fill_holes(self) -> bool:
-        """Try again between two pieces, from straight lines: whether a hole was an artefact."""
-        trials = []
-        for i in self.which:
-            values, d = self.deviance(i)
-            inside = np.flatnonzero(d <= self.limit)
-            for a, b in pairwise(inside):
-                start, end = (self.solved[i][values[k]][1] for k in (a, b))
-                for value in values[a + 1 : b]:
-                    share = (value - values[a]) / (values[b] - values[a])
-                    trials.append((i, with_entry(start + share * (end - start), i, value)))
-        ends = self._solve(trials)
-        return any(self.deviance_of(squares) <= self.limit for squares, _ in ends)
 
     def find_ends(self) -> None:
         """Where deviances pass the limit: regula falsi in their roots, all ends side by side."""
@@ -303,15 +356,28 @@ class _Scans(ScaledFit):
                 height = np.sqrt(d) - limit
                 for k in np.flatnonzero((height[:-1] <= 0) != (height[1:] <= 0)):
                     a, b, p, q = values[k], values[k + 1], height[k], height[k + 1]
-                    if min(abs(p), abs(q)) <= END * limit:
-                        continue
                     share = p / (p - q) if turn % 3 < 2 and np.isfinite(q - p) else 0.5
                     y = a + np.clip(share, 0.02, 0.98) * (b - a)
-                    if a < y < b and abs(b - a) > 1e-6 * max(1.0, abs(a)):
-                        trials.append((i, with_entry(self._nearest(i, y), i, y)))
+                    near = min(abs(p), abs(q)) <= END * limit
+                    if not near and a < y < b and b - a > 1e-6 * max(1.0, abs(a)):
+                        start, end = (self.known[i][x].y for x in (a, b))
+                        at = start + (y - a) / (b - a) * (end - start)
+                        trials.append((i, with_entry(at, i, y)))
             if not trials:
                 return
-            self._solve(trials)
+            self.solve(trials)
+
+    def fill_holes(self) -> bool:
+        """Try again between two pieces, from straight lines: whether a hole was an artefact."""
+        trials = []
+        for i in self.which:
+            values, d = self.deviance(i)
+            for a, b in pairwise(np.flatnonzero(d <= self.limit)):
+                start, end = (self.known[i][values[k]].y for k in (a, b))
+                for value in values[a + 1 : b]:
+                    share = (value - values[a]) / (values[b] - values[a])
+                    trials.append((i, with_entry(start + share * (end - start), i, value)))
+        return any(self.of(end.squares) <= self.limit for end in self.solve(trials))
 
     def profile(self, i: int) -> Profile:
         """The profile of a parameter from all that was solved."""
@@ -319,16 +385,17 @@ class _Scans(ScaledFit):
         below = np.flatnonzero(deviance <= self.limit)
         pieces = np.split(below, np.flatnonzero(np.diff(below) > 1) + 1)
         low, high = self.problem.domains[i]
+        intervals = tuple(
+            (self._end(i, y, deviance, piece[0], -1), self._end(i, y, deviance, piece[-1], 1))
+            for piece in pieces
+        )
         return Profile(
             name=self.fit.names[i],
             value=self.values(i, y),
             deviance=deviance,
             limit=self.limit,
             level=self.level,
-            intervals=tuple(
-                (self._end(i, y, deviance, piece[0], -1), self._end(i, y, deviance, piece[-1], 1))
-                for piece in pieces
-            ),
+            intervals=intervals,
             domain=(float(low), float(high)),
             better=None if self.lower is None else self.problem.values_at(self.lower),
         )
@@ -340,30 +407,17 @@ class _Scans(ScaledFit):
             return float(self.problem.domains[i][(step + 1) // 2])
         p, q = np.sqrt(deviance[k]), np.sqrt(deviance[beyond])
         share = (np.sqrt(self.limit) - p) / (q - p)
-        end = y[k] + share * (y[beyond] - y[k])
-        return float(self.values(i, np.array([end]))[0])
+        return float(self.values(i, y[[k]] + share * (y[beyond] - y[k]))[0])
 
 
-class _Front(NamedTuple):
-    """How far the scan of the i-th parameter has come in one direction."""
+def _squares(end: _Known) -> float:
+    """To compare ends by."""
+    return end.squares
 
-    i: int
-    step: int  # -1 or 1
-    last: np.ndarray
-    before: np.ndarray | None = None
 
-    def next(self, values: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray | None:
-        """Where to start at the next of the values: on a straight line; None at the end."""
-        i, last = self.i, self.last
-        ahead = values[(values - last[i]) * self.step > 0]
-        if len(ahead) == 0:
-            return None
-        value = ahead[0] if self.step > 0 else ahead[-1]
-        y = last
-        if self.before is not None:
-            share = (value - last[i]) / (last[i] - self.before[i])
-            y = np.clip(last + min(share, LONGEST) * (last - self.before), low, high)
-        return with_entry(y, i, value)
+def _growth(rise: float) -> float:
+    """By how much the next step of a walk is longer: so that the height rises by STEP."""
+    return float(np.clip(STEP / max(rise, 1e-9), 1 / WIDEST, WIDEST))
 
 
 def needs_profiles(fit: FitResult) -> bool:
@@ -371,12 +425,141 @@ def needs_profiles(fit: FitResult) -> bool:
 
     Not after lack of fit: no interval of such a law means anything, and its valleys are rough.
     """
-    most = FEW if fit.start_count == 1 else MANY
+    most = FEW_SHOTS if fit.start_count == 1 else MANY_SHOTS
     few = fit.experiments is not None and len(fit.predicted) <= most
     few &= len(fit.names) <= MOST_PARAMETERS
     return few and fit.linearization_misleads and not fit.shows_lack_of_fit
 
 
-def _squares(end: tuple[float, np.ndarray]) -> float:
-    """Sum of squares of an end, to compare ends by."""
-    return end[0]
+# ---------------------------------------------------------------------------- contours
+
+
+@dataclass(frozen=True, eq=False)
+class Contour:
+    """`deviance` (A, B) over values `x` (A,) of one parameter and `y` (B,) of another, by `names`.
+
+    The confidence region at `level` is where it is at most `limit`; inf where no neighbour is
+    inside, which was not computed. `best`: the values of the fit. `log`: which of the two is fitted
+    in its logarithm.
+    """
+
+    names: tuple[str, str]
+    x: np.ndarray
+    y: np.ndarray
+    deviance: np.ndarray
+    limit: float
+    level: float
+    best: tuple[float, float]
+    log: tuple[bool, bool]
+
+
+def contour(
+    fit: FitResult,
+    first: str,
+    second: str,
+    *,
+    level: float = 0.95,
+    points: int = 21,
+    progress: float | None = None,
+) -> Contour:
+    """The joint confidence region of two parameters, all others free.
+
+    Equation: `D(x, y) = (min over the others of |r|^2 - least |r|^2) / s^2 <= q`, where sigma is
+    known s = 1 and q the quantile of chi^2 with 2 degrees of freedom, else s = `fit.noise` and q
+    twice that of F with 2 and the degrees of freedom that are left.
+
+    The values cover somewhat more than the region of a parabola, cut at the bounds; the whole
+    domain of what the data cannot see. The region is filled from the minima of the fit outwards,
+    from neighbour to neighbour, many side by side. `ji.plot.contour` draws it.
+
+    Args:
+        fit: by least squares.
+        first, second: names of two of its parameters.
+        level: of the region, in (0, 1).
+        points: values of each, at least 3.
+        progress: bar on stderr; None: on a terminal, once it takes longer than two seconds.
+
+    Returns:
+        `Contour` with `deviance` (points, points).
+
+    Raises:
+        ValueError: level, points or names; a robust loss; a matrix that must be admissible; a
+            region so thin that no fixed value lies inside.
+
+    >>> import jimpact as ji
+    >>> pre, post = [[1.0, 0.0, -1.0], [2.0, 0.0, 0.0]], [[-0.8, 0.1, 0.7], [0.1, 1.8, 0.1]]
+    >>> data = ji.Experiments(pre, post, sigma=0.1)
+    >>> result = ji.fit(ji.Newton([0.9, 0.9]), ji.chain([1.0, 1.0, 1.0]), data)
+    >>> region = ji.contour(result, "restitution[1]", "restitution[2]", points=5)
+    >>> region.deviance.shape, round(region.limit, 2)
+    ((5, 5), 5.99)
+    """
+    check_level(level)
+    as_whole("points", points, 3)
+    _check_profiled(fit)
+    for argument, name in (("first", first), ("second", second)):
+        check_choice(argument, name, fit.names)
+    if first == second:
+        raise ValueError(f"Arguments `first` and `second` must differ, but both are {first!r}.")
+    freedom, pair = fit.degrees_of_freedom, (fit.names.index(first), fit.names.index(second))
+    limit = float(-2 * np.log(1 - level))
+    if fit.problem.sigma is None and freedom > 0:
+        limit = float(freedom * ((1 - level) ** (-2 / freedom) - 1))
+    with progress_bar(progress) as show:
+        deviances, width = Deviances(fit, show), _BEYOND * np.sqrt(limit)
+        ends = [deviances.reach(i, fit.linearized_interval(i, width)) for i in pair]
+        x, y = (np.linspace(*each, points) for each in ends)
+        deviance = _flood(deviances, pair, (x, y), limit)
+    if deviance.min() > limit:
+        raise ValueError(
+            f"Argument `points` must be larger: the region falls between {points} values of "
+            f"{first} and of {second} (or take `profile`, which needs no grid)."
+        )
+    return Contour(
+        names=(first, second),
+        x=deviances.values(pair[0], x),
+        y=deviances.values(pair[1], y),
+        deviance=deviance,
+        limit=limit,
+        level=level,
+        best=(float(fit.value[pair[0]]), float(fit.value[pair[1]])),
+        log=tuple(bool(fit.problem.parameters.log[i]) for i in pair),  # type: ignore[arg-type]
+    )
+
+
+def _flood(
+    deviances: Deviances, pair: tuple[int, int], values: tuple[np.ndarray, np.ndarray], limit: float
+) -> np.ndarray:
+    """Deviances on the grid of fixed values, from the minima outwards; inf where not computed.
+
+    Each cell below the limit starts its neighbours from its own minimum.
+    """
+    squares = np.full((len(values[0]), len(values[1])), np.inf)
+    known: dict[tuple[int, int], np.ndarray] = {}
+    ahead: dict[tuple[int, int], np.ndarray] = {}
+    for start in deviances.fit.starts[::-1]:  # the best last: it stays where several meet
+        point = deviances.problem.point(start.value)
+        row, column = (int(np.argmin(np.abs(v - point[i]))) for v, i in zip(values, pair))
+        ahead[row, column] = point
+    while ahead:
+        points = [near.copy() for near in ahead.values()]
+        for point, cell in zip(points, ahead):
+            point[list(pair)] = [v[k] for v, k in zip(values, cell)]
+        ends = deviances.minimize([pair] * len(points), points)
+        for cell, total, y in zip(ahead, ends.squares, ends.y):
+            squares[cell], known[cell] = total, y
+        deviances.least = min(deviances.least, float(ends.squares.min()))
+        ahead = {
+            near: known[cell]
+            for cell in ahead
+            if deviances.of(squares[cell]) <= limit
+            for near in _neighbours(cell, len(squares))
+            if near not in known
+        }
+    return deviances.of(squares)
+
+
+def _neighbours(cell: tuple[int, int], points: int) -> list[tuple[int, int]]:
+    """Cells of a square grid next to one, diagonal ones too."""
+    near = [(cell[0] + i, cell[1] + j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+    return [(i, j) for i, j in near if 0 <= i < points and 0 <= j < points]

@@ -1,14 +1,31 @@
-"""A fit as text: a verdict, parameters with errors, quality, minima, warnings and shots."""
+"""A fit as text (verdict, parameters, quality, minima, warnings, shots), as data, and in a file."""
 
+import csv
+import dataclasses
+import json
+import platform
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-from jimpact.files.records import with_error
-from jimpact.fits.findings import joined_words
-from jimpact.fits.intervals import in_words
-from jimpact.fits.parameters import value_of
-from jimpact.fits.prediction import tied_values
-from jimpact.fits.result import FitResult
+import jimpact
+from jimpact._checks import needed
+from jimpact.files.records import as_data, with_error
+from jimpact.fits.parameters import AnyLaw, value_of
+from jimpact.fits.problem import FitProblem
+from jimpact.fits.uncertainty import FitResult, pieces_in_words
+from jimpact.law import StaticNumber, StaticNumbers
 from jimpact.status import STATUS
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure  # which takes long to import
 
 _ROUNDING = 1e-7  # share of the largest velocity that is printed as 0: impacts are good to 1e-8
 _VELOCITIES_SHOWN = 24  # in the table of shots
@@ -19,17 +36,25 @@ OF_A_CONTACT = ("restitution", "friction", "tangential_restitution")  # each may
 # times more they are wider by 2 %.
 FEW_DEGREES = 8
 UNSEEN = "start value; not determined by the data"  # note on a value in brackets
+FORMAT = 1  # of the file; it changes where older files could not be read any more
+_PACKAGES = ("jax", "jaxlib", "equinox", "numpy", "scipy")
+_REBUILT = "problem"  # the field of a fit that is made again from its parts
 
 
-def report(fit: FitResult) -> str:
-    """The whole report: its blocks, an empty line between them."""
-    return "\n\n".join("\n".join(block) for block in report_blocks(fit).values() if block)
+def joined_words(parts: Sequence[str]) -> str:
+    """Parts of a sentence, the last one after an "and".
+
+    >>> from jimpact.fits.report import joined_words
+    >>> joined_words(["a"]), joined_words(["a", "b", "c"])
+    ('a', 'a, b and c')
+    """
+    return " and ".join([", ".join(parts[:-1]), parts[-1]]) if len(parts) > 1 else "".join(parts)
 
 
-def report_blocks(fit: FitResult) -> dict[str, list[str]]:
+def report_blocks(fit: "Fit") -> dict[str, list[str]]:
     """The lines of the report, block by block."""
     return {
-        "verdict": [verdict(fit)],
+        "verdict": [fit.verdict],
         "headline": [_headline(fit)],
         "parameters": _parameters(fit),
         "quality": _quality(fit),
@@ -38,21 +63,6 @@ def report_blocks(fit: FitResult) -> dict[str, list[str]]:
         "warnings": _section("Warnings", fit.warnings),
         "shots": _shots(fit),
     }
-
-
-def verdict(fit: FitResult) -> str:
-    """One sentence: values with errors, what they assume, what is undetermined, what is wrong."""
-    law = type(fit.law).__name__
-    if not fit.converged:
-        return f"No answer: the search for the parameters of {law} has not converged."
-    reserved, sentence = joined_words(fit.reservations), _values_in_words(fit)
-    against = _objection(fit)
-    if against:
-        nearest = f"it comes nearest with {sentence}" if fit.determined.any() else sentence
-        sentence = f"{law} {against}; {nearest}"
-    if reserved:
-        sentence += f"; {'and' if against else 'but'} {reserved}"
-    return f"{sentence}."
 
 
 def _values_in_words(fit: FitResult) -> str:
@@ -170,7 +180,7 @@ def parameter_rows(fit: FitResult) -> list[list[str]]:
             error_text = "unknown" if np.isnan(error) else f"{error:.3g}"
         interval = "-"
         if np.isfinite(error) or fit.profiles:
-            interval = in_words(pieces, (fit.bounds[0][i], fit.bounds[1][i]))
+            interval = pieces_in_words(pieces, (fit.bounds[0][i], fit.bounds[1][i]))
         note = "at its bound" if fit.at_bound[i] else ""
         note = ", ".join(filter(None, [note if seen[i] else UNSEEN, _prior(fit, i)]))
         rows.append(
@@ -207,7 +217,7 @@ def _parameters(fit: FitResult) -> list[str]:
         f"{name:{width}s} {value:>12s} {error:>12s}   {'   '.join(rest)}".rstrip()
         for name, value, error, *rest in [head, *parameter_rows(fit)]
     ]
-    lines += [f"{name} = {with_error(*pair)} is tied" for name, pair in tied_values(fit).items()]
+    lines += [f"{name} = {with_error(*pair)} is tied" for name, pair in fit.tied.items()]
     freedom = fit.degrees_of_freedom
     if fit.problem.sigma is None and 0 < freedom <= FEW_DEGREES:
         lines.append(
@@ -349,3 +359,327 @@ def _shots(fit: FitResult) -> list[str]:
     if shots > rows_shown:
         lines.append(f"     ... and {shots - rows_shown} more shots")
     return lines
+
+
+# ---------------------------------------------------------------------------- the fit
+
+
+class Fit(FitResult[AnyLaw]):
+    """See `FitResult`."""
+
+    __doc__ = FitResult.__doc__
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything a JSON file can hold; numbers that are not finite become None."""
+        interval = self.confidence_interval()
+        parameters = [
+            {
+                "name": name,
+                "value": as_data(self.value[i]),
+                "standard_error": as_data(self.standard_error[i]),
+                "confidence_interval_95": as_data(interval[i]),
+                "at_bound": bool(self.at_bound[i]),
+                "seen": bool(self.determined[i]),
+                "profile_95": as_data(self.profiles[i].intervals) if self.profiles else None,
+            }
+            for i, name in enumerate(self.names)
+        ]
+        starts = [
+            {"sum_of_squares": s.sum_of_squares, "value": as_data(s.value), "count": s.count}
+            for s in self.starts
+        ]
+        return {
+            "law": type(self.law).__name__,
+            "method": self.method,
+            "parameters": parameters,
+            "rms": self.rms,
+            "noise": as_data(self.noise),
+            "degrees_of_freedom": self.degrees_of_freedom,
+            "rank": self.rank,
+            "identifiability": list(self.identifiability),
+            "warnings": list(self.warnings),
+            "verdict": self.verdict,
+            "reservations": list(self.reservations),
+            "seed": self.seed,
+            "converged": self.converged,
+            "covariance": as_data(self.covariance),
+            "correlation": as_data(self.correlation),
+            "starts": starts,
+            "shots": [] if self.experiments is None else list(self.experiments.shots),
+            "predicted": as_data(self.predicted),
+            "residual": as_data(self.residual),
+            "status": [STATUS[code].name for code in self.status],
+        }
+
+    @property
+    def verdict(self) -> str:
+        """The result in one sentence that can be quoted: the first one of `print(fit)`.
+
+        Values with their errors, what they assume, and what speaks against them.
+        """
+        law = type(self.law).__name__
+        if not self.converged:
+            return f"No answer: the search for the parameters of {law} has not converged."
+        reserved, sentence = joined_words(self.reservations), _values_in_words(self)
+        against = _objection(self)
+        if against:
+            nearest = f"it comes nearest with {sentence}" if self.determined.any() else sentence
+            sentence = f"{law} {against}; {nearest}"
+        if reserved:
+            sentence += f"; {'and' if against else 'but'} {reserved}"
+        return f"{sentence}."
+
+    def save(self, path: str | Path) -> Path:
+        """Write the fit to a file (JSON) that `ji.load_fit` reads: problem, result, versions.
+
+        Args:
+            path: the file; an existing file is replaced.
+
+        Returns:
+            The path.
+
+        Raises:
+            ValueError: a fit of something else than shots, or with ties: functions cannot be saved.
+        """
+        problem = self.problem
+        if self.experiments is None:
+            raise ValueError("Argument `fit` must be to shots to be saved: functions cannot be.")
+        if problem.ties:
+            raise ValueError("Argument `fit` must have no ties to be saved: functions cannot be.")
+        names = [field.name for field in dataclasses.fields(self) if field.name != _REBUILT]
+        record = {
+            "format": FORMAT,
+            "versions": versions(),
+            "problem": {
+                "law": _encoded(problem.law),
+                "scene": _encoded(problem.scene),
+                "experiments": _encoded(self.experiments),
+                "free": {name: label.tolist() for name, label in problem.parameters.labels.items()},
+                "bounds": _encoded(dict(zip(problem.names, problem.domains.tolist()))),
+                "priors": {problem.names[i]: [mean, std] for i, mean, std in problem.priors},
+                "used": (~np.isnan(problem.measured).all(axis=1)).tolist(),
+                "notes": list(problem.notes),
+                "left_out": list(problem.left_out),
+            },
+            "result": {name: _encoded(getattr(self, name)) for name in names},
+        }
+        path = Path(path)
+        path.write_text(json.dumps(record, allow_nan=False, indent=1) + "\n", encoding="utf-8")
+        return path
+
+    def plot(self) -> "Figure":
+        """The picture of `ji.plot.fit`: measured and fitted velocities, and the residuals."""
+        from jimpact import plot
+
+        return plot.fit(self)
+
+    def to_csv(self, path: str | Path) -> Path:
+        """Write a row a parameter: value, standard error, ends of its 95 % interval, whether seen.
+
+        Args:
+            path: the file; an existing file is replaced.
+
+        Returns:
+            The path.
+        """
+        columns, path = parameter_columns(self), Path(path)
+        with path.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(["parameter", *columns])
+            for name, *row in zip(self.names, *(x.tolist() for x in columns.values())):
+                writer.writerow([name, *row])
+        return path
+
+    def to_pandas(self) -> Any:
+        """The parameters as a `pandas.DataFrame`, which must be installed."""
+        columns, index = parameter_columns(self), list(self.names)
+        return needed("pandas", "pip install pandas").DataFrame(columns, index=index)
+
+    def to_xarray(self) -> Any:
+        """Parameters, covariance, every shot as an `xarray.Dataset`, which must be installed."""
+        pair = ("parameter", "parameter_2")
+        arrays: dict[str, Any] = {
+            "value": ("parameter", self.value),
+            "standard_error": ("parameter", self.standard_error),
+            "determined": ("parameter", self.determined),
+            "covariance": (pair, self.covariance),
+            "correlation": (pair, self.correlation),
+        }
+        coordinates: dict[str, Any] = {axis: list(self.names) for axis in pair}
+        measured, data = np.asarray(self.problem.measured, float), self.experiments
+        axes: tuple[str, ...] = tuple(f"value_{i + 1}" for i in range(measured.ndim))
+        if data is not None:
+            axes = ("shot", "velocity")
+            units = data.units
+            coordinates |= {"shot": list(data.shots), "unit": ("velocity", list(units))}
+            arrays["before"] = (axes, np.asarray(data.pre))
+            arrays["status"] = ("shot", [STATUS[code].name for code in self.status])
+        for name, values in (
+            ("measured", measured),
+            ("predicted", self.predicted),
+            ("residual", self.residual),
+        ):
+            arrays[name] = (axes, values)
+        about = {"law": type(self.law).__name__, "verdict": self.verdict, "rms": self.rms}
+        return needed("xarray", "pip install xarray").Dataset(arrays, coordinates, about)
+
+    def __str__(self) -> str:
+        return "\n\n".join("\n".join(block) for block in report_blocks(self).values() if block)
+
+
+def load_fit(path: str | Path) -> Fit[Any]:
+    """The fit that `Fit.save` has written, with all that one can do with a fit.
+
+    The classes of laws and scenes are imported by name, so read only files that you trust.
+
+    Args:
+        path: the file.
+
+    Returns:
+        `Fit`.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: no saved fit, one of another format, a law that cannot be imported.
+
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import jimpact as ji
+    >>> data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.3, 0.7], [0.6, 1.4]], sigma=0.02)
+    >>> result = ji.fit(ji.Newton(0.9), ji.chain([1.0, 1.0]), data)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     again = ji.load_fit(result.save(Path(folder) / "fit.json"))
+    >>> again.verdict == result.verdict
+    True
+    """
+    return Fit(**_read_fit(Path(path)))
+
+
+# ---------------------------------------------------------------------------- as data
+
+
+def parameter_columns(fit: FitResult) -> dict[str, np.ndarray]:
+    """Value, standard error, ends of the 95 % interval, at its bound, seen (P,)."""
+    interval = fit.confidence_interval()
+    return {
+        "value": fit.value,
+        "standard_error": fit.standard_error,
+        "low_95": interval[:, 0],
+        "high_95": interval[:, 1],
+        "at_bound": fit.at_bound,
+        "determined": fit.determined,
+    }
+
+
+# ---------------------------------------------------------------------------- in a file
+
+
+def versions() -> dict[str, str]:
+    """Versions of jimpact, of what it computes with, and of Python."""
+    found = {"jimpact": jimpact.__version__}
+    for name in _PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:  # installed in a way that leaves no record
+            continue
+    return found | {"Python": f"{platform.python_version()}, {platform.system()}"}
+
+
+def _read_fit(path: Path) -> dict[str, Any]:
+    """The fields of a fit that `write_fit` has written."""
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path}: the file must be a saved fit (JSON), but {error}.") from None
+    if not isinstance(record, dict) or "format" not in record:
+        raise ValueError(f"{path}: the file must be a saved fit, but has no `format`.")
+    if record["format"] != FORMAT:
+        writer = record.get("versions", {}).get("jimpact", "an unknown version")
+        raise ValueError(
+            f"{path}: the file must be a fit saved in format {FORMAT}, but has format "
+            f"{record['format']} (written by jimpact {writer}; this is {jimpact.__version__})."
+        )
+    try:
+        result = {name: _decoded(value) for name, value in record["result"].items()}
+        return result | {_REBUILT: _problem(record["problem"], result["value"])}
+    except (KeyError, AttributeError, ImportError, TypeError) as error:
+        writer = record.get("versions", {}).get("jimpact")
+        raise ValueError(
+            f"{path}: the fit, saved by jimpact {writer}, cannot be read: {error!r}. A law of your "
+            "own must be imported before."
+        ) from error
+
+
+def _problem(parts: dict[str, Any], value: np.ndarray) -> FitProblem:
+    """The problem that was solved."""
+    law, scene, data = (_decoded(parts[name]) for name in ("law", "scene", "experiments"))
+    bounds = {name: tuple(pair) for name, pair in _decoded(parts["bounds"]).items()}
+    problem = FitProblem.from_shots(law, scene, data, parts["free"], bounds, parts["priors"])
+    used = np.broadcast_to(np.array(parts["used"])[:, None], problem.measured.shape)
+    if parts["left_out"]:
+        problem = problem.weighed(used.astype(float))
+    problem = problem.passing_errors_at(value)
+    notes, left_out = tuple(parts["notes"]), tuple(parts["left_out"])
+    return dataclasses.replace(problem, notes=notes, left_out=left_out)
+
+
+def _encoded(value: Any) -> Any:
+    """What a JSON file can hold, from which `_decoded` makes the value again, bit by bit."""
+    if isinstance(value, StaticNumber):
+        return {"static": float(value)}
+    if isinstance(value, StaticNumbers):
+        return {"statics": list(value)}
+    if value is None or isinstance(value, bool | str | int):
+        return value
+    if isinstance(value, float):
+        return value if np.isfinite(value) else {"number": str(value)}
+    if isinstance(value, jax.Array | np.ndarray | np.generic):
+        array = np.asarray(value)
+        entries = [_encoded(x) for x in array.ravel().tolist()]
+        kind = {"dtype": str(array.dtype), "device": isinstance(value, jax.Array)}
+        return {"array": entries, "shape": list(array.shape), **kind}
+    if dataclasses.is_dataclass(value):
+        cls = type(value)
+        fields = {f.name: _encoded(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        return {"class": f"{cls.__module__}:{cls.__qualname__}", "fields": fields}
+    if isinstance(value, dict):
+        return {"dict": {key: _encoded(each) for key, each in value.items()}}
+    if isinstance(value, list | tuple):
+        return {type(value).__name__: [_encoded(each) for each in value]}
+    raise ValueError(f"Argument `fit` must hold numbers and words to be saved, but has {value!r}.")
+
+
+def _decoded(data: Any) -> Any:
+    """What `_encoded` has encoded."""
+    if not isinstance(data, dict):
+        return data
+    if "array" in data:
+        array = np.array([_decoded(x) for x in data["array"]], data["dtype"])
+        array = array.reshape(data["shape"])
+        return jnp.asarray(array) if data["device"] else array
+    if "class" in data:
+        return _instance(data["class"], data["fields"])
+    (kind, content) = next(iter(data.items()))
+    if kind in ("static", "statics", "number"):
+        makers: dict[str, Any] = {"static": StaticNumber, "statics": StaticNumbers, "number": float}
+        return makers[kind](content)
+    if kind == "dict":
+        return {key: _decoded(each) for key, each in content.items()}
+    return {"tuple": tuple, "list": list}[kind](_decoded(each) for each in content)
+
+
+def _instance(place: str, fields: dict[str, Any]) -> Any:
+    """An instance of the class at a place with these fields, which are all that it has."""
+    module, _, name = place.partition(":")
+    found: Any = sys.modules.get(module) or import_module(module)
+    for part in name.split("."):
+        found = getattr(found, part)
+    if not dataclasses.is_dataclass(found):
+        raise TypeError(f"{place} is no class of a law, scene or result")
+    known = {field.name for field in dataclasses.fields(found)}
+    if known != set(fields):
+        raise TypeError(f"{name} has the fields {sorted(known)}, the file {sorted(fields)}")
+    instance: Any = object.__new__(found)  # type: ignore[arg-type]  # as it was: its fields have been checked and converted
+    for key, value in fields.items():
+        object.__setattr__(instance, key, _decoded(value))
+    return instance

@@ -10,15 +10,14 @@ from scipy.special import chdtrc, fdtrc, stdtr
 
 from jimpact._checks import check_choice, check_kind
 from jimpact.files.records import as_data, number, table
-from jimpact.fits.experiments import Experiments
-from jimpact.fits.fitting import Fit, fit
-from jimpact.fits.many import leave_one_out
-from jimpact.fits.matrix_fit import admissible_start
+from jimpact.fits.data import Experiments
+from jimpact.fits.fitting import Fit, fit, leave_one_out
+from jimpact.fits.matrices import admissible_start
 from jimpact.fits.parameters import OF_SPEED, default_free
 from jimpact.fits.problem import FEW
 from jimpact.fits.profiles import needs_profiles, profile
 from jimpact.fits.report import named_values
-from jimpact.fits.result import check_squares
+from jimpact.fits.uncertainty import check_squares
 from jimpact.law import Law, free_parameters_of, with_parameter
 from jimpact.laws.velocity_dependent import VelocityDependent
 from jimpact.progress import progress_bar

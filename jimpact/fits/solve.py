@@ -1,4 +1,4 @@
-"""Nonlinear least squares in a region, from many starts or of many problems at once.
+"""Nonlinear least squares in a region, from many starts or of many problems at once, and minima.
 
 Minimize `|r(y)|^2 / 2` for y in a `Region`, mostly the `BoxRegion` `low <= y <= high`, by
 Levenberg-Marquardt or by gradient descent with optax. Steps are cut at the box, and a variable on a
@@ -8,8 +8,9 @@ One pass evaluates residual and Jacobian together, so that an impact is compiled
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -22,8 +23,11 @@ from jimpact.progress import Show
 if TYPE_CHECKING:
     import optax  # which takes long to import
 
-# y (P,) -> residual (R,), Jacobian (R, P), anything else to keep of the best point
-Evaluate = Callable[[jax.Array], tuple[jax.Array, jax.Array, Any]]
+    from jimpact.fits.problem import FitProblem
+
+# residual (R,), Jacobian (R, P), anything else to keep of the best point y (P,)
+Evaluated = tuple[jax.Array, jax.Array, Any]
+Evaluate = Callable[[jax.Array], Evaluated]
 Method: TypeAlias = "str | optax.GradientTransformation"
 
 # Steps of one start before the solver gives up: more only costs time.
@@ -63,26 +67,29 @@ PASSES = 4  # of a program, between two looks at the clock
 CREEPS, START_CREEPS, BEHIND, FALLS = 1e-3, 0.01, 10.0, 0.5
 
 
-def quiet(step: str, done: float, total: float | None) -> None:
-    """No progress is shown."""
-
-
-class Region(Protocol):
-    """A convex set of y, as far as the methods need it."""
-
-    def retract(self, y: jax.Array) -> jax.Array:
-        """y itself, or a point of the region near it."""
-
-    def nearest(self, y: jax.Array) -> jax.Array:
-        """The point of the region nearest to y."""
-
-    def free_gradient(self, y: jax.Array, gradient: jax.Array) -> jax.Array:
-        """The gradient without what would push y out of the region."""
-
-    def step(
-        self, y: jax.Array, residual: jax.Array, jacobian: jax.Array, damping: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """Damped Gauss-Newton step inside the region, and the decrease it promises."""
+# Random starts: a stiffness within this factor of the user's, a parameter without two bounds
+# within this many natural scales of the user's.
+START_FACTOR = 5.0
+START_SCALES = 2.0
+# Random coefficients of restitution start above this: below, contacts of a chain re-close many
+# times, which takes ten times as long and hardly occurs in hard bodies. (Fits do go there.)
+START_RESTITUTION = 0.5
+# Ends are one minimum if their sums of squares differ by less than this many variances of a
+# residual, and their values by less than this share of a standard error, or of a natural scale
+# where the data do not determine them. What starts leave is a tenth of that.
+SAME_COST, SAME_ERRORS, SAME_VALUE = 1e-2, 0.2, 1e-3
+FLAT = 1e-6  # share of the largest singular value below which data do not determine a direction
+# Starts up to so many variances above the best are solved to their ends, the others only to
+# where minima can be told apart: intervals of all levels end before.
+HARDLY_WORSE = 100.0
+STARTS, ROUNDS = 12, 6  # by default, and how often others around the best follow
+# Several stiffness ratios often reproduce the same shots. Where one or two are free, a search of
+# its own choice also starts from SCANNED values of each, up to this factor from the user's; ten
+# times more values take ten times as long, ten times fewer step over minima.
+SCANNED, SCAN_FACTOR, SCANS = 24, 100.0, 2
+NEAR_SPREAD = 2.0  # of starts around the best, in standard errors
+NEAR_RCOND = 1e-10  # directions that the data do not determine are not searched
+SETTLED, SETTLING = 1e-5, 10  # change (natural scales) and rounds, where errors of v- are passed on
 
 
 class BoxRegion(eqx.Module):
@@ -157,19 +164,6 @@ class SolverState(eqx.Module):
     done: jax.Array
     stuck: jax.Array  # no step lowers the cost
 
-    @property
-    def squares(self) -> np.ndarray:
-        """`|r|^2` at the best points (S,), on the host."""
-        return 2 * np.asarray(self.cost, float)
-
-    @property
-    def converged(self) -> np.ndarray:
-        """Which of the points (S,) are so close to a minimum that they stand, on the host."""
-        promised, squares = 2 * np.asarray(self.gain, float), self.squares
-        enough = CONVERGED if isinstance(self.memory, Damping) else DESCENDED
-        small = promised <= enough * squares / self.residual.shape[-1]
-        return small | (squares <= EXACT[str(self.y.dtype)]) | np.asarray(self.stuck)
-
 
 def check_method(method: Any) -> None:
     """Raise a ValueError unless `method` is a known name or an optax transformation."""
@@ -209,7 +203,7 @@ def begin(y: Any, first: tuple[Any, Any, Any], method: Method, max_steps: int) -
 
 def advance(
     evaluate: Evaluate,
-    region: Region,
+    region: Any,
     method: Method,
     max_steps: int,
     state: SolverState,
@@ -265,7 +259,7 @@ def advance(
 
 
 @full_precision
-def nearest(region: Region, y: jax.Array) -> jax.Array:
+def nearest(region: Any, y: jax.Array) -> jax.Array:
     """The point of a region nearest to y: least squares of the distance."""
     identity, method = jnp.eye(y.shape[0], dtype=y.dtype), "levenberg-marquardt"
     steps = DEFAULT_STEPS[method]
@@ -311,7 +305,7 @@ def _transformation(method: Method, max_steps: int) -> "optax.GradientTransforma
     return optax.with_extra_args_support(method)
 
 
-# ------------------------------------------------------------------------ many at once
+# ---------------------------------------------------------------------------- many at once
 
 
 class Search(NamedTuple):
@@ -319,8 +313,27 @@ class Search(NamedTuple):
 
     method: Method = "levenberg-marquardt"
     max_steps: int = DEFAULT_STEPS["levenberg-marquardt"]
-    show: Show = quiet
+    show: Show = lambda step, done, total: None
     deadline: float = np.inf  # of `time.monotonic`, after which no pass is begun
+
+
+class Ends(NamedTuple):
+    """Where S solves ended, on the host; residuals in units of sigma."""
+
+    y: np.ndarray  # (S, Q)
+    squares: np.ndarray  # (S,) |r|^2
+    jacobian: np.ndarray  # (S, R, Q)
+    predicted: np.ndarray
+    status: np.ndarray
+    slopes: np.ndarray | None  # `dv+/dv-` of the shots, where errors of v- are passed on
+    converged: np.ndarray  # (S,) whether so close to a minimum that it stands
+    stuck: np.ndarray  # (S,) no step lowers the sum of squares, although derivatives promise it
+    steps: np.ndarray
+    exact: np.ndarray  # (S,) sums of squares up to which data count as reproduced
+
+    def rows(self, which: Any) -> "Ends":
+        """Some of them."""
+        return jax.tree.map(lambda x: x[which], self)
 
 
 def minimize(
@@ -330,20 +343,22 @@ def minimize(
     stop: float = 0.0,
     rivals: bool = False,
     what: str = "fits",
-) -> SolverState:
-    """Minima of S problems (`Residuals` with a leading axis) from y (S, Q), on the host.
+) -> Ends:
+    """Minima of S problems (`FitProblem.program` with a leading axis) from y (S, Q).
 
     As many as `problems.lanes(S)` are solved side by side; those that are done make room for
     others. `stop`: see `FINE`, which it is at least. `rivals`: all are starts of one problem, and
     those that creep or will not become the best are given up. Progress counts `what`.
     """
-    dtype, count = problems.offset.dtype, len(points)
+    dtype, count = problems.low.dtype, len(points)
     limit: Any = search.max_steps
-    if search.method == "levenberg-marquardt":
+    descends = search.method != "levenberg-marquardt"
+    if not descends:
         limit = np.asarray(limit)  # one program serves all limits
     rule: Any = (search.method, limit, np.asarray(max(FINE[str(dtype)], stop), dtype))
     points = points.astype(dtype)
     states = begin(points, problems.blank(points), search.method, search.max_steps)
+    converged = np.zeros(count, bool)
     active, lanes = np.arange(count), problems.lanes(count)
     while len(active):
         before = states.cost.copy()
@@ -352,18 +367,38 @@ def minimize(
             some = advance_all(_rows(problems, rows), _rows(states, rows), *rule)
             for leaf, value in zip(jax.tree.leaves(states), jax.tree.leaves(some)):
                 leaf[rows] = value
+        converged = _converged(states, DESCENDED if descends else CONVERGED)
         ended = states.done | (states.steps >= search.max_steps)
-        if search.method == "levenberg-marquardt":
-            far = states.cost > (BEHIND if rivals else np.inf) * np.nanmin(states.cost)
+        if not descends:
+            far = rivals & (states.cost > BEHIND * np.nanmin(states.cost))
             least = np.where(far, FALLS, 1 - (START_CREEPS if rivals else CREEPS))
             slow = (states.cost > least * before) & (states.memory.value < _SHORT)
-            ended |= slow & ~states.converged
+            ended |= slow & ~converged
         active = active[~ended[active]]
         done, steps = count - len(active), int(states.steps.max())
         search.show(f"fit: {done} of {count} {what} done, step {steps}", done, count)
         if time.monotonic() > search.deadline:
             break
-    return states
+    size = np.asarray(problems.size, float)
+    return Ends(
+        y=np.asarray(states.y, float),
+        squares=2 * np.asarray(states.cost, float) * size**2,
+        jacobian=np.asarray(states.jacobian, float) * size[:, None, None],
+        predicted=np.asarray(states.aux[0], float),
+        status=states.aux[1],
+        slopes=states.aux[2] if len(states.aux) > 2 else None,
+        converged=converged,
+        stuck=np.asarray(states.stuck),
+        steps=np.asarray(states.steps),
+        exact=EXACT[str(dtype)] * size**2,
+    )
+
+
+def _converged(states: SolverState, enough: float) -> np.ndarray:
+    """Which points (S,) are so close to a minimum that they stand."""
+    promised, squares = (2 * np.asarray(x, float) for x in (states.gain, states.cost))
+    small = promised <= enough * squares / states.residual.shape[-1]
+    return small | (squares <= EXACT[str(states.y.dtype)]) | states.stuck
 
 
 @quick_jit
@@ -383,3 +418,267 @@ def advance_all(
 def _rows(tree: Any, rows: np.ndarray) -> Any:
     """These rows of all arrays."""
     return jax.tree.map(lambda leaf: leaf[rows] if eqx.is_array(leaf) else leaf, tree)
+
+
+def repeated(problem: "FitProblem", count: int) -> Any:
+    """So many times the same problem, without copies."""
+
+    def each(leaf: Any) -> Any:
+        """The array without copies."""
+        return np.broadcast_to(leaf, (count, *np.shape(leaf))) if eqx.is_array(leaf) else leaf
+
+    return jax.tree.map(each, problem.program())
+
+
+def stacked(problems: "list[FitProblem]") -> Any:
+    """The problems side by side."""
+    filled = [problem.program() for problem in problems]
+    return jax.tree.map(lambda *x: np.stack([np.asarray(leaf) for leaf in x]), *filled)
+
+
+def minimize_with(
+    many: Any, points: np.ndarray, fixed: np.ndarray, search: Search, stop: float = 0.0
+) -> Ends:
+    """Minima of S problems from y (S, Q) with the `fixed` (S, Q) entries of y as they are."""
+    points = points.astype(many.low.dtype)
+    low, high = (np.where(fixed, points, end) for end in (many.low, many.high))
+    many = replace(many, low=low, high=high, matrix=None)
+    return minimize(many, points, search, stop, what="fixed values")
+
+
+# ---------------------------------------------------------------------------- distinct minima
+
+
+class Minimum(NamedTuple):
+    """A point that starts ended in."""
+
+    squares: float  # |r|^2, in units of sigma
+    value: np.ndarray  # of the parameters (P,)
+    starts: int  # how many
+    jacobian: np.ndarray  # (R, P), of the scaled parameters
+
+
+class Solution(NamedTuple):
+    """All distinct minima, best first, and what the law of the best predicts."""
+
+    minima: list[Minimum]
+    predicted: np.ndarray  # shaped like what was measured
+    status: np.ndarray
+    slopes: np.ndarray | None  # `dv+/dv-` of the shots, where errors of v- are passed on
+    converged: bool
+    stuck: bool  # no step lowers the sum of squares, although derivatives promise it
+    at_bound: np.ndarray
+    steps: int
+    lost: int  # starts that did not converge
+
+    @property
+    def value(self) -> np.ndarray:
+        """The parameters (P,) of the best."""
+        return self.minima[0].value
+
+    @property
+    def jacobian(self) -> np.ndarray:
+        """(R, P), of the scaled parameters at the best."""
+        return self.minima[0].jacobian
+
+
+def solution(
+    problem: "FitProblem", ends: Ends, counts: np.ndarray | None = None, lost: int = 0
+) -> Solution:
+    """The distinct minima among ends; counts: of the starts that an end is for."""
+    counts = np.ones(len(ends.y), int) if counts is None else counts
+    count, measured = len(problem.names), problem.measured
+    groups = _groups(ends, count)
+    best, y = groups[0][0], ends.y[:, :count]
+    # starts that did not converge have no minimum to report, unless they are the best there is
+    kept = [[i for i in group if ends.converged[i] or i == best] for group in groups]
+    minima = [
+        Minimum(
+            float(ends.squares[group[0]]),
+            problem.values_at(ends.y[group[0]]),
+            int(counts[group].sum()),
+            ends.jacobian[group[0]][: measured.size, :count],  # without what filled up
+        )
+        for group in kept
+        if group
+    ]
+    rows = slice(len(measured)) if measured.ndim else ...
+    low, high = (np.asarray(end)[:count] for end in (problem.low, problem.high))
+    return Solution(
+        minima=minima,
+        predicted=ends.predicted[best][rows],
+        status=ends.status[best][rows],
+        slopes=None if ends.slopes is None else ends.slopes[best],
+        converged=bool(ends.converged[best]),
+        stuck=bool(ends.stuck[best]),
+        at_bound=(y[best] <= low) | (y[best] >= high),
+        steps=int(np.max(ends.steps)),
+        lost=lost + int(counts.sum()) - sum(minimum.starts for minimum in minima),
+    )
+
+
+def find_minima(problem: "FitProblem", starts: int | None, seed: int, search: Search) -> Solution:
+    """All starts to where their minima can be told apart, and the best of these to their ends.
+
+    Two thirds of the starts are those of `start_points`. The law is only piecewise smooth, so
+    that the sum of squares has side minima close to a minimum: the others begin around the best.
+    None: STARTS, others along the ratios of stiffness, and further ones around the best as long as
+    they lower it.
+    """
+    rounds, starts = (ROUNDS, STARTS) if starts is None else (1, starts)
+    rng, far = np.random.default_rng(seed), starts - starts // 3
+    points = start_points(problem, far, rng)
+
+    def rough(points: np.ndarray) -> Ends:
+        """To where minima can be told apart."""
+        many = repeated(problem, len(points))
+        return minimize(many, points, search, COARSE, rivals=True, what="starts")
+
+    if starts == 1:
+        return solution(problem, minimize(repeated(problem, 1), points, search, what="starts"))
+    if rounds > 1:
+        points = np.concatenate([points, _scanned(problem)])
+    ends = rough(points)
+    for _ in range(rounds if starts > far else 0):
+        least = np.nanmin(ends.squares)
+        more = rough(_near(problem, ends, starts - far, rng))
+        ends = jax.tree.map(lambda a, b: np.concatenate([a, b]), ends, more)
+        if not np.nanmin(more.squares) < least * (1 - 1 / ends.jacobian.shape[1]):
+            break
+    groups, total = _groups(ends, len(problem.names)), len(ends.y)
+    firsts = np.array([group[0] for group in groups])
+    converged = ends.converged | (np.arange(total) == firsts[0])
+    counts = np.array([converged[group].sum() for group in groups])
+    variance = ends.squares[firsts[0]] / ends.jacobian.shape[1]
+    near = ends.squares[firsts] <= ends.squares[firsts[0]] + HARDLY_WORSE * variance
+    near &= converged[firsts]
+    points = ends.y[firsts[near]]
+    fine = minimize(repeated(problem, len(points)), points, search, what="minima")
+    search.show(f"fit: {total} of {total} starts done", total, total)
+    steps = ends.steps.max() + fine.steps.max()
+    others = converged[firsts] & ~near
+    ends = jax.tree.map(lambda a, b: np.concatenate([b, a[firsts[others]]]), ends, fine)
+    counts = np.concatenate([counts[near], counts[others]])
+    lost = total - int(counts.sum())
+    return solution(problem, ends, counts, lost)._replace(steps=int(steps))
+
+
+def start_points(problem: "FitProblem", starts: int, rng: np.random.Generator) -> np.ndarray:
+    """Starts y (S, Q): the law's own values, then random ones inside the bounds."""
+    log, own = problem.parameters.log, problem.point(problem.start)
+    count = len(log)
+    low, high = (np.array(end, float)[:count] for end in (problem.low, problem.high))
+    reach = np.where(log, np.log(START_FACTOR), START_SCALES)
+    low = np.where(log | np.isinf(low), np.maximum(low, own[:count] - reach), low)
+    high = np.where(log | np.isinf(high), np.minimum(high, own[:count] + reach), high)
+    elastic = np.array([field == "restitution" for field in problem.parameters.of_fields])
+    low = np.where(elastic & (high > START_RESTITUTION), np.maximum(low, START_RESTITUTION), low)
+    points = np.zeros((starts, len(own)))
+    points[:, :count] = low + (high - low) * rng.random((starts, count))
+    points[0] = own
+    return points
+
+
+def _scanned(problem: "FitProblem") -> np.ndarray:
+    """Points (S, Q) with other ratios of stiffness, if few are free: each one in turn."""
+    fields, log = problem.parameters.of_fields, problem.parameters.log
+    ratios = [i for i, field in enumerate(fields) if field == "stiffness" and log[i]]
+    own = problem.point(problem.start)
+    if len(ratios) > SCANS:
+        return np.zeros((0, len(own)))
+    points = np.tile(own, (len(ratios), SCANNED, 1))
+    for row, i in zip(points, ratios, strict=True):
+        row[:, i] += np.linspace(-np.log(SCAN_FACTOR), np.log(SCAN_FACTOR), SCANNED)
+    return np.clip(points.reshape(-1, len(own)), problem.low, problem.high)
+
+
+def _near(problem: "FitProblem", ends: Ends, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Points (count, Q) around the best, as far off as its standard errors, inside the bounds."""
+    best = int(np.nanargmin(ends.squares))
+    jacobian, measured = np.nan_to_num(ends.jacobian[best]), int(np.sum(problem.weight > 0))
+    inverse = np.linalg.pinv(jacobian.T @ jacobian, rcond=NEAR_RCOND, hermitian=True)
+    spread = NEAR_SPREAD * np.sqrt(ends.squares[best] / measured * np.diag(inverse))
+    y = ends.y[best]
+    points = y + np.minimum(spread, START_SCALES) * rng.normal(size=(count, len(y)))
+    return np.clip(points, problem.low, problem.high)
+
+
+def _groups(ends: Ends, count: int) -> list[list[int]]:
+    """Ends in the same minimum, best minimum first.
+
+    Of equally good ends a converged one comes first, then the earliest start: the first start is
+    the user's own.
+    """
+    squares, y, least = ends.squares, ends.y[:, :count], np.nanmin(ends.squares)
+    unit, exact = SAME_COST / ends.jacobian.shape[1], ends.exact[0]
+    equal = squares <= least * (1 + unit) + exact
+    order = np.lexsort((np.arange(len(y)), ~ends.converged, np.where(equal, least, squares)))
+    groups: list[list[int]] = []
+    for i in order:
+        for group in groups:
+            first = group[0]
+            close = abs(squares[i] - squares[first]) <= unit * squares[first] + exact
+            if close and _same_values(ends, first, y[i] - y[first]):
+                group.append(int(i))
+                break
+        else:
+            groups.append([int(i)])
+    return groups
+
+
+def _same_values(ends: Ends, first: int, apart: np.ndarray) -> bool:
+    """Whether values (P,) so far apart from those of an end are the same."""
+    if np.abs(apart).max() < SAME_VALUE:
+        return True
+    jacobian = ends.jacobian[first][:, : len(apart)]
+    if not np.isfinite(jacobian).all():
+        return False
+    _, singular, directions = np.linalg.svd(jacobian, full_matrices=False)
+    determined = singular > FLAT * singular[0]
+    noise = np.sqrt(ends.squares[first] / len(jacobian))
+    errors = np.where(determined, noise / np.where(determined, singular, 1.0), 0.0)
+    allowed = np.maximum(SAME_ERRORS * errors, SAME_VALUE)
+    return bool((np.abs(directions @ apart) <= allowed).all())
+
+
+def settled(
+    problems: "list[FitProblem]",
+    points: np.ndarray,
+    search: Search,
+    many: Any = None,
+    slopes: Any = None,
+) -> "tuple[list[FitProblem], Ends]":
+    """Minima next to points (S, Q), equally many of each problem, its best one first.
+
+    Errors of v- are passed on by the law of the best minimum, until both agree. `many`: other
+    problems (S, ...) than these, whose weights alone are taken. `slopes`: `dv+/dv-` of each problem
+    at its best point; None: the problems pass errors on by them already.
+    """
+    each = len(points) // len(problems)
+    if many is None:
+        many = stacked([problem for problem in problems for _ in range(each)])
+
+    def weighted() -> Any:
+        """The many problems with errors of v- passed on by the slopes."""
+        filled = [p.program() for p in problems for _ in range(each)]
+        names = ("weight", "size", "mixing")
+        return replace(many, **{n: np.stack([getattr(p, n) for p in filled]) for n in names})
+
+    for _ in range(SETTLING):
+        if slopes is not None:
+            problems = [p.with_errors_before(slope) for p, slope in zip(problems, slopes)]
+            many = weighted()
+        ends = minimize(many, points, search)
+        moved = np.abs(ends.y - points).max(axis=1) > SETTLED
+        if ends.slopes is None:
+            return problems, ends
+        points, best = ends.y, np.nanargmin(ends.squares.reshape(-1, each), axis=1)
+        last = ends.slopes[np.arange(0, len(points), each) + best]
+        if not moved.any():
+            if slopes is not None:  # residuals and Jacobians with the weights of the final law
+                problems = [p.with_errors_before(slope) for p, slope in zip(problems, last)]
+                many = weighted()
+                ends = minimize(many, points, search._replace(max_steps=1))
+            return problems, ends
+        slopes = last
+    return problems, ends._replace(converged=ends.converged & ~moved)

@@ -1,8 +1,28 @@
-"""Covariance, rank and what the data do not determine, from the Jacobian of weighted residuals."""
+"""Errors of fitted parameters: covariance, rank, what is not determined; intervals; the result."""
 
-from typing import NamedTuple
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Generic, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from scipy.special import ndtri, stdtrit
+
+from jimpact._checks import check_choice, check_kind, check_values
+from jimpact.fits.data import Experiments
+from jimpact.fits.parameters import (
+    AnyLaw,
+    LawInScene,
+    entry_of,
+    tied_names,
+    tied_places,
+    value_of,
+)
+from jimpact.fits.problem import FitProblem
+from jimpact.fits.solve import Minimum, Search, minimize_with, repeated, solution
+from jimpact.law import Law, parameters_of
+from jimpact.scene import Scene
 
 # Singular values of the scaled Jacobian below this share of the largest are zero: derivatives of
 # an impact are good to about 1e-7 (float64; 1e-4 in float32), so smaller ones may be errors.
@@ -13,6 +33,15 @@ RANK_TOLERANCE = {"float64": 1e-6, "float32": 1e-3}
 TAKES_PART = 1e-3
 
 SMALL_CHANGE = 0.01  # the size, in natural scales, in which undetermined combinations are stated
+# Relative standard error of a stiffness beyond which its linearized interval is not believed.
+HARDLY_SEEN = 0.2
+
+# Share of a prior's standard deviation from which on a standard error is the prior's: the data have
+# then less than a tenth of the information. Ten times as much would call priors of half of it so.
+PRIOR_ALONE = 0.95
+
+
+# ---------------------------------------------------------------------------- linearized errors
 
 
 class Uncertainty(NamedTuple):
@@ -28,41 +57,32 @@ class Uncertainty(NamedTuple):
     undetermined: tuple[str, ...]
 
 
-def uncertainty(
-    names: tuple[str, ...],
-    jacobian: np.ndarray,
-    scale: np.ndarray,
-    log: np.ndarray,
-    sum_of_squares: float,
-    values: int,
-    noise: float | None,
-    rank_tolerance: float,
-    value_name: str,
-) -> Uncertainty:
+def uncertainty(problem: FitProblem, minimum: Minimum, noise: float | None = None) -> Uncertainty:
     """Linearized errors at a minimum.
 
     Equation: `C = s^2 (J^T J)^-1` on the determined subspace, `s^2 = |r|^2 / (values - rank)`, or
     the known noise (1 where the weights are known errors); rank = number of singular values of J,
-    its columns scaled by the natural size of each parameter, above `rank_tolerance` times the
-    largest.
+    its columns scaled by the natural size of each parameter, above `RANK_TOLERANCE` times the
+    largest. Data without sigma that are reproduced to the last digit do not show their noise.
 
     Args:
-        names: of the parameters (P,).
-        jacobian: (R, P) of the weighted residuals, columns already scaled.
-        scale: the natural size (P,) of each parameter.
-        log: (P,) whether changes are given in percent.
-        sum_of_squares: |r|^2.
-        values: independent measured values.
-        noise: s; None: from |r|^2.
-        rank_tolerance: see `RANK_TOLERANCE`.
-        value_name: what a measured value is called.
+        problem: that was solved.
+        minimum: of it.
+        noise: s; None: as stated, or from |r|^2.
     """
+    scale = problem.steps_at(minimum.value)
+    _, of_priors = problem.prior_errors(minimum.value)
+    jacobian = np.vstack([minimum.jacobian, of_priors * scale])
     _, singular, directions = np.linalg.svd(jacobian, full_matrices=True)
-    singular = np.pad(singular, (0, len(names) - len(singular)))
-    rank = int(np.sum(singular > rank_tolerance * singular[0]))
-    freedom = values - rank
-    if noise is None:
-        noise = float(np.sqrt(sum_of_squares / freedom)) if freedom > 0 else np.nan
+    singular = np.pad(singular, (0, len(scale) - len(singular)))
+    rank = int(np.sum(singular > RANK_TOLERANCE[problem.precision] * singular[0]))
+    freedom = problem.values - rank
+    if noise is None and problem.sigma is not None:
+        noise = 1.0
+    elif noise is None and (freedom < 1 or reproduced(problem, minimum)):
+        noise = np.nan
+    elif noise is None:
+        noise = float(np.sqrt(minimum.squares / freedom))
     determined = directions[:rank] / singular[:rank, None]
     covariance = noise**2 * (determined.T @ determined) * np.outer(scale, scale)
     null = directions[rank:]
@@ -73,8 +93,13 @@ def uncertainty(
     with np.errstate(divide="ignore", invalid="ignore"):
         correlation = covariance / np.outer(error, error)
     np.fill_diagonal(correlation, 1.0)
-    undetermined = tuple(_in_words(names, row, scale, log, value_name) for row in _reduced(null))
-    return Uncertainty(rank, singular, freedom, noise, covariance, correlation, error, undetermined)
+    words = tuple(_in_words(problem, row, scale) for row in _reduced(null))
+    return Uncertainty(rank, singular, freedom, noise, covariance, correlation, error, words)
+
+
+def reproduced(problem: FitProblem, minimum: Minimum) -> bool:
+    """Whether all measured values are reproduced to the last digit."""
+    return minimum.squares <= problem.exact_squares
 
 
 def _reduced(null: np.ndarray) -> np.ndarray:
@@ -89,14 +114,10 @@ def _reduced(null: np.ndarray) -> np.ndarray:
     return rows
 
 
-def _in_words(
-    names: tuple[str, ...],
-    direction: np.ndarray,
-    scale: np.ndarray,
-    log: np.ndarray,
-    value_name: str,
-) -> str:
+def _in_words(problem: FitProblem, direction: np.ndarray, scale: np.ndarray) -> str:
     """A direction that leaves all predictions as they are, as small changes of parameters."""
+    names, log = problem.names, problem.parameters.log
+    value_name = "value" if problem.experiments is None else "velocity"
     parts = []
     step = SMALL_CHANGE * direction / np.abs(direction).max()
     for i in np.argsort(-np.abs(step), kind="stable"):
@@ -112,3 +133,468 @@ def _in_words(
         f"The data cannot see a combination: no measured {value_name} changes (to first order) "
         f"when {', '.join(parts[:-1])} and {parts[-1]} together."
     )
+
+
+# ---------------------------------------------------------------------------- intervals
+
+
+def check_level(level: float) -> None:
+    """Raise a ValueError unless this is a confidence level."""
+    if not 0 < level < 1:
+        raise ValueError(f"Argument `level` must lie in (0, 1), but has value {level}.")
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """`deviance` (G,) over the `value`s (G,) of parameter `name`, and where it is below `limit`.
+
+    `deviance` is the sum of squares with the parameter fixed, less its least value, over the noise
+    variance. `intervals` are the pieces of the confidence interval at `level`, in order; an end at
+    `domain` means that the data do not bound the parameter there. `better`: values of a minimum
+    below that of the fit, or None.
+    """
+
+    name: str
+    value: np.ndarray
+    deviance: np.ndarray
+    limit: float
+    level: float
+    intervals: tuple[tuple[float, float], ...]
+    domain: tuple[float, float]
+    better: np.ndarray | None = None
+
+    @property
+    def words(self) -> str:
+        """The interval in words.
+
+        >>> import numpy as np
+        >>> from jimpact.fits.uncertainty import Profile
+        >>> first = ("e", np.zeros(1), np.zeros(1), 4.0, 0.95)
+        >>> Profile(*first, ((0.25, 0.5), (0.75, 1.0)), (0.0, 1.0)).words
+        '0.25 to 0.5 or at least 0.75'
+        """
+        return pieces_in_words(self.intervals, self.domain)
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.words} ({100 * self.level:g} %)"
+
+
+def joined(pieces: Iterable[tuple[float, float]]) -> tuple[tuple[float, float], ...]:
+    """The same set in pieces apart from each other, in order.
+
+    >>> from jimpact.fits.uncertainty import joined
+    >>> joined([(3.0, 4.0), (0.0, 1.0), (0.5, 2.0)])
+    ((0.0, 2.0), (3.0, 4.0))
+    """
+    union: list[tuple[float, float]] = []
+    for low, high in sorted(pieces):
+        if union and low <= union[-1][1]:
+            union[-1] = (union[-1][0], max(high, union[-1][1]))
+        else:
+            union.append((float(low), float(high)))
+    return tuple(union)
+
+
+def pieces_in_words(pieces: Iterable[tuple[float, float]], domain: tuple[float, float]) -> str:
+    """Pieces of an interval; an end of the domain is left out."""
+    return " or ".join(_piece(*ends, domain) for ends in pieces)
+
+
+def _piece(low: float, high: float, domain: tuple[float, float]) -> str:
+    """One piece of an interval in words."""
+    open_low, open_high = low <= domain[0], high >= domain[1]
+    if open_low and open_high:
+        return "anything"
+    if open_low or open_high:
+        return f"at most {high:.5g}" if open_low else f"at least {low:.5g}"
+    return f"{low:.5g} to {high:.5g}"
+
+
+# ---------------------------------------------------------------------------- the result
+
+
+@dataclass(frozen=True, eq=False)
+class FitMinimum:
+    """A minimum that starts ended in: sum of squared (weighted) residuals, values, how many.
+
+    `standard_error` is None where it fits so much worse that it does not matter.
+    """
+
+    sum_of_squares: float
+    value: np.ndarray
+    count: int
+    standard_error: np.ndarray | None = None
+
+
+class FittedParameter(NamedTuple):
+    """A parameter of a fit: its value, standard error, 95 % interval in pieces, and whether the
+    data determine it."""
+
+    value: float
+    standard_error: float
+    intervals: tuple[tuple[float, float], ...]
+    determined: bool
+
+
+class Predicted(NamedTuple):
+    """Velocities after each shot (K, n) [m/s], their standard errors (K, n), status codes (K,).
+
+    `noise` (K, n) is the standard error of a measurement of them. `low` and `high` (K, n) are the
+    ends of the band in which such a measurement lies.
+    """
+
+    velocity: np.ndarray
+    standard_error: np.ndarray
+    status: np.ndarray
+    noise: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class FitResult(Generic[AnyLaw]):
+    """The result of `fit`. `print(fit)` gives its report.
+
+    P free parameters, K shots of n velocities.
+
+    Attributes:
+        law: with the fitted parameters.
+        method: of minimizing, see `fit`.
+        names: of the parameters, contacts numbered from 1.
+        value: (P,) in the units of each parameter, as the next two.
+        standard_error: (P,); inf where the data do not determine a parameter, NaN where no degree
+            of freedom is left to estimate the noise from.
+        covariance: (P, P).
+        correlation: (P, P), in [-1, 1].
+        bounds: lowest and highest values (P,), (P,).
+        at_bound: (P,) boolean.
+        predicted: shaped like what was measured, (K, n) [m/s].
+        residual: measured less predicted (K, n) [m/s]; NaN where no value was measured.
+        rms: of the residual.
+        noise: estimated standard error of one value; NaN where no degree of freedom is left, 1
+            if `sigma` is known, or, if chi^2 shows that sigma is too small, the factor that
+            the standard errors are multiplied by.
+        degrees_of_freedom: independent measured values less `rank`.
+        rank: of the Jacobian; below P: see `identifiability`.
+        singular_values: (P,) of the scaled Jacobian.
+        identifiability: in words, what the data do not determine.
+        starts: the distinct minima, best first.
+        status: (K,) codes of `jimpact.STATUS` at the minimum.
+        converged: whether the best start did.
+        steps: iterations of the best start.
+        lost_starts: how many did not converge.
+        warnings: what is wrong with data or fit, in words.
+        problem: what was solved.
+        jacobian: derivatives of what was measured in the parameters (K, n, P), NaN where no
+            value was measured.
+        loss: see `fit`.
+        seed: of the random starts.
+        profiles: if `fit` computed them.
+        reservations: in words, what has to be said where a value is quoted.
+    """
+
+    law: AnyLaw
+    method: str
+    names: tuple[str, ...]
+    value: np.ndarray
+    standard_error: np.ndarray
+    covariance: np.ndarray
+    correlation: np.ndarray
+    bounds: tuple[np.ndarray, np.ndarray]
+    at_bound: np.ndarray
+    predicted: np.ndarray
+    residual: np.ndarray
+    rms: float
+    noise: float
+    degrees_of_freedom: int
+    rank: int
+    singular_values: np.ndarray
+    identifiability: tuple[str, ...]
+    starts: tuple[FitMinimum, ...]
+    status: np.ndarray
+    converged: bool
+    steps: int
+    lost_starts: int
+    warnings: tuple[str, ...]
+    problem: FitProblem
+    jacobian: np.ndarray
+    loss: str = "squares"
+    seed: int = 0
+    profiles: tuple[Profile, ...] = ()
+    reservations: tuple[str, ...] = ()
+
+    @property
+    def scene(self) -> Scene | None:
+        """The scene of all shots, with what was fitted of it; None: the shots have their own."""
+        return self.problem.to_scene(self.value)
+
+    @property
+    def law_in_scene(self) -> Law:
+        """The law, and with it the parts of the scene that were fitted."""
+        fitted = isinstance(self.problem.law, LawInScene)
+        return self.problem.law_in_scene(self.value) if fitted else self.law
+
+    @property
+    def determined(self) -> np.ndarray:
+        """(P,) which parameters the data say anything about; the values of others are starts."""
+        seen = ~np.isinf(self.standard_error)
+        for i, each in enumerate(self.profiles):
+            seen[i] &= each.words != "anything"
+        return seen
+
+    @property
+    def from_prior(self) -> np.ndarray:
+        """(P,) which parameters are known from their priors alone: the data add hardly anything."""
+        alone = np.zeros(len(self.names), bool)
+        for i, _, std in self.problem.priors:
+            alone[i] = self.standard_error[i] > PRIOR_ALONE * self.noise * std
+        return alone
+
+    @property
+    def tied(self) -> dict[str, tuple[float, float]]:
+        """What is tied to parameters, by name: values with their standard errors."""
+        problem, ties = self.problem, self.problem.ties
+        if not ties:
+            return {}
+
+        def values(x: jax.Array) -> jax.Array:
+            """The tied entries of parameters x."""
+            law = problem.law_in_scene(x)
+            parts = [jnp.ravel(value_of(law, entry_of(name)[0])) for name, _ in ties]
+            places = tied_places(law, ties).values()
+            return jnp.concatenate([part[np.array(at)] for part, at in zip(parts, places)])
+
+        x = jnp.asarray(self.value, problem.precision)
+        errors = self.errors_of(np.asarray(jax.jacfwd(values)(x), float))
+        pairs = zip(np.asarray(values(x), float).tolist(), errors.tolist())
+        return dict(zip(tied_names(problem.law, ties), pairs))
+
+    def errors_of(self, slope: np.ndarray) -> np.ndarray:
+        """Standard errors of what has these derivatives (..., P) in the parameters.
+
+        Equation: `sqrt(J C J^T)`; inf where it depends on what the data do not determine.
+        """
+        seen = self.determined
+        known = slope[..., seen]
+        covariance = self.covariance[np.ix_(seen, seen)]
+        variance = np.einsum("...p,pq,...q->...", known, covariance, known)
+        blind = (np.abs(slope[..., ~seen]) > 0).any(axis=-1)
+        return np.where(blind, np.inf, np.sqrt(variance))
+
+    def predict(self, shots: Any, scene: Scene | None = None, level: float = 0.95) -> Predicted:
+        """Velocities after further shots, with the errors that the parameters leave in them.
+
+        Equation: `sqrt(J C J^T)`, J derivatives in the parameters, C their covariance; a
+        measurement, with its own standard error s, lies within `q sqrt(J C J^T + s^2)`, q the
+        quantile as in `intervals`.
+
+        Args:
+            shots: v- (K, n) [m/s], or `Experiments`, of which v- and scenes count.
+            scene: of all shots; None: that of the fit, or those of the shots.
+            level: of the band.
+
+        Returns:
+            `velocity` (K, n) [m/s], `standard_error` (K, n): inf where it depends on what the data
+            do not determine, NaN where the errors are unknown; `status` (K,); `noise` (K, n) of a
+            measurement: the `sigma` of the shots if they have one, else as in the fit; `low` and
+            `high` (K, n), the band of a measurement.
+
+        Raises:
+            ValueError: a fit of something else than shots; velocities that do not fit the scene, a
+                scene that does not fit the law; a level outside (0, 1).
+        """
+        quantile = self.quantile(level)
+        if self.experiments is None:
+            raise ValueError("Argument `fit` must be to shots.")
+        data, scenes, units = shots, None, self.experiments.units
+        if isinstance(shots, Experiments):
+            data, scenes, units = shots.pre, shots.scenes, shots.units
+        if np.ndim(data) != 2 or np.shape(data)[1] != len(units):
+            raise ValueError(
+                f"Argument `shots` must have shape (K, {len(units)}), velocities of the bodies of "
+                f"the fit, but has shape {np.shape(data)}."
+            )
+        check_values("shots", data)
+        data = Experiments(data, np.zeros_like(np.asarray(data, float)), scenes=scenes, units=units)
+        law, own = self.placed(scene)
+        largest = own if scenes is None else max(scenes, key=lambda each: each.contacts)
+        self._check_scene(largest, len(units))
+        ties = dict(self.problem.ties)
+        problem = FitProblem.from_shots(law, own, data, self.problem.parameters.labels, ties=ties)
+        point, every = problem.point(problem.start)[None], np.ones((1, len(problem.low)), bool)
+        ends = minimize_with(repeated(problem, 1), point, every, Search(max_steps=1))
+        there = solution(problem, ends)
+        slope = there.jacobian.reshape((*problem.measured.shape, len(problem.names)))
+        error = self.errors_of(problem.errors_of(slope / problem.steps_at(problem.start)))
+        value, noise = there.predicted, self._noise_of(shots)
+        half = quantile * np.hypot(error, noise)
+        return Predicted(value, error, np.asarray(there.status), noise, value - half, value + half)
+
+    def placed(self, scene: Scene | None) -> tuple[Law, Scene | None]:
+        """The law, with the parts of the scene that were fitted, and the scene of new shots.
+
+        Raises:
+            ValueError: another scene than that of which parts were fitted.
+        """
+        law = self.law_in_scene
+        if isinstance(law, LawInScene) and scene is not None:
+            raise ValueError(
+                "Argument `scene` must be left out where parts of the scene were fitted: they hold "
+                "for that of the fit only."
+            )
+        return law, self.problem.scene if scene is None else scene
+
+    def _check_scene(self, scene: Any, size: int) -> None:
+        """Raise unless this is a scene for the law that was fitted and velocities of this size."""
+        check_kind("scene", scene, Scene)
+        values = [x.value for x in parameters_of(self.law).values() if x.domain.per_contact]
+        counts = {np.shape(value)[0] for value in values if np.ndim(value) == 1}
+        if scene.size != size or counts - {scene.contacts}:
+            contacts = (
+                f" and {min(counts)} contacts, one for each value of the law" if counts else ""
+            )
+            raise ValueError(
+                f"Argument `scene` must have {size} velocities as the fit{contacts}, but has "
+                f"{scene.size} and {scene.contacts}."
+            )
+
+    def _noise_of(self, shots: Any) -> np.ndarray:
+        """Standard errors (K, n) of measured velocities: of the shots, or as in the fit (rms)."""
+        if isinstance(shots, Experiments) and shots.sigma is not None:
+            stretched = 1.0 if self.problem.sigma is None else self.noise
+            return stretched * np.asarray(shots.sigma, float)
+        pre = shots.pre if isinstance(shots, Experiments) else shots
+        weight = self.problem.weight
+        variance = np.where(weight > 0, 1 / np.where(weight > 0, weight, 1.0) ** 2, 0.0).sum(axis=0)
+        count = (weight > 0).sum(axis=0)
+        each = np.sqrt(variance / np.where(count > 0, count, np.nan))  # NaN: never measured
+        return np.broadcast_to(self.noise * each, np.shape(pre))
+
+    @property
+    def experiments(self) -> Experiments | None:
+        """The shots; None where something else was fitted."""
+        return self.problem.experiments
+
+    @property
+    def shot_count(self) -> int:
+        """Shots (or rows of what was measured) with at least one value that was used."""
+        measured = np.isfinite(self.problem.measured)
+        return int(measured.any(axis=tuple(range(1, measured.ndim))).sum())
+
+    @property
+    def start_count(self) -> int:
+        """Starts, those that did not converge included."""
+        return sum(minimum.count for minimum in self.starts) + self.lost_starts
+
+    def __getitem__(self, name: str) -> FittedParameter:
+        """The parameter of this name, as in `names`."""
+        check_choice("name", name, self.names)
+        i = self.names.index(name)
+        value, error = float(self.value[i]), float(self.standard_error[i])
+        return FittedParameter(value, error, self.intervals()[i], bool(self.determined[i]))
+
+    @property
+    def chi_squared(self) -> float:
+        """The sum of squared residuals in units of sigma, those of priors included; NaN where sigma
+        is unknown."""
+        return np.nan if self.problem.sigma is None else self.starts[0].sum_of_squares
+
+    @property
+    def aic(self) -> float:
+        """Akaike's criterion of a fit by least squares; NaN of other losses and of exact data.
+
+        Equation: `chi^2 + 2 P`; where sigma is unknown `n log(|r|^2 / n) + 2 (P + 1)`, n values.
+        """
+        squares, values = self.starts[0].sum_of_squares, self.problem.values
+        if self.loss != "squares":
+            return np.nan
+        if self.problem.sigma is not None:
+            return squares + 2 * len(self.names)
+        if squares <= self.problem.exact_squares:
+            return np.nan
+        return float(values * np.log(squares / values) + 2 * (len(self.names) + 1))
+
+    def intervals(self, level: float = 0.95) -> tuple[tuple[tuple[float, float], ...], ...]:
+        """The pieces, in order, of the confidence interval of each of the P parameters.
+
+        Those of `profiles`, if there are some of this level. Else linearized, cut at the bounds, a
+        piece for every minimum that fits well enough.
+
+        Equation: `value -+ q standard_error`, q the quantile of Student's t with the degrees of
+        freedom that are left, or of the normal law if `sigma` is known; of what is fitted in
+        its logarithm `value exp(-+ q standard_error / value)`; at a minimum whose sum of squares
+        is higher by d, q^2 - d / noise^2 in place of q^2.
+        """
+        if self.profiles and self.profiles[0].level == level:
+            return tuple(profile.intervals for profile in self.profiles)
+        q = self.quantile(level)
+        return tuple(self.linearized_interval(i, q) for i in range(len(self.names)))
+
+    def confidence_interval(self, level: float = 0.95) -> np.ndarray:
+        """The outermost ends (P, 2) of `intervals` at a level in (0, 1)."""
+        return np.array([(pieces[0][0], pieces[-1][1]) for pieces in self.intervals(level)])
+
+    def quantile(self, level: float) -> float:
+        """Half-width of an interval of this `level` in standard errors."""
+        check_level(level)
+        freedom, tail = self.degrees_of_freedom, 0.5 + 0.5 * level
+        noise_is_known = self.problem.sigma is not None or freedom < 1
+        return float(ndtri(tail) if noise_is_known else stdtrit(freedom, tail))
+
+    def linearized_interval(self, i: int, q: float) -> tuple[tuple[float, float], ...]:
+        """Where parabolas at all minima let parameter `i` lie within `q` standard errors."""
+        low, high = self.bounds[0][i], self.bounds[1][i]
+        minima = [(self.value[i], self.standard_error[i], 0.0)]
+        for minimum in self.starts[1:]:
+            if minimum.standard_error is not None:
+                more = minimum.sum_of_squares - self.starts[0].sum_of_squares
+                minima.append((minimum.value[i], minimum.standard_error[i], more))
+        pieces: list[tuple[float, float]] = []
+        for value, error, more in minima:
+            if pieces and not more < (q * self.noise) ** 2:
+                continue
+            half = error * np.sqrt(q**2 - (more / self.noise**2 if more else 0.0))
+            if self.problem.parameters.log[i]:
+                ends = value * np.exp(np.array([-half, half]) / value)
+            else:
+                ends = np.array([value - half, value + half])
+            pieces.append(tuple(np.clip(ends, low, high)))
+        return joined(pieces)
+
+    @property
+    def shows_lack_of_fit(self) -> bool:
+        """Whether a test rejects the law."""
+        return any(line.startswith("Lack of fit") for line in self.warnings)
+
+    @property
+    def can_be_profiled(self) -> bool:
+        """Whether parameters can be fixed: least squares in a box, not of an admissible matrix."""
+        return self.loss == "squares" and self.problem.matrix is None
+
+    @property
+    def linearization_misleads(self) -> bool:
+        """Whether standard errors may mislead and the fit has no profiles yet."""
+        if self.profiles or not self.can_be_profiled or not self.converged:
+            return False
+        if self.rank < len(self.names):
+            return True
+        if not np.isfinite(self.noise):
+            return False  # the errors are unknown
+        q = self.quantile(0.95)
+        for i in range(len(self.names)):
+            pieces = self.linearized_interval(i, q)
+            at_end = pieces[0][0] <= self.bounds[0][i] or pieces[-1][1] >= self.bounds[1][i]
+            wide = (
+                self.problem.parameters.log[i]
+                and self.standard_error[i] > HARDLY_SEEN * self.value[i]
+            )
+            if len(pieces) > 1 or at_end or wide:
+                return True
+        return False
+
+
+def check_squares(name: str, fit: Any) -> None:
+    """Raise an error unless argument `name` is a fit by least squares."""
+    check_kind(name, fit, FitResult)
+    if fit.loss != "squares":
+        raise ValueError(f"Argument `{name}` must be by least squares, but has loss {fit.loss!r}.")

@@ -10,8 +10,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from jimpact._checks import check_kind
-from jimpact.fits.contours import Contour
-from jimpact.fits.result import FitResult
+from jimpact.fits.profiles import Contour
+from jimpact.fits.uncertainty import FitResult
 from jimpact.plot.style import (
     COLOURS,
     GREY,

@@ -10,8 +10,7 @@ from matplotlib.figure import Figure
 from scipy.special import chdtri, ndtri
 
 from jimpact._checks import check_choice, check_kind
-from jimpact.fits.profiles import Profile
-from jimpact.fits.result import FitResult
+from jimpact.fits.uncertainty import FitResult, Profile
 from jimpact.plot.style import COLOURS, GREY, SMALL, finish, new_figure, new_panels
 
 _TITLE = 45  # letters of a line of a panel's title

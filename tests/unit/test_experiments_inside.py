@@ -7,7 +7,7 @@ import pytest
 
 import jimpact as ji
 from jimpact.files.shots_file import UNITS
-from jimpact.fits.defects import data_defects
+from jimpact.fits.checks import data_defects
 
 DATA = files("jimpact") / "data"
 

@@ -8,12 +8,8 @@ from scipy import optimize
 
 import jimpact as ji
 from jimpact.files.records import with_error
-from jimpact.fits.parameters import bounds_of, free_parameters
-from jimpact.fits.prediction import placed_fit
-from jimpact.fits.saved import write_fit
-from jimpact.fits.scene_parameters import LawInScene
+from jimpact.fits.parameters import LawInScene, bounds_of, free_parameters, tied
 from jimpact.fits.solve import Damping
-from jimpact.fits.ties import tied
 
 
 def test_entries_are_named_as_in_the_report():
@@ -46,11 +42,11 @@ def test_functions_cannot_be_saved(tmp_path):
         (ji.FitProblem.from_shots(ji.Newton([0.5, 0.5]), BALLS, THREE, ties={"restitution[2]": two_thirds}), "must have no ties"),
     ):  # fmt: skip
         with pytest.raises(ValueError, match=message):
-            write_fit(Saved(problem), tmp_path / "fit.json")
+            ji.Fit.save(Saved(problem), tmp_path / "fit.json")
 
 
 class Saved:
-    """What `write_fit` looks at first."""
+    """What `Fit.save` looks at first."""
 
     def __init__(self, problem):
         self.problem, self.experiments = problem, problem.experiments
@@ -76,7 +72,7 @@ def test_a_mass_with_a_prior_is_fitted_with_the_law():
     np.testing.assert_allclose(found.chi_squared, 2 * best.cost, rtol=1e-8)
     np.testing.assert_allclose(found.scene.mass, [1.0, found.value[1]])
     assert type(found.law) is type(found.problem.to_law(found.value)) is ji.Newton
-    law, scene = placed_fit(found, None)  # by which further shots are predicted
+    law, scene = found.placed(None)  # by which further shots are predicted
     np.testing.assert_allclose(law.in_scene(scene).mass, found.scene.mass)
     with pytest.raises(ValueError, match="`scene` must be left out"):
         found.predict(SHOTS, BALLS)

@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 
 import jimpact as ji
 from jimpact import RestitutionMatrix, fit, normalized_delassus
-from jimpact.fits.matrix_fit import admissible_start
+from jimpact.fits.matrices import admissible_start
 from jimpact.theory.restitution_matrices import margin
 
 least_margin = jax.jit(margin)

@@ -11,15 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import jimpact as ji
-from jimpact.fits.problem import filled_up
-from jimpact.fits.scaled import ScaledFit
-from jimpact.fits.solve import BoxRegion, Search, minimize
+from jimpact.fits.solve import Search, minimize_with, stacked
 
 PAGE = Path(__file__).parents[2] / "docs" / "coverage.md"
 PAIR, BALLS = ji.chain([1.0, 2.0]), ji.chain([1.0, 1.0, 1.0])
@@ -201,20 +198,15 @@ def covered(row, fits):
     )
     if row.loss != "squares":  # has no profiles
         return linear.mean(axis=0), []
-    filled, scaled = [filled_up(f.problem.residuals) for f in fits], [ScaledFit(f) for f in fits]
-    inside = []
+    many, inside = stacked([f.problem for f in fits]), []
+    best = np.array([f.problem.point(f.value) for f in fits])
     for i in range(len(truth)):
-        y = np.array([s.best for s in scaled])
-        y[:, i] = [s.problem.point(truth)[i] for s in scaled]
-        low, high = (np.array([getattr(s, end) for s in scaled]) for end in ("low", "high"))
-        low[:, i] = high[:, i] = y[:, i]
-        many = jax.tree.map(lambda *x: np.stack([np.asarray(each) for each in x]), *filled)
-        box = BoxRegion(low, high)
-        many = eqx.tree_at(lambda r: (r.low, r.high, r.region), many, (low, high, box))
-        states = minimize(many, y, Search())
-        squares = 2 * np.asarray(states.cost) * np.array([s.size for s in scaled]) ** 2
-        deviance = np.array([s.deviance_of(x) for x, s in zip(squares, scaled)])
-        inside.append(deviance <= [f.quantile(0.95) ** 2 for f in fits])
+        y = best.copy()
+        y[:, i] = [f.problem.point(truth)[i] for f in fits]
+        fixed = np.broadcast_to(np.arange(y.shape[1]) == i, y.shape)
+        squares = minimize_with(many, y, fixed, Search()).squares
+        more = squares - [f.starts[0].sum_of_squares for f in fits]
+        inside.append(more <= [(f.quantile(0.95) * f.noise) ** 2 for f in fits])
     return linear.mean(axis=0), np.mean(inside, axis=1)
 
 

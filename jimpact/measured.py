@@ -6,7 +6,7 @@ import numpy as np
 
 from jimpact.bodies.blocks import Block
 from jimpact.files.shots_file import read_shots
-from jimpact.fits.experiments import Experiments, read_experiments
+from jimpact.fits.data import Experiments, read_experiments
 from jimpact.scene import Scene
 
 _DATA = files("jimpact") / "data"

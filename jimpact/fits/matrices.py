@@ -430,10 +430,10 @@ def _center(
     )
 
 
-def boundary(region: Any, entries: np.ndarray) -> tuple[str, ...]:
-    """The conditions that a fitted E is at the edge of (other than by fixed entries), in words."""
-    if not isinstance(region, AdmissibleMatrices):
+def boundary(region: AdmissibleMatrices | None, y: np.ndarray) -> tuple[str, ...]:
+    """The conditions that the E of y is at the edge of (other than by fixed entries), in words."""
+    if region is None:
         return ()
-    slack, rows = _host_conditions(region, _start(entries, region.origin, region.map))
+    slack, rows = _host_conditions(region, y)
     at = (slack < _rounding(region)) & np.any(rows != 0, axis=1)
     return tuple(name for name, kind in zip(_FACES, _kinds(region)) if at[kind].any())
