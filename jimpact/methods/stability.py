@@ -89,24 +89,7 @@ FRICTION_RTOL, FRICTION_CONFIRMED = 1e-8, 1e-6
 # of balls.
 QUICK_RATIO, QUICK_BALLS = 1e3, 10
 
-CAUSES = (  # limits, formulas and remedies: docs/stability.md
-    "refused beforehand",
-    "step beyond the linear stability limit",
-    "a contact's whole stroke lies within one step",
-    "contacts re-close without end",
-    "time scales far apart",
-    "many contacts at once",
-    "first order at E = 0",
-    "steps straddle changes of phase",
-    "regularized friction, or steps that straddle changes of phase",
-    "contacts vibrate between stick and slip",
-)
-(_REFUSED, _UNSTABLE, _COARSE, _RECLOSES, _APART, _CLUSTER, _FIRST_ORDER, _STRADDLES) = range(8)
-_CREEPS, _VIBRATES = 8, 9
-STABLE = {"verlet": 2.0, "rk4": float(np.sqrt(8.0))}  # largest step times sqrt(lambda_max)
 RECLOSING = 0.1  # below this e three balls re-close (nearly) without end
-_LONG, _CLUSTERED = 10, 0.9  # from this number of balls on, chains below this e stay in clusters
-_FAR = 100.0  # time scales are far apart from this ratio of the contacts' frequencies on
 NAMES = ("default", "rk4", "verlet", "impulse_euler")
 FRICTION_NAMES = ("default", "implicit", "verlet")  # those of them that there are
 SLICES = ("one", "pairs")
@@ -116,12 +99,11 @@ _FEW_BALLS, _FEW = (2, 3, 10), 8
 
 
 class Slice(NamedTuple):
-    """Classes and errors over one axis (K,) or two (K1, K2); index of CLASSES, of CAUSES."""
+    """Classes (indices of CLASSES) and errors over one axis (K,) or two (K1, K2)."""
 
     axes: tuple[str, ...]
     codes: np.ndarray
     error: np.ndarray
-    cause: np.ndarray
 
 
 class Confirmation(NamedTuple):
@@ -136,7 +118,7 @@ class Confirmation(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class StabilityMap:
-    """The result of `stability_map`; `print` gives numbers of points and causes.
+    """The result of `stability_map`; `print` gives numbers of points.
 
     Attributes:
         methods: the names.
@@ -163,12 +145,6 @@ class StabilityMap:
         codes = np.concatenate([s.codes.ravel() for s in self._all_slices(method)])
         return dict(zip(CLASSES, np.bincount(codes, minlength=len(CLASSES)).tolist()))
 
-    def causes(self, method: str) -> dict[str, int]:
-        """Points of a method that are not right, by cause."""
-        causes = np.concatenate([s.cause.ravel() for s in self._all_slices(method)])
-        counts = np.bincount(causes[causes >= 0], minlength=len(CAUSES)).tolist()
-        return {cause: count for cause, count in zip(CAUSES, counts) if count}
-
     def _all_slices(self, method: str) -> tuple[Slice, ...]:
         """Slices of a method, its samples last."""
         return (*self.slices[method], self.sampled[method])
@@ -178,21 +154,19 @@ class StabilityMap:
         by_method = {
             name: {
                 "counts": self.counts(name),
-                "causes": self.causes(name),
                 "slices": self.slices[name],
                 "sampled": self.sampled[name],
             }
             for name in self.methods
         }
-        words = {"classes": CLASSES, "causes": CAUSES, "methods": by_method}
+        words = {"classes": CLASSES, "methods": by_method}
         return fields_as_data(self, "slices", "sampled") | as_data(words)
 
     def __str__(self) -> str:
-        """Points of each class and causes, by method."""
+        """Points of each class, by method; docs/stability.md says why methods fail."""
         base = ", ".join(f"{name.replace('_', ' ')} {x:g}" for name, x in self.base.items())
         checked = self.confirmation
         counts = [[m, *(str(x or "") for x in self.counts(m).values())] for m in self.methods]
-        causes = [[m, str(x), cause] for m in self.methods for cause, x in self.causes(m).items()]
         others = ""
         if checked.confirmed < checked.tried:
             others = f"; v+ of the others differs by up to {checked.difference:.1g} of |v-|: scipy "
@@ -205,12 +179,6 @@ class StabilityMap:
             "of the largest |v-|",
             "",
             *table(["method", *CLASSES], counts),
-            "",
-            *table(
-                ["method", "points", "cause where not right"],
-                causes,
-                left=["cause where not right"],
-            ),
         ]
         return "\n".join(lines)
 
@@ -590,7 +558,7 @@ def _from_scipy(point: np.ndarray, given: Given | None, exact: np.ndarray) -> fl
     return float(np.abs(outcome(law, scene, v, result).velocity - exact[: len(v)]).max())
 
 
-# ------------------------------------------------------------------------ classes and causes
+# --------------------------------------------------------------------------------- classes
 
 
 def classes_of(
@@ -600,8 +568,8 @@ def classes_of(
     exact: np.ndarray,
     runners: Runners,
     advance: Callable[[int], None],
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Class, error (over the largest |v-|, which is 1) and cause of every point."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Class and error (over the largest |v-|, which is 1) of every point."""
     codes, errors = np.full(len(points), FLAGGED), np.full(len(points), np.nan)
     level = points[:, AXES.index("setting")]
     setting = setting_of(method.setting, level)
@@ -624,10 +592,7 @@ def classes_of(
             falls = error < FALLS * errors[wrong]
             codes[wrong[(finer.code == CODE["ok"]) & ~falls]] = STALLS
         advance(len(group))
-    causes = np.full(len(points), -1)
-    for i in np.flatnonzero(codes != RIGHT):
-        causes[i] = _cause(method, points[i], given, CLASSES[codes[i]], float(setting[i]))
-    return codes, errors, causes
+    return codes, errors
 
 
 def _classified(out: PointOutcomes, error: np.ndarray, allowed: np.ndarray) -> np.ndarray:
@@ -671,32 +636,3 @@ def frequencies(point: np.ndarray, given: Given | None = None) -> tuple[float, f
     largest = np.linalg.eigvalsh(omega[:, None] * g * omega[None, :])[-1]
     fastest = float(np.sqrt(largest * eta * (eta + 1) / 2) / e) if e else np.inf
     return fastest, float(ratio)
-
-
-def _cause(
-    method: Method, point: np.ndarray, given: Given | None, name: str, setting: float
-) -> int:
-    """Index of CAUSES."""
-    e, balls = point[AXES.index("restitution")], point[AXES.index("balls")]
-    friction = given is not None and given.friction and point[AXES.index("friction")] > 0
-    light = given is None and point[AXES.index("mass_ratio")] < 1 / _FAR
-    highest, ratio = frequencies(point, given)
-    reach = setting * highest
-    if name == "flagged" and e == 0:
-        return _REFUSED
-    if method.setting == "step" and reach > 1:
-        return _UNSTABLE if reach > STABLE.get(method.name, np.inf) else _COARSE
-    if name in ("does not end", "flagged", "unchecked"):
-        if e < RECLOSING:
-            return _RECLOSES
-        if ratio > _FAR or light:
-            return _APART
-        if friction:
-            return _VIBRATES
-        if balls >= _LONG and e < _CLUSTERED:
-            return _CLUSTER
-    if method.setting == "impulse step":
-        return _FIRST_ORDER
-    if method.setting == "step" and friction:
-        return _CREEPS
-    return _STRADDLES if name in ("wrong", "stalls", "gains energy") else _APART

@@ -326,7 +326,6 @@ def test_stability_map():
         assert (exponent.codes == 0).all()
         assert sum(result.counts(name).values()) == 6 + 3 * 4 + 3
     assert result.confirmation.tried == result.confirmation.confirmed > 0
-    assert "step beyond the linear stability limit" in str(result)
     assert json.loads(json.dumps(result.to_dict()))["methods"]["rk4"]["counts"]["right"] > 3
     assert ji.plot.stability_map(result, "title").axes
 
@@ -343,9 +342,6 @@ def test_stability_map_of_a_scene_with_friction():
     setting, friction = result.slices["verlet"]
     assert setting.error[1] < 0.2 * setting.error[0]
     assert friction.error.max() < 5e-3
-    assert set(result.causes("verlet")) <= {
-        "regularized friction, or steps that straddle changes of phase"
-    }
     assert set(result.base) == {"setting", "exponent", "restitution", "friction"}
     assert result.confirmation.tried == result.confirmation.confirmed > 0
 
