@@ -324,7 +324,7 @@ def differences(errors: dict[str, np.ndarray], kinds: dict[str, Any], draws: dic
         "",
         "Of the medians held out, paired: the same tosses are drawn for both",
     ]
-    rows[-1] += " laws. An interval\nthat contains 0 ranks nothing.\n"
+    rows[-1] += " laws. An interval\nthat contains 0 does not show which law is better.\n"
     rows += ["| law | one corner | two corners |", "|---" * 3 + "|"]
     for name, error in errors.items():
         if name != "LZB" and "LZB" in errors:

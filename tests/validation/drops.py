@@ -296,15 +296,17 @@ fit to the others. A prediction begins with an arc through seven poses of a flig
 end of the nth flight from there (hit 1 follows from the arc alone), the last rows compare where the square rests and
 on which side (of four: 25 % by chance). Medians in ms and mm, shares in percent, with 95 % intervals of a bootstrap
 over drops, of the starts for which both simulators predict such a hit. Differences are paired, MuJoCo minus
-jimpact; one whose interval contains 0 ranks nothing. jimpact: time stepping, .4 ms. MuJoCo: spheres at the corners,
-one `solref` and mu, steps of .1 ms, the best of two starts.
+jimpact; a
+difference whose interval contains 0 does not show which simulator is better. jimpact: time stepping, 0.4 ms.
+MuJoCo: spheres at the corners,
+one `solref` and mu, steps of 0.1 ms, the best of two starts.
 
 {tables}
 
 ![median error of the angle after a hit, from the first flight and from the one after it](pictures/drops.png)
 
 Right: after 150 ms about half of the drops turn to the right side, so the median lies somewhere between 0 and 90
-degrees and ranks nothing.
+degrees and does not show which simulator is better.
 
 ## How far a prediction reaches
 
