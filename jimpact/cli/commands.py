@@ -352,11 +352,7 @@ def montecarlo(command: options.MonteCarloCommand, steps: Steps) -> CommandResul
 
 def _sampling(study: Study, command: options.MonteCarloCommand) -> dict[str, Any]:
     """Arguments of `monte_carlo`: the study's, or in their place those of the command line."""
-    executor: Any = command.executor
-    if command.scheduler is not None:
-        from jimpact.montecarlo.executors import DaskExecutor
-
-        executor = DaskExecutor(command.scheduler)
+    executor = command.scheduler or command.executor
     chosen = {"samples": command.samples, "key": command.seed, "folder": command.folder}
     computing = {"executor": executor, "keep_samples": command.keep_samples}
     return study.monte_carlo | without_none(chosen) | computing

@@ -9,7 +9,7 @@ impacts are two compiled programs, so that draws made again give the same bits.
 """
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -124,26 +124,17 @@ class SamplingPlan:
 
     def __call__(self, task: Task, device: jax.Device | None = None) -> Chunk:
         """Compute one chunk on a device (None: the default one)."""
-        return self.start(task, device)()
-
-    def start(self, task: Task, device: jax.Device | None = None) -> Callable[[], Chunk]:
-        """Enqueue a chunk on a device; call the result to wait for it and reduce it."""
         with self._flags():
             drawn, lanes, scene = self._drawn(task, device)
             velocity, status = impacts(drawn, scene, lanes)
-
-        def finish() -> Chunk:
-            """Wait for the outcomes and reduce them."""
-            empty = np.zeros((self.size, 0))
-            samples = {
-                "velocity": np.asarray(velocity),
-                "status": np.asarray(status),
-                "velocity_before": np.asarray(drawn.velocity) if drawn.varies[1] else empty,
-                "gaps": np.asarray(drawn.gaps) if drawn.varies[2] else empty,
-            }
-            return reduced(task, samples, self.bins, self.keep_samples)
-
-        return finish
+        empty = np.zeros((self.size, 0))
+        samples = {
+            "velocity": np.asarray(velocity),
+            "status": np.asarray(status),
+            "velocity_before": np.asarray(drawn.velocity) if drawn.varies[1] else empty,
+            "gaps": np.asarray(drawn.gaps) if drawn.varies[2] else empty,
+        }
+        return reduced(task, samples, self.bins, self.keep_samples)
 
     def sample(self, task: Task, lane: int) -> tuple[Law, jax.Array, jax.Array | None]:
         """Law, velocity and gaps of one sample, the same bits as in the run."""

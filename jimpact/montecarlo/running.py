@@ -2,7 +2,7 @@
 
 import time
 import warnings
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ import numpy as np
 
 from jimpact._checks import in_common_dtype
 from jimpact.law import Law
-from jimpact.montecarlo.executors import Executor, as_executor
+from jimpact.montecarlo.executors import check_executor, computed
 from jimpact.montecarlo.gaps import gap_scale
 from jimpact.montecarlo.planning import BINS, CHUNK, Run, Sources, planned_run
 from jimpact.montecarlo.results import MonteCarlo, result_of
@@ -53,7 +53,9 @@ def monte_carlo(
         samples: number of samples; default: that of the passed samples, or 100 000.
         key: a JAX random key, or an integer seed.
         chunk: samples computed together; changing it changes the random samples.
-        executor: 'serial', 'devices' (all JAX devices), 'dask', or `DaskExecutor(client)`.
+        executor: 'serial', 'devices' (all JAX devices), 'dask' (processes on this machine), the
+            address of a Dask scheduler, or anything with a `map` (a Dask client, an executor of
+            `concurrent.futures`).
         folder: where every finished chunk is stored; the same call again continues from it, and
             may ask for more samples.
         keep_samples: store the raw samples in the folder, too (`read_samples`).
@@ -82,12 +84,12 @@ def monte_carlo(
     [-0.6, 0.16, 1.24]
     """
     run = planned_run(Sources(law, velocity, gaps), scene, samples, key, chunk, bins, keep_samples)
-    chosen = as_executor(executor)
+    check_executor(executor)
     if keep_samples and folder is None:
         raise ValueError("Argument `folder` must be given to keep samples, but is None.")
     store = None if folder is None else Store(folder, run.identity)
     begin = time.perf_counter()
-    total, resumed = _total(run, chosen, store, progress)
+    total, resumed = _total(run, executor, store, progress)
     rate = (run.samples - resumed) / (time.perf_counter() - begin)
     result = result_of(run, total, resumed, rate, _gap_scale(run.plan.sources, scene))
     failed = result.samples - result.count
@@ -102,65 +104,43 @@ def monte_carlo(
 
 
 def _total(
-    run: Run, executor: Executor, store: Store | None, progress: float | None
+    run: Run, executor: Any, store: Store | None, progress: float | None
 ) -> tuple[Chunk, int]:
     """All chunks, read or computed, joined in their order; how many samples were read."""
-    keep = run.plan.keep_samples
 
     def read(number: int) -> Chunk | None:
         """The chunk as it is stored, if it is."""
-        return store.read(number, run.task(number).count, keep) if store is not None else None
+        count, keep = run.task(number).count, run.plan.keep_samples
+        return store.read(number, count, keep) if store is not None else None
 
-    missing = [number for number in range(run.chunks) if read(number) is None]
-    known = set(range(run.chunks)).difference(missing)
-    resumed = finished = sum(run.task(number).count for number in known)
-    waiting: dict[int, Chunk] = {}
-    total: Chunk | None = None
+    stored = {number for number in range(run.chunks) if read(number) is not None}
+    resumed = finished = sum(run.task(number).count for number in stored)
+    missing = (n for n in range(1, run.chunks) if n not in stored)
 
-    def join_ready() -> None:
-        """Join all chunks that are next in order."""
-        nonlocal total
-        number = 0 if total is None else total.number + 1
-        while number in waiting or number in known:
-            chunk = waiting.pop(number) if number in waiting else read(number)
-            if chunk is None:
-                raise OSError(f"Chunk {number} of the folder changed during the run: run again.")
-            total = chunk.without_samples() if total is None else joined(total, chunk)
-            number += 1
+    def new(chunk: Chunk) -> Chunk:
+        """A computed chunk, stored and counted."""
+        nonlocal finished
+        if store is not None:
+            store.write(chunk)
+        finished += chunk.count
+        advance(chunk.count)
+        return chunk
 
     try:
-        computing = closing(_computed(run, executor, missing, read))
-        bar = counting_bar(run.samples, "samples", progress, resumed)
-        with bar as advance, computing as chunks:
-            for computed in chunks:
-                if store is not None:
-                    store.write(computed)
-                waiting[computed.number] = computed.without_samples()
-                finished += computed.count
-                advance(computed.count)
-                join_ready()
-            join_ready()
+        with counting_bar(run.samples, "samples", progress, resumed) as advance:
+            # the first chunk sets the histograms
+            first = read(0) or new(run.plan(run.task(0)))
+            tasks = (run.task(number, first.ends) for number in missing)
+            total = first.without_samples()
+            with closing(computed(executor, run.plan, tasks)) as chunks:
+                for number in range(1, run.chunks):
+                    chunk = read(number) if number in stored else new(next(chunks))
+                    if chunk is None:
+                        raise OSError(f"Chunk {number} changed during the run: run again.")
+                    total = joined(total, chunk)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(_interrupted(run, store, finished)) from None
-    assert total is not None  # a run has at least one chunk
     return total, resumed
-
-
-def _computed(
-    run: Run, executor: Executor, missing: list[int], read: Callable[[int], Chunk | None]
-) -> Generator[Chunk]:
-    """The missing chunks; the first of all sets the histograms, and is computed here."""
-    if not missing:
-        return
-    if missing[0] == 0:
-        first = run.plan(run.task(0))
-        yield first
-        missing = missing[1:]
-    else:
-        stored = read(0)
-        assert stored is not None  # it is not missing
-        first = stored
-    yield from executor.run(run.plan, (run.task(number, first.ends) for number in missing))
 
 
 def _interrupted(run: Run, store: Store | None, done: int) -> str:

@@ -1,8 +1,12 @@
 """The same bits from every executor, from any number of devices, and when a worker dies."""
 
 import os
+import signal
 import subprocess
 import sys
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import jax.numpy as jnp
@@ -26,16 +30,88 @@ def run(executor, samples=1000, **options):
     )
 
 
+def same(a, b):
+    """Whether two results have the same bits."""
+    names = ["mean", "covariance", "gap_covariance", "counts", "edges", "minimum", "maximum"]
+    parts = [(getattr(a, name), getattr(b, name)) for name in names]
+    parts += [(a.first[name], b.first[name]) for name in a.first]
+    return a.statuses == b.statuses and all(np.array_equal(*pair) for pair in parts)
+
+
+@pytest.fixture(scope="module")
+def wanted():
+    return run("serial")
+
+
+def test_anything_with_a_map(wanted):
+    with ThreadPoolExecutor(2) as pool:
+        assert same(run(pool), wanted)
+    assert same(run("devices"), wanted)
+
+
 def test_errors_of_a_chunk_come_through():
     class Broken:
-        def run(self, plan, tasks):
+        def map(self, work, tasks):
             for task in tasks:
                 if task.number == 2:
                     raise ArithmeticError("chunk 2")
-                yield plan(task)
+                yield work(task)
 
     with pytest.raises(ArithmeticError, match="chunk 2"):
         run(Broken())
+
+
+ON_FOUR_DEVICES = """
+import sys
+import jax
+jax.config.update("jax_enable_x64", True)
+sys.path[:0] = [sys.argv[1], sys.argv[1] + "/.."]
+from test_executors import run, same
+assert len(jax.devices()) == 4
+assert same(run("devices"), run("serial"))
+"""
+
+
+@pytest.mark.release
+def test_four_devices():
+    flags = {"XLA_FLAGS": "--xla_force_host_platform_device_count=4"}
+    command = [sys.executable, "-c", ON_FOUR_DEVICES, os.path.dirname(__file__)]
+    subprocess.run(command, env=os.environ | flags, check=True)
+
+
+@pytest.mark.slow
+def test_dask_in_this_process(wanted, tmp_path):
+    distributed = pytest.importorskip("distributed")
+    with distributed.Client(
+        processes=False, n_workers=1, threads_per_worker=2, dashboard_address=None
+    ) as client:
+        assert same(run(client, folder=tmp_path), wanted)
+        # the files are written here, and any executor goes on from them
+        assert same(run("serial", folder=tmp_path), wanted)
+        assert same(run(client.scheduler.address), wanted)
+
+
+@pytest.mark.release
+def test_a_killed_dask_worker_changes_nothing(tmp_path):
+    distributed = pytest.importorskip("distributed")
+    cluster = distributed.LocalCluster(
+        processes=True, n_workers=2, threads_per_worker=1, dashboard_address=None
+    )
+    with cluster, distributed.Client(cluster) as client:
+        victim = next(iter(client.run(os.getpid).values()))
+
+        def kill_after_the_first_chunks():
+            while len(list(tmp_path.glob("chunk-*.npz"))) < 3:
+                time.sleep(0.01)
+            os.kill(victim, signal.SIGKILL)
+
+        killer = threading.Thread(target=kill_after_the_first_chunks, daemon=True)
+        killer.start()
+        result = run(client, folder=tmp_path, samples=128 * 400)
+        killer.join()
+        survivors = set(client.run(os.getpid).values())
+    assert victim not in survivors
+    assert same(result, run("serial", samples=128 * 400))
 
 
 # A body in space on two contacts with friction, and in the plane.

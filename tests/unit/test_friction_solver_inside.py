@@ -17,7 +17,7 @@ from jimpact.solvers import dense
 from jimpact.solvers.friction import distribute, solve
 from jimpact.solvers.many_contacts import solve_many
 
-pytestmark = pytest.mark.slow  # they compile programs of their own
+pytestmark = pytest.mark.release  # they compile programs of their own
 
 PLANAR, SPATIAL, LANES = 3, 2, 128
 

@@ -17,7 +17,7 @@ from jimpact.events.impact_dynamics import method_for
 from jimpact.events.queues import SLOTS
 from jimpact.solvers.step_impulses import StepProblem, descent_lengths, solve
 
-pytestmark = pytest.mark.slow  # they compile programs of their own
+pytestmark = pytest.mark.release  # they compile programs of their own
 
 
 def pressed(name):

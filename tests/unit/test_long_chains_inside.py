@@ -9,7 +9,7 @@ from jimpact.contact import contact_of
 from jimpact.events.impact_dynamics import flow_of
 from jimpact.events.look_ahead import comes_to_rest
 
-pytestmark = pytest.mark.slow  # they compile programs of their own
+pytestmark = pytest.mark.release  # they compile programs of their own
 
 ROW = 12  # balls in a row: more contacts than return as multiples of themselves
 

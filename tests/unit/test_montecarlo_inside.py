@@ -129,12 +129,12 @@ class Stops:
     def __init__(self, after, error=KeyboardInterrupt):
         self.left, self.error = after, error
 
-    def run(self, plan, tasks):
+    def map(self, work, tasks):
         for task in tasks:
             if self.left == 0:
                 raise self.error
             self.left -= 1
-            yield plan(task)
+            yield work(task)
 
 
 @pytest.fixture(scope="module")
@@ -252,9 +252,9 @@ import jax; jax.config.update("jax_enable_x64", True)
 import time, jimpact as ji
 from jimpact import (monte_carlo, Uniform)
 class Slow:
-    def run(self, plan, tasks):
+    def map(self, work, tasks):
         for task in tasks:
-            yield plan(task)
+            yield work(task)
             time.sleep(1.0)
 monte_carlo(ji.Binary(1.0, order="earliest"), ji.chain([0.25, 1.0, 0.25]), [1.0, 0.0, -1.0],
             Uniform(0.0, 1e-5), 1000, chunk={CHUNK}, executor=Slow(), folder={str(tmp_path)!r})

@@ -20,7 +20,7 @@ from jimpact.motion.persistent_contact import (
 )
 from jimpact.motion.record import EVENT_KINDS
 
-pytestmark = pytest.mark.slow  # they compile programs of their own
+pytestmark = pytest.mark.release  # they compile programs of their own
 
 RADIUS = 0.1
 

@@ -15,7 +15,7 @@ from jimpact.motion.flow import nan_derivatives, status_at_start
 from jimpact.motion.simulate import CHUNK
 from jimpact.motion.transitions import impact_jump
 
-pytestmark = pytest.mark.slow  # they compile programs of their own
+pytestmark = pytest.mark.release  # they compile programs of their own
 
 
 @pytest.mark.release

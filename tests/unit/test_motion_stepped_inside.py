@@ -10,7 +10,7 @@ import pytest
 import jimpact as ji
 from jimpact.bodies.solids import rotation
 
-pytestmark = pytest.mark.slow  # they compile programs of their own
+pytestmark = pytest.mark.release  # they compile programs of their own
 
 CUBE = Path(__file__).parents[1] / "data" / "cube_pairs.csv"
 

@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 import jimpact as ji
 from jimpact.motion.record import EVENT_KINDS
 
-pytestmark = pytest.mark.slow  # they share a program, a dear one
+pytestmark = pytest.mark.release  # they share a program, a dear one
 
 
 def reported(name):

@@ -14,7 +14,7 @@ import jimpact as ji
 from jimpact.cli import program_cache
 from jimpact.cli.program_cache import limit_size, stored_programs
 
-pytestmark = pytest.mark.slow  # they compile programs of their own
+pytestmark = pytest.mark.release  # they compile programs of their own
 
 V = np.array([1.0, 0.1, 0.0])
 BALLS = ji.chain([1.0, 2.0, 1.0])

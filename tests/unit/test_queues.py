@@ -8,7 +8,7 @@ import jimpact as ji
 from jimpact.events import queues
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_queue_gives_the_outcomes_of_single_impacts(monkeypatch):
     monkeypatch.setattr(queues, "SLOTS", 4)
     monkeypatch.setattr(queues, "FREE", 2)

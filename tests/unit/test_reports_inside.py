@@ -274,7 +274,7 @@ def test_pictures_of_many_bodies_show_those_that_move_most():
         ji.plot.motion(found, system=system, contacts=[8])
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_films_run_in_time(tmp_path):
     """Frames are equally spaced in time, and files last as long as they say."""
     system, found = rocked()

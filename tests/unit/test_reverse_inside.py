@@ -9,7 +9,7 @@ from reverse_cases import both_modes
 import jimpact as ji
 from jimpact.events import kept_steps
 
-pytestmark = pytest.mark.slow  # they compile programs of their own
+pytestmark = pytest.mark.release  # they compile programs of their own
 
 
 def test_steps_that_are_run_again_have_their_derivatives(monkeypatch):

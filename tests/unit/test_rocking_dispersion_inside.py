@@ -7,7 +7,7 @@ import pytest
 import jimpact as ji
 from jimpact.theory.rocking import OUTCOMES
 
-pytestmark = pytest.mark.slow  # they compile programs of their own
+pytestmark = pytest.mark.release  # they compile programs of their own
 
 MU = np.array([0.0, 0.3, 1.0])
 

@@ -10,7 +10,7 @@ import jimpact as ji
 from jimpact.contact import contact_of, coupled_groups
 from jimpact.scene import pad_scene
 
-pytestmark = pytest.mark.slow  # they compile programs of their own
+pytestmark = pytest.mark.release  # they compile programs of their own
 
 PAIRS = np.array([[-1.0, 0.0, 0], [1, 0, 0], [0, -1, -1], [0, 1, 0], [0, 0, 1]])
 

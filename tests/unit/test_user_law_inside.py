@@ -10,7 +10,7 @@ import jimpact as ji
 from jimpact import read_study
 from jimpact.cli.study import import_laws
 
-pytestmark = pytest.mark.slow  # they compile programs of their own
+pytestmark = pytest.mark.release  # they compile programs of their own
 
 FILE = '''
 import jax.numpy as jnp
