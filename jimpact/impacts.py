@@ -19,6 +19,7 @@ from jimpact._checks import (
 )
 from jimpact.compiling import full_precision, is_top_level_call, quick_jit
 from jimpact.contact import Contact, Groups, contacts_of_groups, coupled_groups
+from jimpact.events.derive import naming_the_adjoint
 from jimpact.law import Impulses, Law, check_law, is_separable, restrict_law, within_domains
 from jimpact.scene import (
     Scene,
@@ -140,7 +141,8 @@ def impact(
     pads = few and groups is None and separable and law.pads_scenes
     if pads and not is_traced((law, scene, v, offsets)) and is_top_level_call():
         return _impact_of_padded_scene(law, scene, v, offsets)
-    return _impact(law, scene, v, groups, offsets, Traced.of(law, scene, v, offsets))
+    with naming_the_adjoint():
+        return _impact(law, scene, v, groups, offsets, Traced.of(law, scene, v, offsets))
 
 
 def _warn_of_unused_gaps(law: Law, scene: Scene, v: jax.Array) -> None:

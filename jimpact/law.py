@@ -484,6 +484,19 @@ def _forwarded(name: str) -> property:
     return property(lambda self: getattr(self.law, name), doc="That of the law within.")
 
 
+def forward_only(law: AnyLaw) -> AnyLaw:
+    """The law, and laws within it, with `adjoint` 'forward' where they have this option."""
+    fields = dataclasses.fields(law)
+    if not any(f.name == "adjoint" or isinstance(getattr(law, f.name), Law) for f in fields):
+        return law
+    new = object.__new__(type(law))
+    for field in fields:
+        value = getattr(law, field.name)
+        value = forward_only(value) if isinstance(value, Law) else value
+        object.__setattr__(new, field.name, "forward" if field.name == "adjoint" else value)
+    return new
+
+
 def check_law(law: Law, scene: Scene, dtype: jnp.dtype) -> None:
     """Raise a ValueError where parameters, or the law as a whole, do not fit the scene."""
     for name, (value, _, domain) in parameters_of(law).items():

@@ -15,6 +15,26 @@ import jax.numpy as jnp
 State = TypeVar("State")
 
 
+@jax.custom_batching.custom_vmap
+def over_lanes(count: jax.Array) -> jax.Array:
+    """The sum of whole numbers over all lanes that `vmap` makes of this program.
+
+    It is the same in all lanes: a condition or a loop on it is not turned into a selection.
+    """
+    return count
+
+
+@over_lanes.def_vmap
+def _over_lanes(size: int, batched: Any, count: jax.Array) -> tuple[jax.Array, bool]:
+    """Rule of `vmap`: the sum over its lanes."""
+    return over_lanes(jnp.sum(count, axis=0, dtype=count.dtype)), False
+
+
+def any_lane(happens: jax.Array) -> jax.Array:
+    """Whether it happens in any lane."""
+    return over_lanes(happens.astype(jnp.int32)) > 0
+
+
 def while_loop(
     goes_on: Callable[[State], jax.Array], one_pass: Callable[[State], State], start: State
 ) -> State:
@@ -27,6 +47,36 @@ def fori_loop(
 ) -> State:
     """As `jax.lax.fori_loop`, from a start of the types that its passes end with."""
     return jax.lax.fori_loop(first, last, one_pass, _begin(lambda s: one_pass(first, s), start))
+
+
+def scan(
+    one: Callable[[State, Any], tuple[State, Any]],
+    start: State,
+    rows: Any,
+    length: int | None = None,
+) -> tuple[State, Any]:
+    """As `jax.lax.scan`, from a start of the types that its passes end with."""
+    first = jax.tree.map(lambda x: x[0], rows)
+    return jax.lax.scan(one, _begin(lambda s: one(s, first)[0], start), rows, length)
+
+
+def cond(which: jax.Array, then: Callable[[], State], otherwise: Callable[[], State]) -> State:
+    """As `jax.lax.cond` of branches that may vary over different mesh axes."""
+    if not jax.sharding.get_abstract_mesh().manual_axes:
+        return jax.lax.cond(which, then, otherwise)
+    both = [jax.make_jaxpr(branch)().out_avals for branch in (then, otherwise)]
+    axes = [axes_of(a) | axes_of(b) for a, b in zip(*both)]
+
+    def varying(branch: Callable[[], State]) -> Callable[[], State]:
+        """The branch, whose results vary over the axes of both."""
+
+        def call() -> State:
+            leaves, tree = jax.tree.flatten(branch())
+            return jax.tree.unflatten(tree, map(_varying, leaves, axes))
+
+        return call
+
+    return jax.lax.cond(which, varying(then), varying(otherwise))
 
 
 def _begin(one_pass: Callable[[Any], Any], start: Any) -> Any:
@@ -52,19 +102,6 @@ def _varying(x: Any, axes: frozenset[Any]) -> Any:
     """x, varying over these axes, too."""
     missing = axes and axes - axes_of(jax.typeof(x))
     return jax.lax.pcast(x, tuple(missing), to="varying") if missing else x
-
-
-def kinds_like(kinds: list[Any], like: Any) -> list[Any]:
-    """The abstract kinds of arrays, varying over the mesh axes of another one."""
-    axes = axes_of(like)
-    if not axes:
-        return kinds
-
-    def arrays() -> list[jax.Array]:
-        """Arrays of these kinds; nothing is computed."""
-        return [_varying(jnp.zeros(x.shape, x.dtype), axes) for x in kinds]
-
-    return list(jax.make_jaxpr(arrays)().out_avals)
 
 
 def axes_of(kind: Any) -> frozenset[Any]:

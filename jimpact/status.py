@@ -32,12 +32,6 @@ STATUS = (
         False,
     ),
     Status("unsolved_step", "impulses of a step are off by > 1 % of its velocities", False),
-    Status(
-        "no_derivatives",
-        "the motion is right, but its derivatives are NaN: it takes more steps than they keep "
-        "(samples + 16 `max_events` + 1024)",
-        False,
-    ),
     Status("energy_gain", "the outcome holds more energy than was there before", True),
     Status("inadmissible_velocity", "a contact still approaches after the impact", True),
     Status("negative_impulse", "a contact would have to pull (p < 0)", True),

@@ -467,10 +467,14 @@ class ContactFlow(Flow):
         return self.closed_form and self.contacts == 1
 
     @property
+    def self_similar(self) -> bool:
+        """Whether a state multiplied by s takes the same course: see `plastic_limit.py`."""
+        return not self.gapped and self.viscous is None
+
+    @property
     def looks_ahead(self) -> bool:
         """Whether the chain is so long that a look ahead decides whether it comes to rest."""
-        self_similar = not self.gapped and self.viscous is None
-        return isinstance(self.coupling, Chain) and self.contacts > MANY and self_similar
+        return isinstance(self.coupling, Chain) and self.contacts > MANY and self.self_similar
 
     def look_due(self, passes: jax.Array) -> jax.Array:
         """Whether (1, B) passes per contact are LOOKS times 1, 2, 4, ..., and energy is lost."""
@@ -482,8 +486,8 @@ class ContactFlow(Flow):
 
     def pauses(self, before: jax.Array, after: jax.Array, passes: jax.Array) -> jax.Array | None:
         """Where the most closings of a contact become 8, 16, 32, ...: see `plastic_limit.py`."""
-        if self.gapped or self.viscous is not None:
-            return None  # not self-similar
+        if not self.self_similar:
+            return None
         m = self.contacts
         count, old = (jnp.max(x[m : 2 * m], axis=0, keepdims=True) for x in (after, before))
         doubled = (count > old) & (count >= OFTEN) & (count & (count - 1) == 0)

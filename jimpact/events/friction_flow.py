@@ -38,6 +38,7 @@ from jimpact.events.contact_flow import (
     power,
 )
 from jimpact.events.stepper import any_of
+from jimpact.loops import fori_loop
 from jimpact.solvers.dense import load_shares, regularized_once, times
 from jimpact.solvers.friction import distribute
 
@@ -259,13 +260,9 @@ class FrictionFlow(ContactFlow):
     # ---- the end: a contact with friction is no multiple of another state
 
     @property
-    def looks_ahead(self) -> bool:
-        """No: see `pauses`."""
+    def self_similar(self) -> bool:
+        """Never, with friction."""
         return False
-
-    def pauses(self, before: jax.Array, after: jax.Array, passes: jax.Array) -> jax.Array | None:
-        """Never: the states of an impact with friction are not self-similar."""
-        return None
 
     @property
     def at_once(self) -> bool:
@@ -302,9 +299,7 @@ class FrictionFlow(ContactFlow):
         twice = jnp.where(x > 0, power(x, plus_one(self.exponent)), 0.0)
         slopes = 1 + across * drag, 1 + across * hold
         start = SingleContact(jnp.where(works, gamma, -1.0), twice, length, 0 * p, 0 * p)
-        end = jax.lax.fori_loop(
-            0, PIECES, lambda _, s: _next_piece(s, slopes, self.restitution), start
-        )
+        end = fori_loop(0, PIECES, lambda _, s: _next_piece(s, slopes, self.restitution), start)
         side = drag * end.sliding + hold * end.holding
         side = jnp.where(works, side, 0.0)
         dp = jnp.where(works, end.sliding + end.holding, 0.0)

@@ -12,12 +12,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.custom_derivatives import SymbolicZero
 
-from jimpact.compiling import full_precision
 from jimpact.contact import Contact
-from jimpact.events import implicit_steps, impulse_form, stepper
-from jimpact.events.batches import in_columns, with_tangents_in_columns
+from jimpact.events import implicit_steps, stepper
 from jimpact.events.contact_flow import (
     Chain,
     ContactFlow,
@@ -28,10 +25,10 @@ from jimpact.events.contact_flow import (
     Viscous,
     per_row,
 )
+from jimpact.events.derive import Arrays, in_lanes
 from jimpact.events.friction_flow import FrictionFlow
 from jimpact.events.implicit_steps import ImplicitSteps
 from jimpact.events.plastic_limit import final_impulses, to_the_end
-from jimpact.events.reverse_mode import reversible_run
 from jimpact.events.slip import SlipFlow
 from jimpact.events.tangents import Dual, is_dual, pushforward, value_of
 from jimpact.solvers.dense import unit
@@ -55,7 +52,7 @@ IMPLICIT_TIGHTENING = 0.1  # the same of method 'implicit', whose steps cost mor
 # A contact slower than the fastest by more than this factor sees many of its periods, whose errors
 # add up, so the tolerance falls with their number. Ten times more: it begins to fall too late.
 WIDE_SPREAD = 5.0
-METHODS = ("auto", "time", "implicit", "impulse")
+METHODS = ("auto", "time", "implicit")
 # Contacts with friction in space up to which 'auto' is 'time'. More of them change between stick
 # and slip thousands of times, one after the other: already of two, some impacts do not end.
 EXACT_CONTACTS = 1
@@ -233,40 +230,21 @@ class ImpulseProgram:
     sides: int = 0  # tangential rows
     whole: bool = False
     finely: bool = False  # at the tolerance of derivatives
-    smooth: bool = False  # only the results that have derivatives
-    reverses: bool = False  # in a form that has a reverse mode
+    checkpoints: bool = False  # its loops have the reverse mode, in the place of the forward mode
 
     def flow(self, problem: Problem, tighten: float) -> tuple[ContactFlow, jax.Array, jax.Array]:
         """The flow of a problem, its first modes and state."""
         flow, modes, y = flow_of(problem, self.exponent, self.structure, tighten)
         return dataclasses.replace(flow, closed_form=flow.closed_form and not self.whole), modes, y
 
-    def shapes(self, *leaves: Any) -> tuple[jax.ShapeDtypeStruct, ...]:
-        """Of the results, from those of the leaves."""
-        contacts, batch = jax.tree.unflatten(self.tree, leaves).omega.shape
-        smooth = (leaves[0].dtype,) * 3
-        kinds = smooth if self.smooth else (*smooth, jnp.int32, jnp.int32)
-        rows = contacts, self.sides, 1, 1, 1
-        return tuple(jax.ShapeDtypeStruct((n, batch), kind) for n, kind in zip(rows, kinds))
-
     def queues(self, *leaves: Any) -> bool:
-        """Whether a batch of any size is worked through as a queue (`stepper.run`): in space."""
-        smooth = self.smooth and self.takes_duals  # called with tangents
-        in_space = self.sides > jax.tree.unflatten(self.tree, leaves).omega.shape[0]
-        return in_space and (smooth or not self.finely)
+        """Whether a batch of any size is worked through as a queue (`until_over`): in space."""
+        return self.sides > jax.tree.unflatten(self.tree, leaves).omega.shape[0]
 
     @property
     def takes_duals(self) -> bool:
         """Whether its arguments may have tangents (see `tangents.py`)."""
-        return self.finely and not self.reverses
-
-    def smoothed(self) -> "ImpulseProgram":
-        """The same with only the results that have derivatives."""
-        return dataclasses.replace(self, smooth=True)
-
-    def reversible(self) -> "ImpulseProgram":
-        """The same in a form that the reverse mode goes through, too."""
-        return dataclasses.replace(self, reverses=self.smooth)
+        return self.finely
 
     def __call__(self, *leaves: Any) -> tuple[Any, ...]:
         """The results from the leaves of a problem; see the class."""
@@ -274,31 +252,21 @@ class ImpulseProgram:
         tighten = GRADIENT_TIGHTENING if self.finely else 1.0
         flow, modes, y = pushforward(lambda problem: self.flow(problem, tighten), problem)
         gamma = value_of(problem.gamma)
-        duals = any(map(is_dual, leaves))
         rows = 3 * gamma.shape[0]
         sides = slice(rows + self.sides, rows + 2 * self.sides)
-        state: Any
         if value_of(flow).at_once:
             state = pushforward(lambda flow, y: flow.finish(modes, y)[1], flow, y)
             results = pushforward(lambda y: (y[rows - 1 : rows], y[sides], y[-1:]), state)
             none = jnp.full(gamma.shape, CODE["ok"], jnp.int32)
-            return results if self.smooth else (*results, none, none)
-        if self.reverses:
-            (state, _), (end, _) = reversible_run(flow, gamma, modes, y, self.most, 0)
-            end = jax.lax.stop_gradient(end)
-            state = jnp.where(end.finishes, flow.finish(end.carry.step.modes, state)[1], state)
-        else:
-            end = to_the_end(flow, gamma, modes, y, self.most, keeps=self.finely and not duals)
-            state = end.carry.y
+            return *results, none, none
+        end = to_the_end(flow, gamma, modes, y, self.most, self.checkpoints)
+        state = end.carry.y
         p = value_of(state)[rows - len(gamma) : rows] + end.impulse
-        if self.smooth or duals:
+        if self.finely:
             last = flow, problem.gamma, state
             plastic = pushforward(lambda f, g, y: final_impulses(f, g, y, end.carries), *last)
             p = Dual(p, plastic.tangents) if is_dual(plastic) else plastic
         rest = pushforward(lambda y: (y[sides], y[-1:]), state)
-        if self.smooth:
-            return p, *rest
-        p = end.with_kept(p) if self.finely and not duals else p
         return p, *rest, end.status, end.carry.progress[3:4].astype(jnp.int32)
 
 
@@ -307,8 +275,12 @@ class ImplicitProgram(ImpulseProgram):
     """As `ImpulseProgram`, by steps without events."""
 
     def queues(self, *leaves: Any) -> bool:
-        """Where it keeps no plan of its steps."""
-        return not self.reverses
+        """Always."""
+        return True
+
+    def only_first(self, values: Arrays) -> Arrays:
+        """The values; a second derivative raises."""
+        return without_derivatives(values, NotImplementedError(NO_SECOND))
 
     def steps(self, problem: Problem) -> tuple[ImplicitSteps, implicit_steps.ImplicitState]:
         """The contacts of a problem, and their state before the impact."""
@@ -340,43 +312,13 @@ class ImplicitProgram(ImpulseProgram):
 
     def __call__(self, *leaves: Any) -> tuple[Any, ...]:
         """The results from the leaves of a problem; see `ImpulseProgram`."""
-        if self.reverses:
-            return self.by_plan(leaves)
-        values = without_derivatives(value_of(leaves), NotImplementedError(NO_SECOND))
+        values = value_of(leaves) if self.checkpoints else self.only_first(value_of(leaves))
         first_only = [Dual(v, x.tangents) if is_dual(x) else v for x, v in zip(leaves, values)]
-        duals, most = any(map(is_dual, leaves)), self.most
-        if self.finely and not duals:  # the reverse mode will walk its steps
-            most = min(most, implicit_steps.MOST_KEPT)
         flow, start = pushforward(self.steps, jax.tree.unflatten(self.tree, first_only))
-        run = implicit_steps.to_the_end(flow, start, most)
-        results = self.results(run.state)
-        return results if self.smooth else (*results, self.code(flow, run), run.passes)
-
-    def results(self, state: implicit_steps.ImplicitState) -> tuple[Any, Any, Any]:
-        """Normal impulses, tangential ones, and the time."""
-        m = len(value_of(state.indentation))
-        return *pushforward(lambda p: (p[:m], p[m:]), state.impulse), state.time
-
-    def by_plan(self, leaves: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """The results with derivatives, in a form that the reverse mode goes through, too."""
-
-        def walked(leaves: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
-            """The results as smooth functions."""
-            still = self.steps(jax.tree.unflatten(self.tree, jax.lax.stop_gradient(leaves)))
-            run = implicit_steps.to_the_end(*still, self.most, keeps=True)
-            assert run.plan is not None
-            flow, start = self.steps(jax.tree.unflatten(self.tree, leaves))
-            return self.results(implicit_steps.repeat(flow, start, run.plan))
-
-        @full_precision
-        def tangent(primals: Any, tangents: Any) -> tuple[Any, Any]:
-            """Those of the steps that were taken; events within them spoil second ones."""
-            leaves = without_derivatives(primals[0], NotImplementedError(NO_SECOND))
-            return jax.jvp(walked, (leaves,), tangents)
-
-        outcome = jax.custom_jvp(walked)
-        outcome.defjvp(tangent)
-        return outcome(leaves)
+        run = implicit_steps.to_the_end(flow, start, self.most, self.checkpoints)
+        m = len(value_of(start.indentation))
+        impulses = pushforward(lambda p: (p[:m], p[m:]), run.state.impulse)
+        return *impulses, run.state.time, self.code(flow, run), run.passes
 
     def code(self, flow: ImplicitSteps, run: implicit_steps.ImplicitRun) -> jax.Array:
         """Status (1, B) of a run."""
@@ -402,6 +344,7 @@ class Dynamics(NamedTuple):
     structure: Structure
     max_steps: int
     method: str = "time"
+    adjoint: str = "jacobian"
 
     @property
     def static_exponent(self) -> float | tuple[float, ...] | None:
@@ -435,15 +378,11 @@ def solve(
     `ill_conditioned`. Differentiable in both modes; method 'time' in all orders.
     """
     units, problem = dynamics.units, dynamics.problem
-    if dynamics.method == "impulse":
-        exponent, most = dynamics.static_exponent, dynamics.max_steps
-        p, code = impulse_form.solve(problem, exponent, dynamics.structure, most)
-        return p * units.momentum, None, code
     leaves, _ = dynamics.columns()
     if condition_check is not None:
         second = dynamics._replace(problem=perturbed(problem)).columns()[0]
         leaves = tuple(jnp.concatenate(both, axis=-1) for both in zip(leaves, second))
-    p, side, _, code, _ = evaluate(dynamics.program(), leaves)
+    p, side, _, code, _ = evaluate(dynamics.program(), leaves, dynamics.adjoint)
     p, code = p * units.momentum[:, None], code[0]
     tangential = None
     if dynamics.tangents > 0:
@@ -498,22 +437,8 @@ def velocity_changes(contact: Contact, p: jax.Array, sides: jax.Array | None) ->
     return jnp.concatenate([contact.delassus @ p + cross @ sides, cross.T @ p + tangent @ sides])
 
 
-def evaluate(function: ImpulseProgram, leaves: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-    """`function(*leaves)` in columns; derivatives walk the accepted steps once more."""
-
-    @jax.custom_jvp
-    def value(*leaves: jax.Array) -> tuple[jax.Array, ...]:
-        """The values."""
-        return in_columns(function, *leaves)
-
-    @full_precision
-    def rule(primals: Any, tangents: Any) -> Any:
-        """Values at the tolerance of derivatives, and their tangents."""
-        # in reverse mode values keep the steps: one loop where they are one program
-        fine = dataclasses.replace(function, finely=True)
-        outs, rates = with_tangents_in_columns(fine, primals, tangents)
-        whole = [SymbolicZero(jax.typeof(x).to_tangent_aval()) for x in outs[len(rates) :]]
-        return outs, (*rates, *whole)
-
-    value.defjvp(rule, symbolic_zeros=True)
-    return value(*leaves)
+def evaluate(program: ImpulseProgram, leaves: Arrays, adjoint: str = "jacobian") -> Arrays:
+    """`program(*leaves)` in lanes; its derivatives are those of a run at a finer tolerance."""
+    checkpoints = adjoint == "checkpoints"
+    fine = dataclasses.replace(program, finely=True, checkpoints=checkpoints)
+    return in_lanes(program, fine, *leaves, adjoint=adjoint)

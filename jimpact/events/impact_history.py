@@ -1,15 +1,19 @@
-"""What a flow of contacts does over the time of an impact, sampled between its steps."""
+"""What a flow of contacts does over the time of an impact, sampled between its steps.
+
+A first run tells how long the impact takes. A second one keeps, for each sample, the state before
+the step that contains it; the sample is one more step from there.
+"""
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from jimpact.events import implicit_steps, stepper
+from jimpact.events import implicit_steps, plastic_limit, stepper
 from jimpact.events.contact_flow import ContactStates
 from jimpact.events.impact_dynamics import ImplicitProgram, ImpulseProgram
-from jimpact.events.reverse_mode import reversible_run, run
+from jimpact.events.implicit_steps import ImplicitState
 
 
 def history_program(outcome: ImpulseProgram, samples: int) -> "HistoryProgram":
@@ -17,6 +21,15 @@ def history_program(outcome: ImpulseProgram, samples: int) -> "HistoryProgram":
     if isinstance(outcome, ImplicitProgram):
         return ImplicitHistoryProgram(outcome, samples)
     return HistoryProgram(outcome, samples)
+
+
+class Seen(NamedTuple):
+    """What is kept of the steps: states (s, .., B), their step, largest forces (m, B)."""
+
+    states: Any
+    modes: jax.Array
+    clock: jax.Array
+    force: jax.Array
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,37 +42,63 @@ class HistoryProgram:
 
     outcome: ImpulseProgram  # `whole`: no closed form ends it
     samples: int
-    reverses: bool = False  # in a form that has a reverse mode
 
-    def reversible(self) -> "HistoryProgram":
-        """The same in a form that the reverse mode goes through, too."""
-        return dataclasses.replace(self, reverses=True)
+    def each(self, x: jax.Array) -> jax.Array:
+        """x (k, B) in each sample."""
+        return jnp.broadcast_to(x, (self.samples, *x.shape))
+
+    def parts(self, dtype: Any) -> jax.Array:
+        """Samples (s,) as parts of the duration."""
+        return jnp.linspace(0.0, 1.0, self.samples, dtype=dtype)
 
     def __call__(self, *leaves: jax.Array) -> tuple[jax.Array, ...]:
         """The results from the leaves of a problem; see the class."""
         problem = jax.tree.unflatten(self.outcome.tree, leaves)
         flow, modes, y = self.outcome.flow(problem, 1.0)
-        gamma, most = problem.gamma, self.outcome.most
-        way = reversible_run if self.reverses else run
-        (end, found), (ended, places) = way(flow, gamma, modes, y, most, self.samples)
-        ended, places = jax.lax.stop_gradient((ended, places))
-        no_target = jnp.zeros(ended.carry.step.target.shape, bool)
+        gamma, most, checkpoints = problem.gamma, self.outcome.most, self.outcome.checkpoints
+        still = jax.lax.stop_gradient((flow, gamma, modes, y))
+        duration = plastic_limit.to_the_end(*still, most, checkpoints).reached[-1:]
+        t = self.parts(y.dtype)[:, None, None] * jax.lax.stop_gradient(duration)[None]
+
+        def observe(seen: Seen, now: stepper.StepperState, accept: jax.Array) -> Seen:
+            """With this step where it may contain a sample."""
+            force = flow.contact_states(now.step.modes, now.y).force
+            begun = accept[None] & (now.y[None, -1:] <= t)
+            return Seen(
+                jnp.where(begun, now.y[None], seen.states),
+                jnp.where(begun, now.step.modes[None], seen.modes),
+                jnp.where(begun, now.step.clock[None], seen.clock),
+                jnp.where(accept & (force > seen.force), force, seen.force),
+            )
+
+        first = flow.contact_states(modes, y).force
+        clock = jnp.zeros((4, *y.shape[1:]), y.dtype)
+        seen = Seen(self.each(y), self.each(modes), self.each(clock), first)
+        end = plastic_limit.to_the_end(
+            flow, gamma, modes, y, most, checkpoints, observe=observe, seen=seen
+        )
+        last = flow.contact_states(end.carry.step.modes, end.reached).force
+        no_target = jnp.zeros(end.carry.step.target.shape, bool)
 
         def at(sample: Any) -> tuple[jax.Array, jax.Array, ContactStates]:
             """A sample is one more step, in time, from the state before it."""
             part, state, now, clock = sample
             rate = flow.contact_states(now, state).rate
-            since = part * end[-1:] - state[-1:]
+            since = part * end.reached[-1:] - state[-1:]
             ahead = jnp.where(rate > 0, since / jnp.where(rate > 0, rate, 1.0), 0.0)
             state = stepper.between(flow, stepper.Step(now, no_target, clock), state, ahead)
             sample = flow.contact_states(now, state)
             x = jnp.maximum(sample.indentation, 0.0)
             return state[-1:], flow.energy(x, jnp.zeros_like(x)), sample._replace(indentation=x)
 
-        parts = jnp.linspace(0.0, 1.0, self.samples, dtype=y.dtype)
-        samples = parts, found.states, places.modes, places.clock
-        time, energy, states_at = jax.lax.map(at, samples)
-        return time, energy, *states_at, found.force, ended.status.astype(y.dtype)
+        over = t >= end.reached[None, -1:]
+        states = jnp.where(over, end.reached[None], end.seen.states)
+        now = jnp.where(over, end.carry.step.modes[None], end.seen.modes)
+        clock = jnp.where(over, 0.0, end.seen.clock)
+        rows = self.parts(y.dtype), states, now, clock
+        time, energy, states_at = jax.lax.map(at, rows)
+        force = jnp.where(last > end.seen.force, last, end.seen.force)
+        return time, energy, *states_at, force, end.status.astype(y.dtype)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,32 +110,34 @@ class ImplicitHistoryProgram(HistoryProgram):
 
     outcome: ImplicitProgram
 
-    def reversible(self) -> "ImplicitHistoryProgram":
-        """Itself."""
-        return self
-
     def __call__(self, *leaves: jax.Array) -> tuple[jax.Array, ...]:
         """The results from the leaves of a problem; see `HistoryProgram`."""
-        problem = jax.tree.unflatten(self.outcome.tree, leaves)
-        flow, start = self.outcome.steps(jax.lax.stop_gradient(problem))
-        run = implicit_steps.to_the_end(flow, start, self.outcome.most, keeps=True)
-        assert run.plan is not None
-        flow, start = self.outcome.steps(problem)
-        states, m = implicit_steps.path(flow, start, run.plan), flow.contacts
-        times = states.time  # (steps + 1, 1, B)
+        outcome = self.outcome
+        flow, start = outcome.steps(jax.tree.unflatten(outcome.tree, leaves))
+        m, most, checkpoints = flow.contacts, outcome.most, outcome.checkpoints
+        still = jax.lax.stop_gradient((flow, start))
+        duration = implicit_steps.to_the_end(*still, most, checkpoints).state.time
+        t = self.parts(duration.dtype)[:, None, None] * jax.lax.stop_gradient(duration)[None]
 
-        def at(part: jax.Array) -> tuple[jax.Array, jax.Array, ContactStates]:
+        def force(s: ImplicitState) -> jax.Array:
+            """Normal forces (m, B)."""
+            return flow.force_of(s.indentation, s.velocity[:m])
+
+        def observe(seen: Any, now: ImplicitState, accept: jax.Array) -> Any:
+            """With the state before this step where it may contain a sample."""
+            states, largest = seen
+            begun = accept[None] & (now.time[None] <= t)
+            kept = jax.tree.map(lambda a, b: jnp.where(begun, a[None], b), now, states)
+            return kept, jnp.where(accept, jnp.maximum(force(now), largest), largest)
+
+        seen = jax.tree.map(self.each, start), force(start)
+        run = implicit_steps.to_the_end(flow, start, most, checkpoints, observe, seen)
+        states, largest = run.seen
+
+        def at(sample: Any) -> tuple[jax.Array, jax.Array, ContactStates]:
             """A sample is one more step from the state before it."""
-            t = part * times[-1]
-            reached = times <= jax.lax.stop_gradient(t)[None]
-            before = jnp.sum(reached.astype(jnp.int32), axis=0) - 1
-
-            def of(rows: jax.Array) -> jax.Array:
-                """Rows of the state before the sample."""
-                return jnp.take_along_axis(rows, before[None], axis=0)[0]
-
-            state = jax.tree.map(of, states)
-            s = implicit_steps.between(flow, state, t - state.time)
+            part, state = sample
+            s = implicit_steps.between(flow, state, part * run.state.time - state.time)
             x, gamma = jnp.maximum(s.indentation, 0.0), s.velocity[:m]
             sample = ContactStates(
                 force=flow.force_of(x, gamma),
@@ -110,8 +151,6 @@ class ImplicitHistoryProgram(HistoryProgram):
             )
             return s.time, flow.energy(x), sample
 
-        parts = jnp.linspace(0.0, 1.0, self.samples, dtype=times.dtype)
-        time, energy, states_at = jax.lax.map(at, parts)
-        force = jax.vmap(flow.force_of)(states.indentation, states.velocity[:, :m])
-        code = self.outcome.code(flow, run).astype(times.dtype)
-        return time, energy, *states_at, jnp.max(force, axis=0), code
+        time, energy, states_at = jax.lax.map(at, (self.parts(t.dtype), states))
+        code = outcome.code(flow, run).astype(t.dtype)
+        return time, energy, *states_at, jnp.maximum(largest, force(run.state)), code

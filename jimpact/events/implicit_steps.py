@@ -20,16 +20,15 @@ at about twice the one allowed in a step, but nothing bounds them where an outco
 course without limit: a second run shows that (`check_conditioning`).
 
 Units are those of `impact_dynamics.py`. Derivatives are those of the accepted steps with their
-lengths fixed, and converge with the tolerance. Forward mode carries all directions along (`Dual`);
-the reverse mode walks the plan of the steps once more.
+lengths fixed, and converge with the tolerance; the loop carries all directions along (`Dual`).
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from jimpact.events.contact_flow import (
     Coupling,
@@ -40,8 +39,9 @@ from jimpact.events.contact_flow import (
     per_row,
     power,
 )
-from jimpact.events.queues import run_queue, side_by_side
+from jimpact.events.queues import until_over
 from jimpact.events.tangents import dual_like, is_dual, pushforward, value_of
+from jimpact.loops import cond, scan
 from jimpact.solvers.step_impulses import StepProblem, descent_lengths, solve
 
 # The stages of friction: with 1 - 1/sqrt(2) two implicit stages are of order 2 and L-stable. No
@@ -75,10 +75,6 @@ ROUNDINGS = 64
 # A contact unloads implicitly where explicit expansion changes its force within a step by more than
 # this part. Ten times more is unstable.
 STIFF = 0.5
-# Steps that the reverse mode can walk back, in blocks; more end as `max_steps`. At the default
-# tolerance an impact takes 50 to 500. Ten times more: memory in batches.
-BLOCKS, BLOCK = 64, 64
-MOST_KEPT = BLOCKS * BLOCK
 
 
 class ImplicitState(NamedTuple):
@@ -222,11 +218,10 @@ class ImplicitSteps:
         normal, after = impulse[:m], velocity[:m]
 
         cut = stiff & (normal < load)
-        middle = jax.lax.cond(
+        middle = cond(
             jnp.any(cut),
-            lambda f, x: jnp.where(cut, self.indentation_of(f, h), x),
-            lambda _, x: x,
-            *(normal, half),
+            lambda: jnp.where(cut, self.indentation_of(normal, h), half),
+            lambda: half,
         )
         x = self.moved(middle, after, h / 2, stiff)
         x = x + jnp.where(stiff, 0.0, self.turned(s.indentation, half, gamma, after, h))
@@ -287,13 +282,13 @@ class ImplicitSteps:
             load = h * self.force_of(half, s.velocity + self.coupling.times(load) / 2)
             return load, load / h, load, none
 
-        def cut(load: jax.Array, unloading: jax.Array) -> tuple[jax.Array, jax.Array]:
+        def cut() -> tuple[jax.Array, jax.Array]:
             """What fast expansions leave of the load."""
             problem = self.problem(s.velocity, load, unloading, self.friction)
             return solve(problem, h * s.rate, INNER * self.tolerance)
 
         some = jnp.any(unloading > 0)
-        normal, left = jax.lax.cond(some, cut, lambda load, _: (load, none), load, unloading)
+        normal, left = cond(some, cut, lambda: (load, none))
         return normal, normal / h, load, left
 
     def turned(
@@ -377,11 +372,13 @@ class ImplicitSteps:
             at, big = carry
             length, is_whole = which
             after, loss = self.substep(at, length)
+            # guesses of impulses have no tangents
+            after = after._replace(rate=jax.lax.stop_gradient(after.rate))
             at = jax.tree.map(lambda a, b: jnp.where(is_whole, a, b), at, after)
             big = jax.tree.map(lambda a, b: jnp.where(is_whole, b, a), big, after)
             return (at, big), jnp.where(is_whole, 0.0, loss)
 
-        (end, big), losses = jax.lax.scan(part, (s, s), (lengths, whole))
+        (end, big), losses = scan(part, (s, s), (lengths, whole))
         loaded = (end.indentation > 0) & (big.indentation > 0)
         counts = jnp.ones_like(loaded) if self.gapped else end.indentation > 0
         moved = jnp.where(counts, jnp.abs(end.indentation - big.indentation), 0.0)
@@ -407,20 +404,13 @@ def descent_of(coupling: Coupling, contacts: int) -> jax.Array:
     return ones / jnp.max(row_sums, axis=0, keepdims=True) * jnp.ones_like(row_sums)
 
 
-class Plan(NamedTuple):
-    """Lengths of the accepted steps (MOST_KEPT, 1, B), 0 where there are no more."""
-
-    lengths: jax.Array
-    used: jax.Array  # (1, B) how many
-
-
 class ImplicitRun(NamedTuple):
-    """An impact on its way: its state, the next step (1, B), attempts (1, B), the plan."""
+    """An impact on its way: its state, the next step (1, B), attempts (1, B), what steps showed."""
 
     state: ImplicitState
     length: jax.Array
     passes: jax.Array
-    plan: Plan | None
+    seen: Any
 
     def over(self, flow: ImplicitSteps, most: int) -> jax.Array:
         """Whether (1, B) it has ended or is given up."""
@@ -443,7 +433,7 @@ def attempt(
     `flow` and `state` may have tangents (`Dual`); the length of the step has none.
     """
     new, error = pushforward(lambda flow, s: flow.step(flow.coasted(s), length), flow, state)
-    new, error = with_tangents_of(state, new), value_of(error)
+    new, error = with_tangents_of(state, new), jax.lax.stop_gradient(value_of(error))
     accepted = live & (error <= 1)
     state = jax.tree.map(lambda a, b: jnp.where(accepted, a, b), new, state)
     return state, jnp.where(live, next_length(length, error), length), accepted
@@ -456,17 +446,22 @@ def with_tangents_of(flow: Any, state: ImplicitState) -> ImplicitState:
 
 
 def to_the_end(
-    flow: ImplicitSteps, start: ImplicitState, most: int, keeps: bool = False
+    flow: ImplicitSteps,
+    start: ImplicitState,
+    most: int,
+    checkpoints: bool = False,
+    observe: Callable[[Any, ImplicitState, jax.Array], Any] | None = None,
+    seen: Any = None,
 ) -> ImplicitRun:
-    """From the start to the end of the impact; `keeps` the plan of the steps.
+    """From the start to the end of the impact, in at most so many passes.
 
-    `flow` and `start` may have tangents (`Dual`), which are carried along.
+    `flow` and `start` may have tangents (`Dual`), which are carried along. With `checkpoints` the
+    loop has a reverse mode, and no forward mode. `observe(seen, state, accepted)` follows the
+    states before each step, and which impacts (1, B) accept it.
     """
     start = with_tangents_of((flow, start), start)
     length = FIRST * jnp.ones_like(value_of(flow.tolerance))
-    lanes = jnp.zeros(length.shape, jnp.int32)
-    plan = Plan(jnp.zeros((MOST_KEPT, *lanes.shape), length.dtype), lanes) if keeps else None
-    run, most = ImplicitRun(start, length, lanes, plan), min(most, MOST_KEPT) if keeps else most
+    run = ImplicitRun(start, length, jnp.zeros(length.shape, jnp.int32), seen)
 
     def goes_on(flow: ImplicitSteps, run: ImplicitRun) -> jax.Array:
         """Which impacts (1, B) are not over."""
@@ -476,62 +471,10 @@ def to_the_end(
         """One step tried in all impacts that go on."""
         live = goes_on(flow, run)
         state, length, accepted = attempt(flow, run.state, run.length, live)
-        plan = run.plan
-        if plan is not None:
-            at = plan.used[0], 0, np.arange(lanes.shape[1])
-            kept = jnp.where(accepted[0], run.length[0], plan.lengths[at])
-            used = plan.used + accepted.astype(jnp.int32)
-            plan = Plan(plan.lengths.at[at].set(kept), used)
-        return ImplicitRun(state, length, run.passes + live.astype(jnp.int32), plan)
+        seen = run.seen if observe is None else observe(run.seen, run.state, accepted)
+        return ImplicitRun(state, length, run.passes + live.astype(jnp.int32), seen)
 
-    # a plan is long, and is not moved between slots
-    return (side_by_side if keeps else run_queue)(goes_on, attempt_all, flow, run)
-
-
-def repeat(flow: ImplicitSteps, start: ImplicitState, plan: Plan) -> ImplicitState:
-    """The state after the steps of the plan, as a smooth function of `flow` and `start`."""
-    return _walk(flow, start, plan, states=False)[0]
-
-
-def path(flow: ImplicitSteps, start: ImplicitState, plan: Plan) -> ImplicitState:
-    """States (steps + 1, .., B) before the first step and after each one, smooth as well."""
-    after = _walk(flow, start, plan, states=True)[1]
-
-    def joined(first: jax.Array, blocks: jax.Array) -> jax.Array:
-        """The first one and those of all blocks."""
-        return jnp.concatenate([first[None], blocks.reshape(-1, *first.shape)])
-
-    return jax.tree.map(joined, start, after)
-
-
-def _walk(
-    flow: ImplicitSteps, start: ImplicitState, plan: Plan, states: bool
-) -> tuple[ImplicitState, Any]:
-    """The state after the steps of the plan; with `states` those after each step, in blocks."""
-
-    def step(s: ImplicitState, length: jax.Array) -> tuple[ImplicitState, ImplicitState | None]:
-        """One step of the plan."""
-        taken = length > 0
-        new, _ = flow.step(flow.coasted(s), jnp.where(taken, length, FIRST))
-        s = jax.tree.map(lambda a, b: jnp.where(taken, a, b), new, s)
-        return s, s if states else None
-
-    def block(s: ImplicitState, lengths: jax.Array) -> tuple[ImplicitState, Any]:
-        """One block of steps; an empty one costs nothing."""
-
-        def walk(s: ImplicitState) -> tuple[ImplicitState, Any]:
-            """The state after the block."""
-            return jax.lax.scan(jax.checkpoint(step), s, lengths)
-
-        def skip(s: ImplicitState) -> tuple[ImplicitState, Any]:
-            """The state as it is."""
-            same = jax.tree.map(lambda x: jnp.broadcast_to(x, (BLOCK, *x.shape)), s)
-            return s, same if states else None
-
-        return jax.lax.cond(jnp.any(lengths > 0), walk, skip, s)
-
-    rows = plan.lengths.reshape(BLOCKS, BLOCK, *plan.lengths.shape[1:])
-    return jax.lax.scan(jax.checkpoint(block), start, rows)
+    return until_over(goes_on, attempt_all, flow, run, checkpoints, queues=observe is None)
 
 
 def between(flow: ImplicitSteps, s: ImplicitState, ahead: jax.Array) -> ImplicitState:

@@ -15,7 +15,7 @@ them apart in the end; meanwhile its states are no multiples of each other.
 The states of many contacts return in no order. There a look ahead decides (`look_ahead.py`).
 """
 
-import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -23,10 +23,11 @@ import jax.numpy as jnp
 
 from jimpact.events import stepper
 from jimpact.events.contact_flow import OFTEN, ContactFlow
-from jimpact.events.kept_steps import Kept, nothing_kept, record
 from jimpact.events.look_ahead import comes_to_rest
+from jimpact.events.queues import until_over
 from jimpact.events.stepper import GOES_ON, OVER, PAUSED, any_of, total
 from jimpact.events.tangents import dual_like, pushforward, value_of
+from jimpact.loops import cond, fori_loop, scan
 from jimpact.status import CODE
 
 # Velocity in tolerances, below which a contact that re-closed often is at rest once the rest of its
@@ -56,10 +57,9 @@ class ImpactEnd(NamedTuple):
     """An impact at its end, finished but for the impulse of the contacts at rest."""
 
     carry: stepper.StepperState
-    kept: Kept | None  # its steps
-    reached: Any  # the state (n, B) before it was finished; None where no steps are kept
+    reached: Any  # the state (n, B) before it was finished
     rest: Rest
-    begun: jax.Array  # ()
+    seen: Any  # what its steps showed
 
     @property
     def carries(self) -> jax.Array:
@@ -70,18 +70,6 @@ class ImpactEnd(NamedTuple):
     def impulse(self) -> jax.Array:
         """Of the contacts at rest (m, B)."""
         return jnp.where(self.carries, self.rest.rows[2], 0.0)
-
-    def with_kept(self, x: jax.Array) -> jax.Array:
-        """x, of a program that has to keep steps even if only x is used.
-
-        Values and their derivatives keep the same steps. The compiler merges two loops that are the
-        same; it would first remove the slots from one of them.
-        """
-        assert self.kept is not None
-        numbers = self.kept.state[0, -1:], self.kept.marks[0, -1:], self.kept.plan[:1, None]
-        negative = functools.reduce(jnp.logical_or, [number < 0 for number in numbers])
-        never = negative | (self.reached[-1:] < 0)  # passes, flags, steps and time are not
-        return jnp.where(never, jnp.nan, x)
 
     @property
     def over(self) -> jax.Array:
@@ -100,56 +88,100 @@ class ImpactEnd(NamedTuple):
         return jnp.where(self.over, code, CODE["max_steps"]).astype(jnp.int32)
 
 
-def to_the_end(
-    flow: Any, gamma: jax.Array, modes: jax.Array, y: Any, most: int, keeps: bool
-) -> ImpactEnd:
-    """From gap velocities gamma (m, B) to the end; `keeps` steps, for the reverse mode.
+class _Run(NamedTuple):
+    """An impact on its way."""
 
-    What of `flow` and y has tangents (see `tangents.py`) gives a state with tangents.
+    carry: stepper.StepperState
+    rest: Rest
+    seen: Any
+
+
+Observe = Callable[[Any, stepper.StepperState, jax.Array], Any]
+
+
+def to_the_end(
+    flow: Any,
+    gamma: jax.Array,
+    modes: jax.Array,
+    y: Any,
+    most: int,
+    checkpoints: bool = False,
+    observe: Observe | None = None,
+    seen: Any = None,
+) -> ImpactEnd:
+    """From gap velocities gamma (m, B) to the end, in at most so many passes.
+
+    What of `flow` and y has tangents (see `tangents.py`) gives a state with tangents. With
+    `checkpoints` the loop has a reverse mode, and no forward mode. `observe(seen, state, accept)`
+    follows the states before each step, and which impacts (1, B) accept it.
     """
-    carry = stepper.begin(flow, modes, y)
-    still = jax.lax.stop_gradient(value_of(flow))
-    gamma = jax.lax.stop_gradient(gamma)
     no = jnp.zeros(gamma.shape, bool)
     rows = jnp.zeros((3, *gamma.shape), gamma.dtype)
     rest = Rest(no, no, rows, jnp.zeros(gamma.shape, modes.dtype), no[:1])
-    kept, reached = (nothing_kept(carry), carry.y) if keeps else (None, None)
-    start = ImpactEnd(carry, kept, reached, rest, jnp.asarray(False))
 
-    def on(end: ImpactEnd) -> ImpactEnd:
-        """On to the next pause or to the end."""
-        finished = (end.carry.progress[2:3] == OVER) & end.begun
-        if end.kept is None:
-            carry, kept, reached = stepper.run(flow, end.carry, most), None, None
-        else:
-            carry, kept = record(flow, end.carry, end.kept, most)
-            reached = jnp.where(finished, end.reached, carry.y)
-        over, paused = (carry.progress[2:3] == OVER) & ~finished, carry.progress[2:3] == PAUSED
-        values = jax.lax.stop_gradient(carry._replace(y=value_of(carry.y)))
-        quiet = over & at_rest(still, values)
-
-        def at_end(flow: ContactFlow, y: jax.Array) -> jax.Array:
-            """The state, finished where the impact is over."""
-            return jnp.where(over, flow.finish(carry.step.modes, y)[1], y)
-
-        carry = carry._replace(y=dual_like(carry.y, pushforward(at_end, flow, carry.y)))
-        values = values._replace(y=jax.lax.stop_gradient(value_of(carry.y)))
-        rest = jax.lax.cond(
-            jnp.any(paused | quiet),
-            lambda: contacts_at_rest(still, gamma, values, end.rest, quiet),
-            lambda: end.rest,
-        )
-        if still.looks_ahead:
-            due = paused & ~rest.ended & still.look_due(values.progress[3:4])
-            rest = jax.lax.cond(
-                jnp.any(due), lambda: block_at_rest(still, gamma, values, rest, due), lambda: rest
-            )
+    def one_pass(at: tuple[Any, jax.Array], run: _Run) -> _Run:
+        """One step tried; impacts that pause are inspected."""
+        flow, gamma = at
+        carry, accept = stepper.advance(flow, run.carry, most)
+        if observe is not None:
+            run = run._replace(seen=observe(run.seen, run.carry, accept))
+        paused = carry.progress[2:3] == PAUSED
+        if not value_of(flow).self_similar:
+            return run._replace(carry=carry)
+        rest = _inspected(flow, gamma, carry, run.rest, paused, jnp.zeros_like(run.rest.contacts))
         settled = jnp.where(rest.ended, OVER, GOES_ON)
-        progress = carry.progress.at[2:3].set(jnp.where(paused, settled, carry.progress[2:3]))
-        return ImpactEnd(carry._replace(progress=progress), kept, reached, rest, jnp.asarray(True))
+        mark = jnp.where(paused, settled, carry.progress[2:3])
+        progress = carry.progress.at[2:3].set(jax.lax.stop_gradient(mark))
+        return _Run(carry._replace(progress=progress), rest, run.seen)
 
-    return jax.lax.while_loop(
-        lambda end: ~end.begun | jnp.any(stepper.goes_on(end.carry, most)), on, start
+    start = _Run(stepper.begin(flow, modes, y), rest, seen)
+    run = until_over(
+        lambda _, run: stepper.goes_on(run.carry, most), one_pass, (flow, gamma), start,
+        checkpoints, value_of(flow).queues and observe is None,
+    )  # fmt: skip
+    return _finished(flow, gamma, run)
+
+
+def _finished(flow: Any, gamma: jax.Array, run: _Run) -> ImpactEnd:
+    """The end of a run; the flow finishes the state where it has ended by itself."""
+    carry, rest, seen = run
+    over = (carry.progress[2:3] == OVER) & ~rest.ended
+    quiet = over & at_rest(*_values(flow, carry))
+
+    def at_end(flow: ContactFlow, y: jax.Array) -> jax.Array:
+        """The state, finished where the impact is over."""
+        return jnp.where(over, flow.finish(carry.step.modes, y)[1], y)
+
+    y = dual_like(carry.y, pushforward(at_end, flow, carry.y))
+    end = carry._replace(y=y)
+    rest = _inspected(flow, gamma, end, rest, jnp.any(quiet, axis=0, keepdims=True), quiet)
+    return ImpactEnd(end, carry.y, rest, seen)
+
+
+def _values(flow: Any, carry: stepper.StepperState) -> tuple[Any, stepper.StepperState]:
+    """Flow and state without tangents."""
+    values = value_of(flow), carry._replace(y=value_of(carry.y))
+    return jax.lax.stop_gradient(values)
+
+
+def _inspected(
+    flow: Any, gamma: jax.Array, carry: Any, rest: Rest, due: jax.Array, quiet: jax.Array
+) -> Rest:
+    """`contacts_at_rest` where any impact (1, B) is `due`, otherwise `rest`."""
+    flow, values = _values(flow, carry)
+    gamma, rest = jax.lax.stop_gradient((gamma, rest))
+    rest = cond(
+        jnp.any(due),
+        lambda: contacts_at_rest(flow, gamma, values, rest, quiet),
+        lambda: rest,
+    )
+    if not flow.looks_ahead:
+        return rest
+    look = due & ~rest.ended & ~any_of(quiet) & flow.look_due(values.progress[3:4])
+    return cond(
+        jnp.any(look),
+        lambda: block_at_rest(flow, gamma, values, rest, look),
+        lambda: rest,
     )
 
 
@@ -227,7 +259,7 @@ def plastic_impulses(
         after = now + flow.coupling.times(dp)
         return allowed & jnp.where(carries, dp > 0, after < 0), dp
 
-    return jax.lax.fori_loop(0, CHOICES, choose, (start, jnp.zeros_like(now)))
+    return fori_loop(0, CHOICES, choose, (start, jnp.zeros_like(now)))
 
 
 def final_impulses(
@@ -246,7 +278,7 @@ def final_impulses(
         of_rest = impulse_of_rest(flow, carries, gamma + flow.change(others))
         return jnp.where(carries, of_rest, p)
 
-    return jax.lax.cond(jnp.any(carries), some, lambda: p)
+    return cond(jnp.any(carries), some, lambda: p)
 
 
 def impulse_of_rest(flow: ContactFlow, carries: jax.Array, after: jax.Array) -> jax.Array:
@@ -265,4 +297,4 @@ def impulse_of_rest(flow: ContactFlow, carries: jax.Array, after: jax.Array) -> 
         return (z, residual, residual + ratio * direction, new), None
 
     start = (jnp.zeros_like(right), right, right, total(right * right))
-    return jax.lax.scan(step, start, None, length=2 * right.shape[0])[0][0]
+    return scan(step, start, None, length=2 * right.shape[0])[0][0]

@@ -1,16 +1,22 @@
-"""Impacts of a batch in a queue: one that is over makes room for the next one."""
+"""The loop of all impacts: side by side, or in a queue where one that is over makes room."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
+import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
+
+from jimpact.loops import cond, while_loop
 
 # Impacts with friction that a CPU computes side by side, whatever the size of the batch; and slots
 # that are free before they are filled with waiting impacts. Ten times more slots: more of them idle
 # while the last impacts end; ten times fewer: each operation has too few numbers to work on. Ten
 # times more free slots: all wait for the slowest impact again.
 SLOTS, FREE = 64, 4
+# States that the reverse mode of a loop keeps at a time. Ten times more: ten times its memory; ten
+# times fewer: steps are run again more often.
+CHECKPOINTS = 64
 
 Carry = TypeVar("Carry")
 
@@ -25,39 +31,38 @@ class _Slots(NamedTuple):
     ends: Any  # of all impacts, as far as they have left their slots
 
 
-def side_by_side(
+def until_over(
     goes_on: Callable[[Any, Any], jax.Array],
     advance: Callable[[Any, Any], Any],
     flow: Any,
     carry: Carry,
+    checkpoints: bool = False,
+    queues: bool = False,
 ) -> Carry:
-    """All impacts at once, as in `run_queue`: they wait for the slowest one."""
-    return jax.lax.while_loop(
-        lambda c: jnp.any(goes_on(flow, c)), lambda c: advance(flow, c), carry
-    )
-
-
-def run_queue(
-    goes_on: Callable[[Any, Any], jax.Array],
-    advance: Callable[[Any, Any], Any],
-    flow: Any,
-    carry: Carry,
-) -> Carry:
-    """All impacts to their ends, at most SLOTS of them side by side on a CPU.
+    """All impacts to their ends.
 
     `goes_on(flow, carry)` says which (1, B) are not over, `advance(flow, carry)` makes one pass;
-    the batch B is the last axis of all arrays.
+    the batch B is the last axis of all arrays. With `checkpoints` the loop has a reverse mode, in
+    the place of a forward mode. If it `queues`, a CPU has at most SLOTS impacts side by side.
     """
 
     def at_once(flow: Any, carry: Any) -> Any:
-        """The impacts of the queue, all of them at once."""
-        return side_by_side(goes_on, advance, flow, carry)
+        """All impacts side by side: they wait for the slowest one."""
+
+        def busy(carry: Any) -> jax.Array:
+            """Whether () any goes on."""
+            return jnp.any(goes_on(flow, carry))
+
+        if checkpoints:
+            one = lambda carry: advance(flow, carry)  # noqa: E731
+            return eqxi.while_loop(busy, one, carry, kind="checkpointed", checkpoints=CHECKPOINTS)
+        return while_loop(busy, lambda carry: advance(flow, carry), carry)
 
     def in_slots(flow: Any, carry: Any) -> Any:
-        """The impacts of the queue, in slots."""
+        """As a queue, in slots."""
         return _in_slots(goes_on, advance, flow, carry)
 
-    if jax.tree.leaves(carry)[0].shape[-1] <= SLOTS:
+    if checkpoints or not queues or jax.tree.leaves(carry)[0].shape[-1] <= SLOTS:
         return at_once(flow, carry)
     return jax.lax.platform_dependent(flow, carry, cpu=in_slots, default=at_once)
 
@@ -68,7 +73,7 @@ def _in_slots(
     flow: Any,
     carry: Any,
 ) -> Any:
-    """`run_queue` of more impacts than there are slots."""
+    """`until_over` of more impacts than there are slots."""
     count = jax.tree.leaves(carry)[0].shape[-1]
 
     def picked(tree: Any, impact: jax.Array) -> Any:
@@ -94,7 +99,7 @@ def _in_slots(
         """One pass in each slot; enough of those that are free are filled first."""
         free = jnp.sum(~goes_on(s.flow, s.carry), dtype=jnp.int32)
         fills = (free >= FREE) & (s.following < count)
-        s = jax.lax.cond(fills, refilled, lambda s: s, s)
+        s = cond(fills, lambda: refilled(s), lambda: s)
         return s._replace(carry=advance(s.flow, s.carry))
 
     def open_work(s: _Slots) -> jax.Array:
@@ -104,4 +109,4 @@ def _in_slots(
     first = jnp.arange(SLOTS, dtype=jnp.int32)
     own, here = picked((flow, carry), first)
     slots = _Slots(first, jnp.asarray(SLOTS, jnp.int32), own, here, carry)
-    return stored(jax.lax.while_loop(open_work, one_pass, slots))
+    return stored(while_loop(open_work, one_pass, slots))

@@ -31,6 +31,7 @@ import numpy as np
 from jimpact.events.contact_flow import ContactFlow, ContactStates, Frozen, as_pytree
 from jimpact.events.friction_flow import FrictionFlow
 from jimpact.events.stepper import any_of, total
+from jimpact.loops import cond
 from jimpact.solvers.dense import product, pseudoinverse, solve, times, unit
 from jimpact.solvers.friction import distribute
 
@@ -415,7 +416,7 @@ class SlipFlow(FrictionFlow):
         if m == 1:
             return value, rates
         needed = jnp.any(target[3 * m :] & stick & any_of(creeps))
-        rates = jax.lax.cond(
+        rates = cond(
             needed,
             lambda: jax.jvp(lambda z: self.margins(const, modes, z), (y,), (dy,))[1],
             lambda: rates,

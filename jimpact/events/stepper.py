@@ -20,8 +20,8 @@ WHAT COMES NEXT   Each margin gets an intention (SHORTEN, LAND, AHEAD) and a dis
 the step just tried; the most urgent one decides (`advance`).
 
 DERIVATIVES   In forward mode the state carries tangents (`tangents.py`); step sizes and events
-depend on values, not on tangents. For the reverse mode a run keeps accepted steps
-(`kept_steps.py`), and `step_again` is one of them once more, with all decisions fixed.
+depend on values, not on tangents. `step_again` is an accepted step once more, with all decisions
+fixed.
 
 COMPILING costs some 20 ms a kernel, and a kernel starts at every shared root or quotient, every
 reduction, every array that a loop carries. So the field occurs once (a 13th stage with the weights
@@ -37,9 +37,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.events.queues import run_queue
 from jimpact.events.tableaux import DOP853
 from jimpact.events.tangents import Dual, dual_like, is_dual, pushforward, value_of
+from jimpact.loops import cond, scan
 
 # Step-size control: a step is at most GROWTH times and at least SHRINK times the one before it, and
 # SAFETY times what its error allows. More growth or less safety: more rejected steps.
@@ -248,7 +248,7 @@ def _slopes(
     if flow.near:  # of costly margins: steps in time need them at their ends only
         needed = jnp.any(lands > 0) | (i == 0) | (i == STAGES)
         none = jnp.zeros_like(s.target, now.dtype)
-        value, dc = jax.lax.cond(needed, rates_of_margins, lambda: (none, none))
+        value, dc = cond(needed, rates_of_margins, lambda: (none, none))
     else:
         value, dc = rates_of_margins()
     rate = total(jnp.where(s.target, dc, 0.0)) + (1 - lands)
@@ -295,7 +295,7 @@ def _stages(flow: Any, s: Step, y: Any, ends: bool) -> tuple[Any, ...]:
     carry = [dual_like((flow, y), k) for k in none]
     margins = [jnp.zeros_like(s.target, dtype)] * (3 if ends else 0)
     rows = (jnp.arange(count, dtype=jnp.uint32), table, jnp.asarray(_NODES[:count], dtype))
-    (slopes, added, *margins), _ = jax.lax.scan(stage, (*carry, *margins), rows)
+    (slopes, added, *margins), _ = scan(stage, (*carry, *margins), rows)
     change, errors = _weighted([slopes, added], weights, frame.length)
     return change, errors[:, :n], c0, margins
 
@@ -370,11 +370,6 @@ def begin(flow: Any, modes: jax.Array, start: Any) -> StepperState:
 def goes_on(carry: StepperState, most: int) -> jax.Array:
     """Impacts (1, B) that are neither over nor given up nor paused."""
     return (carry.progress[2:3] == GOES_ON) & (carry.progress[3:4] < most)
-
-
-def unwatched(carry: StepperState, most: int) -> jax.Array:
-    """Whether () some impact goes on and none pauses."""
-    return jnp.any(goes_on(carry, most)) & ~jnp.any(carry.progress[2:3] == PAUSED)
 
 
 def advance(flow: Flow, state: StepperState, most: int) -> tuple[StepperState, jax.Array]:
@@ -594,17 +589,6 @@ def _root_of_cubic(
         slope = rise + (v - u) * bend + u * v * (b - a)
         u = jnp.clip(u - value / jnp.where(slope < 0, slope, -jnp.inf), 0.0, 1.0)
     return u
-
-
-def run(flow: Any, carry: StepperState, most: int) -> StepperState:
-    """On to the end, the first pause, or the limit of passes; `finish` is not yet applied."""
-    if value_of(flow).queues:
-        return run_queue(
-            lambda _, c: goes_on(c, most), lambda flow, c: advance(flow, c, most)[0], flow, carry
-        )
-    return jax.lax.while_loop(
-        lambda c: unwatched(c, most), lambda c: advance(flow, c, most)[0], carry
-    )
 
 
 def between(flow: Flow, s: Step, y: jax.Array, ahead: jax.Array) -> jax.Array:

@@ -10,7 +10,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.interpreters import ad
+from jax.custom_derivatives import SymbolicZero
+
+from jimpact.loops import varying_like
 
 TANGENT_AXIS = -2  # the axis of the directions
 
@@ -41,15 +43,29 @@ def pushforward(function: Callable[..., Any], *args: Any) -> Any:
     depends: list[bool] = []  # of each result, whether it depends on a dual
     trees: list[Any] = []  # the tree of the results
 
+    @jax.custom_jvp
+    def observed(results: list[jax.Array]) -> list[jax.Array]:
+        """The results as they are; its rule notes which of them have tangents."""
+        return results
+
+    def note(results: Any, tangents: Any) -> tuple[Any, Any]:
+        """A tangent that is known to be 0 is symbolic."""
+        depends[:] = [
+            is_smooth(x) and not isinstance(t, SymbolicZero)
+            for x, t in zip(results[0], tangents[0])
+        ]
+        return results[0], tangents[0]
+
+    observed.defjvp(note, symbolic_zeros=True)
+
     def of_values(*values: jax.Array) -> list[Any]:
         """Leaves of the results, from the values of the duals."""
         replaced = dict(zip(duals, values))
         args = jax.tree.unflatten(tree, [replaced.get(i, x) for i, x in enumerate(leaves)])
         results, result_tree = jax.tree.flatten(function(*args))
-        results = [jnp.asarray(x) for x in results]
-        depends[:] = [isinstance(x, ad.JVPTracer) and _is_float(x) for x in results]
         trees[:] = [result_tree]
-        return results
+        depends[:] = [False] * len(results)
+        return observed([jnp.asarray(x) for x in results])
 
     values = tuple(leaves[i].value for i in duals)
 
@@ -66,8 +82,8 @@ def pushforward(function: Callable[..., Any], *args: Any) -> Any:
     )
 
 
-def _is_float(x: jax.Array) -> bool:
-    """Whether x is an array of floating-point numbers."""
+def is_smooth(x: Any) -> bool:
+    """Whether x is an array, or a shape, of floating-point numbers: it may have tangents."""
     return bool(jnp.issubdtype(x.dtype, jnp.floating))
 
 
@@ -77,4 +93,5 @@ def dual_like(tree: Any, x: jax.Array | Dual) -> Any:
     if not duals or isinstance(x, Dual):
         return x
     directions = duals[0].tangents.shape[TANGENT_AXIS]
-    return Dual(x, jnp.zeros((*x.shape[:-1], directions, x.shape[-1]), x.dtype))
+    none = jnp.zeros((*x.shape[:-1], directions, x.shape[-1]), x.dtype)
+    return Dual(x, varying_like(none, duals))

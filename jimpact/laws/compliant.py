@@ -11,6 +11,7 @@ from jimpact._checks import check_choice, check_values
 from jimpact.compiling import full_precision
 from jimpact.contact import Contact
 from jimpact.events.contact_flow import Viscous
+from jimpact.events.derive import ADJOINTS
 from jimpact.events.impact_dynamics import (
     METHODS,
     Dynamics,
@@ -46,6 +47,7 @@ class Compliant(Law):
         max_steps: maximum attempted steps.
         method: 'time', 'implicit' or 'auto' (default), as in `LZB`.
         check_conditioning: solve a second time to detect `ill_conditioned`, as in `LZB`.
+        adjoint: 'jacobian' (default), 'forward' or 'checkpoints', as in `LZB`.
 
     Status: `max_steps`; `plastic_limit` where contacts re-close without end; `ill_conditioned`
     if checked.
@@ -71,8 +73,9 @@ class Compliant(Law):
     initial_energy: Values = parameter(low=0.0, default=0.0, kw_only=True)
     rtol: float | None = option(None, low=0.0, high=1.0, open_low=True)
     max_steps: int = option(100_000, low=1)
-    method: str = option("auto", METHODS[:-1])
+    method: str = option("auto", METHODS)
     check_conditioning: bool = option(False, (False, True))
+    adjoint: str = option("jacobian", ADJOINTS)
 
     def __check_init__(self) -> None:
         """Raise where `force` is not a force, or has no energy to store."""
@@ -139,7 +142,8 @@ class Compliant(Law):
             problem = problem._replace(limit=depth / units.indentation)
         if self.friction is not None:
             problem = problem._replace(sides=sides_of(contact, self.friction, units))
-        return Dynamics(problem, units, exponent, contact.structure, self.max_steps, method)
+        structure, most = contact.structure, self.max_steps
+        return Dynamics(problem, units, exponent, structure, most, method, self.adjoint)
 
     @full_precision
     def impulses(self, contact: Contact) -> Impulses:

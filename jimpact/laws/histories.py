@@ -1,5 +1,6 @@
 """What happens during an impact: forces, indentations, energies and velocities over its time."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -8,8 +9,8 @@ import jax.numpy as jnp
 
 from jimpact._checks import as_whole, check_values, in_common_dtype
 from jimpact.compiling import full_precision, quick_jit
-from jimpact.events.batches import in_columns
 from jimpact.events.contact_flow import ContactStates
+from jimpact.events.derive import in_lanes, naming_the_adjoint
 from jimpact.events.impact_history import history_program
 from jimpact.impacts import NO_OFFSETS, Traced, check_constrained
 from jimpact.law import Law, check_law
@@ -52,7 +53,7 @@ def history(law: Law, scene: Scene, velocity: Any, samples: int = 200) -> Histor
     are only nearly equal: see `time`.)
 
     Args:
-        law: an `LZB` (not with method 'impulse'), a `Compliant` with a power law or a `Bistiffness`
+        law: an `LZB`, a `Compliant` with a power law or a `Bistiffness`
             (gaps included: `indentation` is 0 while a contact is open), a `VelocityDependent` of
             these, or a law of your own with `has_history` and `dynamics`; a stiffness in SI units
             makes time and force SI.
@@ -75,7 +76,7 @@ def history(law: Law, scene: Scene, velocity: Any, samples: int = 200) -> Histor
     """
     if not law.has_history:
         raise TypeError(
-            "Argument `law` must have a history (`has_history`: LZB, not by method 'impulse', a "
+            "Argument `law` must have a history (`has_history`: LZB, a "
             "Compliant with a Bistiffness force, a law of your own with `dynamics`), "
             f"but is {law!r}."
         )
@@ -85,7 +86,8 @@ def history(law: Law, scene: Scene, velocity: Any, samples: int = 200) -> Histor
     check_constrained(scene, v)
     law, scene, v = in_common_dtype(law, scene, v)
     check_law(law, scene, v.dtype)
-    return _history(law, scene, v, samples, Traced.of(law, scene, v))
+    with naming_the_adjoint():
+        return _history(law, scene, v, samples, Traced.of(law, scene, v))
 
 
 @quick_jit
@@ -96,8 +98,10 @@ def _history(law: Law, scene: Scene, v: jax.Array, samples: int, traced: Traced)
     harmless = jnp.where(happens, gamma, -jnp.ones_like(gamma))
     dynamics = law.dynamics(eqx.tree_at(lambda c: c.gap_velocity, contact, harmless))
     t, units = dynamics.tangents, dynamics.units
-    program = dynamics.program(whole=True)
-    time, energy, *rest = in_columns(history_program(program, samples), *dynamics.columns()[0])
+    program, leaves = dynamics.program(whole=True), dynamics.columns()[0]
+    walked = dataclasses.replace(program, checkpoints=dynamics.adjoint == "checkpoints")
+    values, fine = history_program(program, samples), history_program(walked, samples)
+    time, energy, *rest = in_lanes(values, fine, *leaves, adjoint=dynamics.adjoint)
     *rows, maximum, code = (x[..., 0] for x in rest)
     states = ContactStates(*rows)
     force, root = units.momentum / units.time, jnp.repeat(units.root, t // len(gamma))

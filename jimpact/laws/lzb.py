@@ -9,6 +9,7 @@ import numpy as np
 from jimpact._checks import as_float_array, check_values
 from jimpact.compiling import full_precision
 from jimpact.contact import Contact
+from jimpact.events.derive import ADJOINTS
 from jimpact.events.impact_dynamics import (
     METHODS,
     Dynamics,
@@ -33,7 +34,6 @@ from jimpact.scene import Scene
 # Tolerances of v+ if the law has no `rtol`, relative to max |v-|. Ten times more would make every
 # outcome right to one digit less.
 DEFAULT_RTOL = {"float64": 1e-8, "float32": 1e-5}
-DEFAULT_RTOL_IMPULSE = 1e-4  # method 'impulse', first order: the step in the primary impulse itself
 # Method 'implicit': finer than what is measured, some 100 steps. Ten times more saves half of them.
 DEFAULT_RTOL_IMPLICIT = {"float64": 1e-5, "float32": 1e-4}
 FINEST_RTOL_IN_EPS = 16  # below this many eps the error estimate is noise
@@ -45,8 +45,6 @@ MOST_WITH_FRICTION = 200
 
 def default_rtol(method: str, dtype: jnp.dtype) -> float:
     """Tolerance if the law has no `rtol`."""
-    if method == "impulse":
-        return DEFAULT_RTOL_IMPULSE
     table = DEFAULT_RTOL_IMPLICIT if method == "implicit" else DEFAULT_RTOL
     return table.get(str(dtype), table["float32"])
 
@@ -166,13 +164,17 @@ class LZB(Law):
             'implicit' 1e-5 (float32: 1e-4), in fits 1e-4 where that is a tenth of the noise.
         max_steps: maximum attempted steps.
         method: 'time', event-aligned, order 8; 'implicit', steps that know no events, order 2 to
-            3, compiled as soon for many contacts with friction as for one;
-            'impulse', the published scheme in the impulse of a primary contact, order 1; 'auto'
-            (default): 'time', but 'implicit' for several contacts with friction in space, where
-            events may be endless.
+            3, compiled as soon for many contacts with friction as for one; 'auto' (default):
+            'time', but 'implicit' for several contacts with friction in space, where events may be
+            endless.
         check_conditioning: solve a second time with rtol / 100 and with perturbed last digits, and
             set `ill_conditioned` if gap velocities or slips differ by more than 10 rtol of the
-            fastest approach (not with 'impulse'; cost and float32: `docs/speed_accuracy.md`).
+            fastest approach (cost and float32: `docs/speed_accuracy.md`).
+        adjoint: how derivatives are computed. 'jacobian' (default): both modes, by the Jacobian in
+            all numbers of the contacts that depend on what is differentiated; 'forward': forward
+            mode only, along the directions asked for: faster where these are few and contacts
+            many; 'checkpoints': reverse mode only, faster from some 64 numbers on. Another mode
+            than these raises.
 
     Status: `plastic_limit` where contacts re-close without end; `max_steps`, also because large
     friction can jam contacts, which then vibrate for a long time; `ill_conditioned` if checked.
@@ -194,6 +196,7 @@ class LZB(Law):
     """
 
     separable: ClassVar[bool] = True
+    has_history: ClassVar[bool] = True
 
     restitution: Values = parameter(low=0.0, high=1.0)
     stiffness: Values = parameter(low=0.0, open_low=True, log=True, default=1.0)
@@ -206,18 +209,7 @@ class LZB(Law):
     max_steps: int = option(100_000, low=1)
     method: str = option("auto", METHODS)
     check_conditioning: bool = option(False, (False, True))
-
-    def __check_init__(self) -> None:
-        """Raise a ValueError for what method 'impulse' does not have."""
-        for name, used in (
-            ("friction", self.friction is not None),
-            ("check_conditioning", self.check_conditioning),
-        ):
-            if self.method == "impulse" and used:
-                raise ValueError(
-                    f"Argument `method` must be 'auto', 'time' or 'implicit' with {name}, "
-                    f"but has value {self.method!r}."
-                )
+    adjoint: str = option("jacobian", ADJOINTS)
 
     def check(self, scene: Scene, dtype: jnp.dtype) -> None:
         """Raise for a tolerance finer than the precision can hold, and too many contacts."""
@@ -230,13 +222,8 @@ class LZB(Law):
 
     @property
     def pads_scenes(self) -> bool:  # type: ignore[override]
-        """True without friction, but for method 'impulse'."""
-        return self.method != "impulse" and self.friction is None
-
-    @property
-    def has_history(self) -> bool:  # type: ignore[override]
-        """True but for method 'impulse'."""
-        return self.method != "impulse"
+        """True without friction."""
+        return self.friction is None
 
     @property
     def only_stiffness_ratios(self) -> bool:  # type: ignore[override]
@@ -263,7 +250,8 @@ class LZB(Law):
         )
         if self.friction is not None:
             problem = problem._replace(sides=sides_of(contact, self.friction, units))
-        return Dynamics(problem, units, self.exponent, contact.structure, self.max_steps, method)
+        structure, most = contact.structure, self.max_steps
+        return Dynamics(problem, units, self.exponent, structure, most, method, self.adjoint)
 
     @full_precision
     def impulses(self, contact: Contact) -> Impulses:

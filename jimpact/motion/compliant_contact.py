@@ -1,14 +1,12 @@
 """Motions in which contact forces of a `Compliant` law act, instead of impacts at an instant."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jimpact.events import stepper
-from jimpact.events.batches import any_lane
 from jimpact.events.contact_flow import COMPRESSION, EXPANSION, OPEN
+from jimpact.loops import any_lane
 from jimpact.motion.compliant_flow import (
     Phases,
     compliant_flow,
@@ -19,27 +17,16 @@ from jimpact.motion.compliant_flow import (
     stable_step,
 )
 from jimpact.motion.dynamics import gaps, kinematics, kinematics_with_tangents, not_rounding
-from jimpact.motion.event_driven import (
-    MotionProblem,
-    empty_table,
-    event_numbers,
-    event_width,
-    recorded_events,
-    why_stuck,
-)
+from jimpact.motion.event_driven import why_stuck
 from jimpact.motion.flow import (
-    Course,
     Flight,
     State,
     allowed_errors,
     first_flight,
     one_pass,
     packed,
-    put,
-    sampled_states,
     selected,
     status_at_start,
-    step_again,
     toward_sample,
     unpacked,
 )
@@ -58,15 +45,17 @@ from jimpact.motion.persistent_contact import (
     with_normal_forces,
 )
 from jimpact.motion.record import KIND_CODE
-from jimpact.motion.replays import (
+from jimpact.motion.tables import (
+    Course,
     MotionEnd,
-    MotionPlan,
+    MotionProblem,
     MotionTable,
     differentiable,
-    empty_plan,
-    samples_before,
-    tables_of,
-    walk,
+    empty_table,
+    event_numbers,
+    put,
+    recorded_events,
+    sampled_states,
 )
 from jimpact.motion.transitions import (
     REST_SPEED,
@@ -78,9 +67,6 @@ from jimpact.motion.transitions import (
 )
 from jimpact.status import CODE
 
-# Rows of a plan: a contact takes some tens of steps. Ten times more takes ten times the memory of
-# derivatives.
-ROWS_PER_EVENT = 64
 # Of the cone: contacts that have reached its rim stick only if others take over more than this.
 # Ten times more: contacts that share what they hold slide one after the other.
 WITHIN = 1e-6
@@ -95,17 +81,6 @@ class _CompliantRun(NamedTuple):
     event_count: jax.Array
     status: jax.Array
     apart: jax.Array  # whether all contacts are open and none closes
-    plan: MotionPlan | None
-
-
-class _PlanRow(NamedTuple):
-    """Of a plan: a pass, perhaps an accepted step, perhaps an event at its end."""
-
-    accepted: jax.Array  # ()
-    written: jax.Array  # ()
-    stopped: jax.Array  # (m,) contacts whose slip stops at its end
-    aim: stepper.Step
-    fastest: jax.Array
 
 
 def compliant_motion(
@@ -116,11 +91,7 @@ def compliant_motion(
     Returns:
         The course, the last state, and whether all contacts are open and none closes in it.
     """
-    end = differentiable(
-        problem,
-        lambda problem, records: _run(problem, max_events, until_apart, records),
-        lambda problem, plan: _again(problem, plan, max_events),
-    )
+    end = differentiable(problem, lambda problem: _run(problem, max_events, until_apart))
     start = _start(problem)
     samples = sampled_states(end.table.samples, start, end.reached)
     events = recorded_events(end.table, end.event_count, problem)
@@ -138,9 +109,9 @@ def _start(problem: MotionProblem) -> State:
     return problem.start._replace(contact=jnp.concatenate([x[None], impulses]))
 
 
-def _run(problem: MotionProblem, max_events: int, until_apart: bool, records: bool) -> MotionEnd:
-    """From pass to pass; with its plan, if it `records`."""
-    start = _begin(problem, max_events, records)
+def _run(problem: MotionProblem, max_events: int, until_apart: bool) -> MotionEnd:
+    """From pass to pass."""
+    start = _begin(problem, max_events)
 
     def going(run: _CompliantRun) -> jax.Array:
         on = (run.status == CODE["ok"]) & (run.flight.sample < problem.times.shape[0])
@@ -150,14 +121,12 @@ def _run(problem: MotionProblem, max_events: int, until_apart: bool, records: bo
     last = packed(end.flight.state)[:, 0]
     table = end.table._replace(samples=end.table.samples.at[-1].set(last))
     flight = end.flight
-    return MotionEnd(
-        table, flight.sample, end.event_count, flight.steps, end.status, end.plan, end.apart
-    )
+    return MotionEnd(table, flight.sample, end.event_count, flight.steps, end.status, end.apart)
 
 
-def _begin(problem: MotionProblem, max_events: int, records: bool) -> _CompliantRun:
+def _begin(problem: MotionProblem, max_events: int) -> _CompliantRun:
     """The run before its first pass: phases follow from gaps and their rates."""
-    system, force, mu, settings, _, _, times, m, _ = problem
+    system, force, mu, _, _, _, times, m, _ = problem
     state = _start(problem)
     gamma, slip = _rates(problem, state)
     x = state.contact[0]
@@ -173,20 +142,13 @@ def _begin(problem: MotionProblem, max_events: int, records: bool) -> _Compliant
     stable = stable_step(force, flight.aim.modes, contacts, state)
     flight = toward_sample(flight, times, jnp.minimum(flight.free, stable))
     flight = flight._replace(event=flight.event.at[:m].set(True))  # friction is to be decided
-    no = jnp.asarray(False)
-    plan = None
-    if records:
-        row = _PlanRow(no, no, jnp.zeros(m, bool), flight.aim, fastest)
-        steps = settings.max_steps
-        plan = empty_plan(row, times.shape[0], max_events, ROWS_PER_EVENT, steps)
     return _CompliantRun(
         flight,
-        fastest,
+        jax.lax.stop_gradient(fastest),
         empty_table(problem, state, max_events),
         jnp.int32(0),
         status_at_start(system, state, times[-1], jnp.inf),
         jnp.all((phase[:m] == OPEN) & (gamma >= 0)),
-        plan,
     )
 
 
@@ -254,7 +216,7 @@ def _one_pass(problem: MotionProblem, max_events: int, run: _CompliantRun) -> _C
     depth, impulse = flow.scales.depth, flow.scales.impulse
     sizes = [depth, *[impulse] * (len(flight.state.contact) - 1)]
     rows = jnp.concatenate([ledger, settings.rtol * jnp.concatenate(sizes)])
-    flown, accept = one_pass(flow, settings, rows, times, flight)
+    flown, _ = one_pass(flow, settings, rows, times, flight)
     before, after = flight.aim.modes[:m, 0], flown.aim.modes[:m, 0]
     closed, opened = (before == OPEN) & (after != OPEN), (before != OPEN) & (after == OPEN)
     gamma, slip = _rates(problem, flown.state)
@@ -281,17 +243,13 @@ def _one_pass(problem: MotionProblem, max_events: int, run: _CompliantRun) -> _C
         put(run.table.events, _event(problem, at, opened), index),
         put(run.table.marks, marks, index),
     )
-    plan = run.plan
-    if plan is not None:
-        plan = plan.with_row(_PlanRow(accept, written, stopped, flight.aim, run.fastest), accept)
     return _CompliantRun(
         flown,
-        jnp.maximum(run.fastest, fastest),
+        jax.lax.stop_gradient(jnp.maximum(run.fastest, fastest)),
         table,
         run.event_count + written.astype(jnp.int32),
         status.astype(jnp.int32),
         jnp.all((after == OPEN) & (gamma >= 0)),
-        plan,
     )
 
 
@@ -303,36 +261,3 @@ def _event(problem: MotionProblem, at: State, opened: jax.Array) -> jax.Array:
     if sides:
         jump = jump._replace(tangential=jnp.stack(sides, axis=1).reshape(-1))
     return event_numbers(at, After(at, jump, Passed(zero, zero)))
-
-
-def _again(
-    problem: MotionProblem, plan: MotionPlan, max_events: int
-) -> tuple[jax.Array, jax.Array]:
-    """Samples and events of a run, as a smooth function of the problem and the force."""
-    times, start = problem.times, _start(problem)
-    rows: _PlanRow = jax.tree.map(lambda x: x[: plan.size], plan.rows)
-    used = jnp.arange(plan.size, dtype=jnp.int32) < plan.used
-    accepted = rows.accepted & used
-    sampled = accepted & rows.aim.target[:, -1, 0]
-
-    def one(state: State, x: Any) -> tuple[State, Any]:
-        """One row of the plan."""
-        row, sample = x
-        aim = row.aim._replace(modes=row.aim.modes.astype(jnp.int32))
-        flow = compliant_flow(problem, state, aim.modes, row.fastest)
-        flow = eqx.tree_at(lambda f: f.sample, flow, times[sample])
-        state = selected(row.accepted, step_again(flow, aim, state), state)
-        if problem.mu is not None:
-            state = flow.stopped(row.stopped & row.accepted, state)
-        after = flow.switch(aim.modes, packed(state), aim.target)[0]
-        opened = ((aim.modes != OPEN) & (after == OPEN))[: problem.contacts, 0]
-        return state, (packed(state)[:, 0], _event(problem, state, opened))
-
-    todo = rows._replace(accepted=accepted), samples_before(sampled)
-    went = walk(one, start, todo, accepted, event_width(problem))
-    sizes = times.shape[0], max_events + 1
-    written = rows.written & accepted
-    samples, events = tables_of(problem, plan, start, went, sampled, written, sizes)
-    last = went.states[jnp.maximum(plan.used - 1, 0)]
-    last = jnp.where(plan.used > 0, last, packed(start)[:, 0])
-    return samples.at[-1].set(jnp.where(plan.lost, samples[-1], last)), events

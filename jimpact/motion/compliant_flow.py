@@ -9,7 +9,6 @@ from jimpact.events.contact_flow import COMPRESSION, EXPANSION, OPEN, SLACK
 from jimpact.events.stepper import any_of
 from jimpact.laws.forces import Force
 from jimpact.motion.dynamics import kinematics, user_force
-from jimpact.motion.event_driven import MotionProblem
 from jimpact.motion.flow import (
     MotionFlow,
     State,
@@ -20,6 +19,7 @@ from jimpact.motion.flow import (
     unpacked,
 )
 from jimpact.motion.persistent_contact import (
+    BEGINS,
     Contacts,
     Forces,
     Modes,
@@ -34,7 +34,8 @@ from jimpact.motion.persistent_contact import (
     slip_frames,
     with_normal_forces,
 )
-from jimpact.motion.slip_in_space import slip_axes
+from jimpact.motion.slip_in_space import slip_axes, straightened
+from jimpact.motion.tables import MotionProblem
 from jimpact.motion.transitions import velocity_noise
 
 # Of the errors allowed: margins closer to 0 are 0. Ten times more, and events are off by a tenth
@@ -207,15 +208,23 @@ class CompliantFlow(MotionFlow):
 
     def projected(self, const: Phases, at: State) -> State:
         """Slip of contacts that stick set to 0, in the metric of M."""
-        return at if self.mu is None else self.stopped(const.side.active & const.side.stick, at)
+        return at if self.mu is None else self.without_slip(const.side, at)
 
     def stopped(self, which: jax.Array, at: State) -> State:
         """Slip of contacts (m,) set to 0."""
-        contacts, one = self.contacts(at), jnp.ones_like(at.contact_work[0])
+        one = jnp.ones_like(at.contact_work[0])
+        return self.without_slip(Modes(which, which, one), at, straight=False)
+
+    def without_slip(self, modes: Modes, at: State, straight: bool = True) -> State:
+        """Slip of contacts that stick set to 0, and what of it is across where it ends."""
+        contacts = self.contacts(at)
         known = with_normal_forces(contacts, jnp.zeros_like(contacts.normal.rate))
         assert known.tangent is not None
         rates = jnp.concatenate([jnp.zeros_like(contacts.normal.rate), known.tangent.rate])
-        p = constraint_impulse(known, self.mu, Modes(which, which, one), rates)
+        if straight and self.axes is not None:
+            modes = straightened(self.axes, modes, known.tangent.rate)
+        acts = modes.stick | (modes.sign == BEGINS) if straight else modes.stick
+        p = constraint_impulse(known, self.mu, modes._replace(active=modes.active & acts), rates)
         return at._replace(v=at.v + contacts.moved @ p)
 
 

@@ -11,8 +11,8 @@ from jax.flatten_util import ravel_pytree
 
 from jimpact.bodies.base import Body
 from jimpact.events import stepper
-from jimpact.events.batches import any_lane
 from jimpact.laws.lzb import FINEST_RTOL_IN_EPS
+from jimpact.loops import any_lane
 from jimpact.motion.dynamics import (
     definite,
     free_acceleration,
@@ -39,12 +39,12 @@ from jimpact.motion.persistent_contact import (
     rest_acceleration,
     slip_margins,
 )
-from jimpact.motion.record import Events
 from jimpact.motion.slip_in_space import (
     SlipAxes,
     log_rates,
     slip_axes,
     slip_within,
+    straightened,
     turning_errors,
 )
 from jimpact.motion.system import System
@@ -93,15 +93,6 @@ class Scales(NamedTuple):
     gap_velocity: jax.Array
     speed: jax.Array  # gap velocity that all kinetic energy could give a contact
     acceleration: jax.Array
-
-
-class Course(NamedTuple):
-    """A whole motion: states at the sampled times (NaN: not reached), events, steps, status."""
-
-    samples: State
-    events: Events
-    steps: jax.Array
-    status: jax.Array
 
 
 def watched(
@@ -321,6 +312,8 @@ class MechanicalFlow(MotionFlow):
         if contacts.tangent is not None:  # tangentially only velocities drift
             value = jnp.concatenate([value, jnp.zeros_like(contacts.tangent.rate)])
             rate = jnp.concatenate([rate, contacts.tangent.rate])
+            if self.axes is not None:
+                const = straightened(self.axes, const, contacts.tangent.rate)
         p = constraint_impulse(contacts, self.mu, const, jnp.stack([value, rate], axis=1))
         move = contacts.moved @ p
         return at._replace(q=self.system.body.moved(at.q, move[:, 0]), v=at.v + move[:, 1])
@@ -369,52 +362,6 @@ class Flight(NamedTuple):
     sample: jax.Array  # number of samples reached
     steps: jax.Array
     stuck: jax.Array
-
-
-def put(rows: jax.Array, value: jax.Array, index: jax.Array) -> jax.Array:
-    """The table with a row written."""
-    return jax.lax.dynamic_update_index_in_dim(rows, value.astype(rows.dtype), index, 0)
-
-
-def no_samples(start: State, targets: jax.Array) -> jax.Array:
-    """A table of the states at the samples, and a last row for discarded entries."""
-    row = packed(start)[:, 0]
-    return jnp.zeros((targets.shape[0] + 1, len(row)), row.dtype).at[0].set(row)
-
-
-def nan_unless(known: jax.Array, rows: jax.Array) -> jax.Array:
-    """Rows (r, w), NaN where not `known` (r,); other than those of `where`, derivatives pass."""
-    return rows + jnp.where(known, 0.0, jnp.nan).astype(rows.dtype)[:, None]
-
-
-def nan_derivatives(inputs: Any, known: jax.Array) -> jax.Array:
-    """Rows (r, 1): 0 where `known` (r,); elsewhere all derivatives by all inputs are NaN.
-
-    A motion that has ended does not determine what would come later. In reverse mode what nobody
-    differentiates (a cotangent of 0) leaves the gradient as it is.
-    """
-    unknown, total = ~known, jnp.zeros(())
-    for x in jax.tree.leaves(inputs):
-        if eqx.is_inexact_array(x):
-            # the sine has derivatives of all orders
-            wave = jnp.sin(jnp.where(jnp.isfinite(x), x, 0.0) + 1)
-            total = total + jnp.sum(_nan_unless_zero(wave, jnp.any(unknown))).astype(total.dtype)
-    each = _nan_unless_zero(jnp.broadcast_to(total, known.shape), unknown)
-    return jnp.where(known, 0.0, each)[:, None]
-
-
-def _nan_unless_zero(x: jax.Array, chosen: jax.Array) -> jax.Array:
-    """x, but NaN where `chosen` unless it is 0: products, so that this holds transposed as well."""
-    huge = jnp.where(chosen, jnp.finfo(x.dtype).max, 1.0).astype(x.dtype)
-    times_infinity = jnp.where(chosen, 0.0, 1.0).astype(x.dtype) * (huge * (huge * x))
-    return huge * (huge * times_infinity)
-
-
-def sampled_states(samples: jax.Array, start: State, reached: jax.Array) -> State:
-    """States of a table, NaN where they were not reached."""
-    is_reached = jnp.arange(samples.shape[0] - 1, dtype=reached.dtype) < reached
-    rows = nan_unless(is_reached, samples[:-1])
-    return jax.vmap(lambda row: unpacked(start, row[:, None]))(rows)
 
 
 def longest_step(system: System, targets: jax.Array) -> jax.Array:
@@ -530,12 +477,6 @@ def status_at_start(system: System, at: State, end: jax.Array, closed_below: Any
     status = jnp.where(end <= at.t, CODE["backward"], status)
     finite = jnp.all(jnp.isfinite(at.q)) & jnp.all(jnp.isfinite(at.v)) & jnp.isfinite(end)
     return jnp.where(finite, status, CODE["not_finite"]).astype(jnp.int32)
-
-
-def step_again(flow: MotionFlow, aim: stepper.Step, state: State) -> State:
-    """The state after an accepted step, as a smooth function of the flow and the state."""
-    y = stepper.step_again(flow, aim, _rows(flow, state))
-    return _reached(flow, aim, flow.switch(aim.modes, y, aim.target)[1])
 
 
 def _rows(flow: MotionFlow, state: State) -> jax.Array:

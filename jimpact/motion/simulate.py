@@ -34,11 +34,12 @@ from jimpact.motion.arguments import (
 )
 from jimpact.motion.compliant_contact import compliant_motion
 from jimpact.motion.dynamics import is_pile, kinetic, potential, recorded_gaps
-from jimpact.motion.event_driven import MotionProblem, Past, empty_checkpoint, event_driven
-from jimpact.motion.flow import Course, Settings, check_rtol
+from jimpact.motion.event_driven import empty_checkpoint, event_driven
+from jimpact.motion.flow import Settings, check_rtol
 from jimpact.motion.record import Events, Motion, joined
 from jimpact.motion.stepping import time_stepping
 from jimpact.motion.system import System
+from jimpact.motion.tables import Course, MotionProblem, Past
 from jimpact.progress import progress_bar, waiting
 from jimpact.status import CODE
 
@@ -122,9 +123,8 @@ def simulate(
         Methods 'events' and 'contact_forces' have derivatives in both modes (grad, jvp, hessian)
         of everything in it, event times and accumulated works included, in all arrays, also those
         captured by the system's functions. They hold for the order of events that occurs:
-        one-sided where two events change places or a contact is grazed; NaN, with status
-        `no_derivatives`, for motions of more steps than samples + 16 `max_events` + 1024 (by
-        contact forces 64 `max_events`).
+        one-sided where two events change places or a contact is grazed; NaN of what a motion does
+        not reach.
 
     Raises:
         NotImplementedError: derivatives of time stepping, which do not converge with the step.

@@ -10,8 +10,8 @@ then as smooth as in the plane.
 
 ERRORS of slip count by what is left of it: a small error of a small slip is a large one of its
 direction, and of all derivatives. So steps integrate `ln |u|`, too, whose error limits their
-length: each takes a part of the slip, until less than LAST is left for the landing. Within it the
-direction changes as if all of this were still there.
+length: each takes a part of the slip, until less than LAST is left for the landing. This keeps its
+direction, as a constant: the time until it ends then has the derivatives of the slip that turns.
 
 SLIP BEGINS, at a contact that stuck, slowly: its rate r' grows from 0, while its direction follows
 the forces at a rate c / r, with c the acceleration by friction. As long as `r' < BEGINNING c` the
@@ -26,7 +26,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jimpact.events.batches import any_lane
+from jimpact.loops import any_lane
 from jimpact.motion.persistent_contact import (
     BEGINS,
     Contacts,
@@ -82,6 +82,9 @@ def slip_axes(contacts: Contacts, mu: jax.Array, modes: Modes, speed_scale: jax.
         lambda: moving,
     )
     last, speed = speed <= LAST * speed_scale, jnp.where(starts, 0.0, speed)
+    # a derivative of the direction that is kept would be that of a turn which goes on
+    kept = (last & (speed > 0))[:, None]
+    along = jnp.where(kept, jax.lax.stop_gradient(along), along)
     least = jnp.where(last, 1.0, AHEAD) * jax.lax.stop_gradient(speed)
     return SlipAxes(along, speed, jnp.where(starts, NO_SLIP * speed_scale, least), last)
 
@@ -95,6 +98,17 @@ def slip_within(axes: SlipAxes, modes: Modes, rate: jax.Array) -> jax.Array:
     straight = (modes.sign == BEGINS) | none
     ahead, across = jnp.where(straight, 1.0, ahead), jnp.where(straight, 0.0, u[:, 1])
     return direction(jnp.stack([ahead, across], axis=1))
+
+
+def straightened(axes: SlipAxes, modes: Modes, rate: jax.Array) -> Modes:
+    """The modes in which slip (t,) at the end of a step is held across its direction where it ends.
+
+    Of the last of a slip its step knows one direction only, and drifts across it by as much as is
+    left at its end: the next step would begin in any direction, and derivatives with it.
+    """
+    ahead = by_contact(rate, len(axes.speed))[:, 0]
+    ends = modes.active & ~modes.stick & axes.last & (jnp.abs(ahead) < axes.speed)
+    return modes._replace(sign=jnp.where(ends, BEGINS, modes.sign))
 
 
 def log_rates(axes: SlipAxes, modes: Modes, contacts: Contacts, force: Forces) -> jax.Array:

@@ -42,9 +42,10 @@ from jimpact.motion.dynamics import (
     solve_mass,
     user_force,
 )
-from jimpact.motion.flow import Course, State, out_of_range, status_at_start
+from jimpact.motion.flow import State, out_of_range, status_at_start
 from jimpact.motion.record import KIND_CODE, Events, no_events, with_row
 from jimpact.motion.system import System
+from jimpact.motion.tables import Course
 from jimpact.motion.transitions import FAILS, scene_at
 from jimpact.scene import Scene
 from jimpact.solvers.many_contacts import Many, solve_many

@@ -114,18 +114,6 @@ def sides_of(system: System, q: jax.Array, m: int) -> int:
     return m if tangents is None else int(tangents.shape[1])
 
 
-class Decision(NamedTuple):
-    """What is decided at an event: with it the state after it is a smooth function."""
-
-    strikes: jax.Array  # () whether there is an impact
-    approach: jax.Array  # () gap velocity that the law is shown of one without collision, else 0
-    closed: jax.Array  # (m,) contacts that take part in it
-    held: jax.Array  # (m,) those brought to rest
-    stick: jax.Array  # (m,) tangentially, too
-    ends: jax.Array  # (m,) accumulations that are passed
-    scales: Scales
-
-
 class Passed(NamedTuple):
     """What of an accumulation is passed at once, as estimated; 0 where there is none."""
 
@@ -145,7 +133,8 @@ class Outcome(NamedTuple):
     """What happens at an event, and how it goes on."""
 
     after: After
-    decision: Decision
+    strikes: jax.Array  # () whether there is an impact
+    scales: Scales
     modes: Modes
     kind: jax.Array
     contacts: jax.Array  # (m,)
@@ -189,7 +178,7 @@ def resolve(
     stopped = jnp.zeros(m, bool)
     if settings.spatial:
         fired, stopped = _fired_in_space(settings, strike, before, fired)
-    stick, result = _brought_slow_to_rest(system, mu, settings, strike, struck, tight, stopped)
+    result = _brought_slow_to_rest(system, mu, settings, strike, struck, tight, stopped)
     jump = result.jump
     at_rest = state._replace(v=jump.v)
     choice, held, released = _next_modes(
@@ -198,13 +187,13 @@ def resolve(
     status, code, wedges = _status(strike, jump, choice, held)
     took = jnp.where(strike.happens, jump.impulse != 0, jnp.any(fired.reshape(-1, m), axis=0))
     took = took | choice.parts
-    decision = Decision(
-        strike.happens, approach, strike.closed, result.held, stick, result.ends, strike.scales
-    )
     after = After(_with_jump(state, jump), jump, result.passed)
     parts = released[:m] | choice.parts
     kind = _kind(strike.happens, strike.jams, jnp.any(result.ends), parts, fired)
-    return Outcome(after, decision, choice.modes, kind, took, code, status, wedges, choice.several)
+    return Outcome(
+        after, strike.happens, strike.scales, choice.modes, kind, took, code, status, wedges,
+        choice.several,
+    )  # fmt: skip
 
 
 def slip_stops(
@@ -277,8 +266,8 @@ def _brought_slow_to_rest(
     struck: jax.Array,
     tight: jax.Array,
     stopped: jax.Array,
-) -> "tuple[jax.Array, _Resting]":
-    """Which contacts (m,) stick, and what comes to rest: those that are `tight`, and slow ones.
+) -> "_Resting":
+    """What comes to rest: contacts (m,) that are `tight`, and slow ones.
 
     Slip comes to rest where it has `stopped` (m,) or is slow.
     """
@@ -307,13 +296,13 @@ def _brought_slow_to_rest(
 
     slow = closed & (jnp.abs(gamma) <= slowly)
     if m == 1:
-        return stick, resting(slow)
+        return resting(slow)
     nested = closed & strike.happens & ~strike.jams & _share_bodies(contacts, closed | struck)
     nested = nested & (jnp.abs(gamma) <= jnp.sqrt(settings.accumulation) * scales.gap_velocity)
     both = jax.lax.map(resting, jnp.stack([slow, slow | nested]))
     alone, cluster = (jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1))
     undisturbed = _undisturbed(system, contacts, cluster, tight, strike.t)
-    return stick, selected(undisturbed, cluster, alone)
+    return selected(undisturbed, cluster, alone)
 
 
 def _slack(strike: _Strike) -> jax.Array:
@@ -408,22 +397,6 @@ def _undisturbed(
     return jnp.all(result.held | tight | never | (reached > result.passed.time))
 
 
-def resolved_again(
-    system: System,
-    law: Law,
-    mu: jax.Array | None,
-    settings: Settings,
-    state: State,
-    decision: Decision,
-) -> After:
-    """What `resolve` does to the state, as a smooth function: all is decided already."""
-    t, (strikes, approach, closed, held, stick, ends, scales) = state.t, decision
-    jump = _struck(system, law, settings, state, strikes, approach, closed, scales)
-    contacts = contacts_at(system, state.q, jump.v, t, settings.friction)
-    jump, passed = _brought_to_rest(system, contacts, mu, held, stick, ends, t, jump)
-    return After(_with_jump(state, jump), jump, passed)
-
-
 def _approach(choice: ModeChoice, slip: jax.Array, held: jax.Array) -> jax.Array:
     """Gap velocity () of the approach to an impact without collision, 0 where nothing slips."""
     left = jnp.clip(choice.regularity, 0.0, 2 * least_regularity(slip.dtype))
@@ -500,7 +473,7 @@ def _grown(
         jnp.sqrt(2 * energy * jnp.max(jnp.diagonal(contacts.delassus))),
         jnp.abs(contacts.approach[:m]).max(),
     )
-    return jax.tree.map(jnp.maximum, scales, now)
+    return jax.lax.stop_gradient(jax.tree.map(jnp.maximum, scales, now))
 
 
 def _brought_to_rest(

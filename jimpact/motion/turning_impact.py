@@ -14,9 +14,9 @@ from jimpact.contact import delassus_matrix
 from jimpact.laws.forces import Force
 from jimpact.motion.arguments import check_unbounded, contacts_of
 from jimpact.motion.compliant_contact import compliant_motion
-from jimpact.motion.event_driven import MotionProblem
 from jimpact.motion.flow import Settings, check_rtol
 from jimpact.motion.system import System
+from jimpact.motion.tables import MotionProblem
 from jimpact.scene import gap_velocity
 
 RTOL = 1e-9  # of `turning_impact`

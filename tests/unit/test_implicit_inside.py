@@ -26,8 +26,8 @@ def pressed(name):
     return ji.Scene(body.mass, body.normals, body.tangents), jnp.asarray(body.velocity)
 
 
-def test_reverse_mode_of_many_numbers(monkeypatch):
-    """Of ten balls in their masses: the forward slope; it says where it cannot walk back."""
+def test_reverse_mode_of_many_numbers():
+    """Of ten balls in their masses: the forward slope; second derivatives raise."""
     masses, change = jnp.linspace(1.0, 2.0, 10), jnp.cos(jnp.arange(10.0))
 
     def first(mass, most=9999):
@@ -41,9 +41,6 @@ def test_reverse_mode_of_many_numbers(monkeypatch):
     assert status == CODE["ok"]
     with pytest.raises(NotImplementedError, match="must be 'time' for second derivatives"):
         jax.jacfwd(jax.grad(lambda mass: first(mass)[0]))(masses)
-    monkeypatch.setattr(implicit_steps, "MOST_KEPT", 20)
-    *_, status = jax.vjp(lambda mass: first(mass, 9998), masses, has_aux=True)
-    assert status == CODE["max_steps"]
 
 
 def test_tangents_of_the_impulses_of_a_step():
@@ -93,7 +90,6 @@ def test_auto_leaves_several_contacts_in_space_to_it():
         scene, v = pressed(name)
         assert method_for("auto", contact_of(scene, v), True) == method, name
         assert method_for("auto", contact_of(scene, v), False) == "time", name
-    assert method_for("impulse", contact_of(scene, v), False) == "impulse"
     balls = ji.chain([1.0] * 9)
     assert method_for("auto", contact_of(balls, jnp.zeros(9)), False) == "time"
 

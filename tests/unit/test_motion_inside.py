@@ -9,10 +9,11 @@ import pytest
 from motion_cases import stack, status
 
 import jimpact as ji
-from jimpact.motion import event_driven, fitting_motion, replays
+from jimpact.motion import fitting_motion
 from jimpact.motion.dynamics import kinematics
-from jimpact.motion.flow import nan_derivatives, status_at_start
+from jimpact.motion.flow import status_at_start
 from jimpact.motion.simulate import CHUNK
+from jimpact.motion.tables import nan_derivatives
 from jimpact.motion.transitions import impact_jump
 
 pytestmark = pytest.mark.release  # they compile programs of their own
@@ -60,21 +61,6 @@ def test_a_motion_back_in_time_is_reported():
     )
     codes = [status_at_start(ball, start, jnp.asarray(end), 1e-9) for end in (2.0, 1.0, 0.0)]
     assert [ji.STATUS[int(code)].name for code in codes] == ["ok", "backward", "backward"]
-
-
-@pytest.mark.release
-def test_a_motion_of_more_steps_than_a_plan_has_rows_has_no_derivative(monkeypatch):
-    monkeypatch.setattr(replays, "ROWS_MORE", 16)
-    monkeypatch.setattr(event_driven, "ROWS_PER_EVENT", 0)
-    ball = ji.ball_system(base=ji.HarmonicBase(1e-3, 20.0))  # too fast for so few steps
-
-    def end(e):
-        return ji.simulate(ball, ji.Newton(e), [1.0], [0.0], 1.0, samples=2, max_events=3).q[-1, 0]
-
-    value, slope = jax.value_and_grad(end)(0.8)
-    assert np.isfinite(value)
-    assert np.isnan(slope)
-    assert np.isnan(jax.jvp(end, (0.8,), (1.0,))[1])
 
 
 A_BASE, W_BASE = 0.1, 2 * np.pi * 1.5  # of a plate at A sin(w t)
@@ -133,19 +119,3 @@ def test_several_motions_are_fitted_at_once(monkeypatch):
     np.testing.assert_allclose(found.value, 0.8, atol=1e-9)
     assert found.degrees_of_freedom == 10
     np.testing.assert_allclose(found.predicted[1, 2], 2 * 0.8**4)
-
-
-def test_lost_derivatives_are_reported(monkeypatch):
-    """Where a plan has no room for the steps, derivatives are NaN and the status says so."""
-    monkeypatch.setattr(event_driven, "ROWS_PER_EVENT", 0)
-    monkeypatch.setattr(replays, "ROWS_MORE", 0)
-
-    def last(height):
-        motion = ji.simulate(
-            ji.ball_system(), ji.Newton(0.8), height[None], [0.0], 4.0, samples=3, max_events=60
-        )
-        return motion.q[-1, 0], motion.status
-
-    (_, status), (slope, _) = jax.jvp(last, (jnp.asarray(1.0),), (jnp.asarray(1.0),))
-    assert bool(jnp.isnan(slope))
-    assert ji.STATUS[int(status)].name == "no_derivatives"

@@ -23,10 +23,10 @@ from jimpact.contact import Contact
 from jimpact.events import impact_dynamics
 from jimpact.events.contact_flow import power
 from jimpact.events.impact_dynamics import Dynamics, ImpactUnits, Sides
-from jimpact.events.impulse_form import Rule, rule_of
 from jimpact.impacts import Impact, impact
 from jimpact.law import Impulses, Law
 from jimpact.laws.lzb import LZB
+from jimpact.methods.contenders.impulse_form import Rule, rule_of
 from jimpact.scene import Scene
 from jimpact.solvers.tangential import per_tangent
 from jimpact.status import CODE

@@ -17,7 +17,7 @@ largest force; it may change from step to step),
 
     dp_j = F_j / F_i dp_i,   dE_j = -c_j gamma_j dp_j,   gamma = gamma- + G p
 
-`impulse_euler` is the published scheme (`events/impulse_form.py`). `impulse_rk4` advances the same
+`impulse_euler` is the published scheme (`impulse_form.py`). `impulse_rk4` advances the same
 equations by the classical Runge-Kutta formula, with the same primary contact, the same closed-form
 first step of a contact that is touched for the first time (0/0 of the rule) and the same shortened
 step where the primary contact is unloaded. It stays far below order 4: the rule is not Lipschitz at
@@ -33,13 +33,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jimpact.events import impulse_form
 from jimpact.events.contact_flow import power
 from jimpact.events.impact_dynamics import Sides, evaluate
 from jimpact.events.implicit_steps import FORCES_A_STEP
-from jimpact.events.impulse_form import EMPTY, Rule, Walk, force
 from jimpact.events.stepper import STAGES
 from jimpact.laws.lzb import LZB
+from jimpact.methods.contenders import impulse_form
 from jimpact.methods.contenders.base import (
     Method,
     MethodResult,
@@ -52,6 +51,7 @@ from jimpact.methods.contenders.base import (
     stopped_within,
     time_form,
 )
+from jimpact.methods.contenders.impulse_form import EMPTY, Rule, Walk, force
 from jimpact.scene import Scene
 from jimpact.status import CODE
 

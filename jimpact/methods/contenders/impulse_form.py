@@ -13,10 +13,8 @@ import jax
 import jax.numpy as jnp
 
 from jimpact.events.contact_flow import Exponent, power
-from jimpact.solvers.sensitivity import both_modes
 from jimpact.solvers.sparse import Neighbours, Sparse
 from jimpact.solvers.tridiagonal import Structure, Symmetric, Tridiagonal
-from jimpact.status import CODE
 
 # Part of the largest energy below which that of a contact is rounding, and the contact unloaded.
 # Ten times more would unload contacts that still push.
@@ -103,15 +101,6 @@ def at_work(walk: Walk) -> jax.Array:
     return jnp.any((walk.energy > 0) | (walk.gamma < 0))
 
 
-def walk(flow: Rule, dp: jax.Array, max_steps: int, gamma: jax.Array, energy: jax.Array) -> Walk:
-    """Walk to the end of the impact, or for `max_steps` steps."""
-    return jax.lax.while_loop(
-        lambda w: at_work(w) & (w.steps < max_steps),
-        lambda w: advance(flow, dp, w),
-        Walk(gamma, energy, jnp.zeros_like(gamma), jnp.zeros((), jnp.int32)),
-    )
-
-
 def rule_of(problem: Any, exponent: Any, structure: Structure) -> Rule:
     """The rule of a dimensionless problem (see `impact_dynamics.py`)."""
     m, eta = problem.gamma.shape[0], exponent if problem.exponent is None else problem.exponent
@@ -126,18 +115,3 @@ def rule_of(problem: Any, exponent: Any, structure: Structure) -> Rule:
         )
         coupling = jnp.eye(m, dtype=problem.gamma.dtype) + upper + upper.T
     return Rule(coupling, problem.omega, problem.restitution, eta)
-
-
-def solve(
-    problem: Any, exponent: Any, structure: Structure, max_steps: int
-) -> tuple[jax.Array, jax.Array]:
-    """Dimensionless impulses and status; the step in impulse is the problem's `step`."""
-
-    def run(problem: Any, differentiated: bool) -> tuple[jax.Array, jax.Array]:
-        """Impulses and status, as `both_modes` takes them."""
-        step = jax.lax.stop_gradient(problem.step[0])
-        rule = rule_of(problem, exponent, structure)
-        end = walk(rule, step, max_steps, problem.gamma, 0.5 * problem.energy)
-        return end.p, jnp.where(at_work(end), CODE["max_steps"], CODE["ok"])
-
-    return both_modes(run)(problem)
