@@ -7,7 +7,7 @@ energy bends; its second derivatives make the steps converge quadratically.
 """
 
 from itertools import product
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -29,7 +29,6 @@ _SHORT = 16.0
 # where shots are too few to determine E.
 _LEAST_DAMPING = {"float64": 1e-8, "float32": 1e-4}
 _SCALINGS = 60  # of the ray: each closes in on the boundary quadratically
-_TIE = 1e-10  # eigenvalues of Q closer than this, relative to G^-1, count as equal
 
 # Every support of m contacts gives a condition on the energy, 2^m - 1 conditions.
 LARGEST = 6
@@ -39,14 +38,6 @@ _REDUNDANT = 100.0  # G with an eigenvalue below this multiple of m eps has no i
 _CUTS = 60  # rounds of cutting planes in the search of a start
 _HALVINGS = 40  # from a start on the boundary towards the inside
 _FACES = ("E >= 0", "G^-1 (I + E) >= 0", "G^-1 - E^T G^-1 E copositive (energy)")
-
-
-class Approaches(NamedTuple):
-    """x (S, F, m), and the eigenvectors (columns) and eigenvalues of Q on the faces they lie on."""
-
-    x: jax.Array
-    vectors: jax.Array
-    values: jax.Array
 
 
 class AdmissibleMatrices(eqx.Module):
@@ -88,7 +79,7 @@ class AdmissibleMatrices(eqx.Module):
         after = jnp.einsum("sij,sfj->sfi", e, x)
         return _square(inverse, x) - _square(inverse, after)
 
-    def worst(self, y: jax.Array) -> Approaches:
+    def worst(self, y: jax.Array) -> jax.Array:
         """Approaches x >= 0 (S, F, m) among which each face has that of the least lost energy.
 
         The minimizer with a given support is an eigenvector of the smallest eigenvalue there
@@ -100,13 +91,12 @@ class AdmissibleMatrices(eqx.Module):
         above = (m + 1.0) * (jnp.abs(q).max() + jnp.abs(self.inverse).max())
         inside = faces[:, :, None] * faces[:, None, :]
         outside = above * (1 - faces)[:, :, None] * jnp.eye(m, dtype=q.dtype)[None]
-        values, vectors = jnp.linalg.eigh(q[:, None] * inside[None] + outside[None])
-        x = vectors[..., 0] * faces[None]
+        x = jnp.linalg.eigh(q[:, None] * inside[None] + outside[None])[1][..., 0] * faces[None]
         x = jnp.maximum(x * jnp.where(jnp.sum(x, axis=-1) < 0, -1.0, 1.0)[..., None], 0.0)
         x = x * self.closed[:, None, :]
         norm = jnp.sqrt(jnp.sum(x**2, axis=-1, keepdims=True))
         x = x / jnp.where(norm > 0, norm, 1.0)
-        return jax.lax.stop_gradient(Approaches(x, vectors * faces[None, :, :, None], values))
+        return jax.lax.stop_gradient(x)
 
     def _dissipation(self, y: jax.Array) -> jax.Array:
         """`Q = G^-1 - E^T G^-1 E` (S, m, m)."""
@@ -138,7 +128,7 @@ class AdmissibleMatrices(eqx.Module):
         ) -> tuple[jax.Array, jax.Array, jax.Array]:
             """The share after one more look at the worst approaches."""
             share, _, passes = state
-            x = self.worst(self.center + share * (y - self.center)).x
+            x = self.worst(self.center + share * (y - self.center))
             nearer = jnp.minimum(share, self._energy_share(y, x).min())
             return nearer, nearer < share, passes + 1
 
@@ -158,7 +148,7 @@ class AdmissibleMatrices(eqx.Module):
 
     def conditions(self, y: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Slacks (C,), >= 0 but for rounding, of all conditions, and their derivatives (C, Q)."""
-        x = self.worst(y).x
+        x = self.worst(y)
 
         def slacks(y: jax.Array) -> tuple[jax.Array, jax.Array]:
             """Slacks, to be differentiated, and once more as they are."""
@@ -171,23 +161,10 @@ class AdmissibleMatrices(eqx.Module):
     def curvature(self, y: jax.Array, pressure: jax.Array) -> jax.Array:
         """Minus the second derivatives (Q, Q) of the lost energies, weighted; semidefinite.
 
-        The least eigenvalue of Q on a face bends with Q itself and as its eigenvector turns.
+        Of the approaches as they are: that they turn with E makes steps shorter, not wrong.
         """
-        at = self.worst(y)
-
-        def moved(y: jax.Array) -> tuple[jax.Array, jax.Array]:
-            """`E x`, and `Q x` in the eigenvectors."""
-            after = jnp.einsum("sij,sfj->sfi", self.matrices(y), at.x)
-            turning = jnp.einsum("sij,sfj->sfi", self._dissipation(y), at.x)
-            return after, jnp.einsum("sfij,sfi->sfj", at.vectors, turning)
-
-        after, turning = jax.jacfwd(moved)(y)
-        apart = at.values - at.values[..., :1]
-        most = jnp.abs(self.inverse).max()
-        turns = jnp.where(apart > _TIE * most, 1 / jnp.where(apart > 0, apart, 1.0), 0.0)
-        weight = 2 * pressure.reshape(at.x.shape[:2])
-        bent = jnp.einsum("sf,sfip,sij,sfjq->pq", weight, after, self.inverse, after)
-        return bent + jnp.einsum("sf,sfj,sfjp,sfjq->pq", weight, turns, turning, turning)
+        x = self.worst(y)
+        return -jax.hessian(lambda y: pressure @ self.lost_energy(y, x).reshape(-1))(y)
 
     def free_gradient(self, y: jax.Array, gradient: jax.Array) -> jax.Array:
         """Minus the step of steepest descent that the linearized conditions leave."""

@@ -18,9 +18,9 @@ from jimpact.fits.solve import START_SCALES, Ends, Search, minimize_with, repeat
 from jimpact.fits.uncertainty import FitResult, Profile, check_level
 from jimpact.progress import Show, progress_bar
 
-# Deviances are right to this (see `solve.FINE`): the ends of an interval move by a hundred
-# thousandth. A search that goes on after so many passes creeps along a kink.
-_STOP, PASSES = 1e-5, 24
+# Deviances are right to this (see `solve.FINE`): the ends of an interval move by less than END. A
+# search that goes on after so many passes creeps along a kink. It begins near its end.
+_STOP, PASSES, NEAR = 1e-4, 16, 1e-6
 STEP, WIDEST = 0.4, 2.0  # of a walk: rise of the root of the deviance, over the limit's; growth
 FIRST_SHARE = 1 / 16  # of what can be reached: the first step where the error is infinite
 LONGEST = 2.0  # steps by which a walk is extrapolated
@@ -28,7 +28,8 @@ FAR = 2.0  # times the limit, where a walk ends
 MOST_STEPS = 40  # of a walk: it then moves along a valley without end
 ROUGH = 2  # passes of a value that is only looked at
 SAME = 1e-6  # relative sums of squares that are equal
-END = 1e-3  # of the root of the limit: how near to it an end is searched for
+# Share of the root of the limit, or of the values inside, to which an end is searched for.
+END = 1e-3
 ROUNDS = 8  # of the search for an end: it is then right to a millionth of a step, mostly
 # Shots up to which `fit` profiles of itself, with one start and with several: as long as half of
 # the fit. Parameters: with four of LZB it takes longer than the search.
@@ -59,7 +60,7 @@ class Deviances:
         for row, which in zip(held, fixed):
             row[list(which)] = True
         held[:, len(self.fit.names) :] = True
-        search = Search(max_steps=steps, show=self.show)
+        search = Search(max_steps=steps, show=self.show, damping=NEAR)
         return minimize_with(repeated(self.problem, len(y)), np.array(y), held, search, _STOP)
 
     def of(self, squares: Any) -> Any:
@@ -119,8 +120,9 @@ def profile(
     of the normal law where sigma is known (s = 1), else of Student's t (s = `fit.noise`).
 
     From each minimum a walk goes in both directions, each value from where the last two lead, in
-    steps that raise the root of D by .4 of the limit's, all parameters side by side. The rest of
-    the domain is only looked at; where a further valley shows, it is followed to its minimum.
+    steps that raise the root of D by .4 of the limit's, all parameters side by side. Of a fit from
+    one start, which has not searched for other minima, the rest of the domain is looked at; where
+    a further valley shows, it is followed to its minimum.
     Without sigma and with no degree of freedom left, the interval is that of the values which
     reproduce the data exactly.
 
@@ -128,7 +130,7 @@ def profile(
         fit: by least squares.
         names: of parameters; None: all.
         level: of the confidence intervals, in (0, 1).
-        points: fixed values across the domain, besides those of the walks, at least 3.
+        points: values across the domain that are looked at, at least 3.
         progress: bar on stderr; None: on a terminal, once it takes longer than two seconds.
 
     Returns:
@@ -159,7 +161,7 @@ def walked_profiles(
     with progress_bar(progress) as show:
         scans = _Scans(fit, which, level, show)
         scans.walk(scans.minima())
-        if points:
+        if points and fit.start_count == 1:
             scans.look(points)
         scans.finish()
     return tuple(scans.profile(i) for i in which)
@@ -353,13 +355,14 @@ class _Scans(Deviances):
             trials = []
             for i in self.which:
                 values, d = self.deviance(i)
-                height = np.sqrt(d) - limit
+                height, inside = np.sqrt(d) - limit, values[d <= self.limit]
+                least = END * max(np.ptp(inside), END * abs(inside[0]))
                 for k in np.flatnonzero((height[:-1] <= 0) != (height[1:] <= 0)):
                     a, b, p, q = values[k], values[k + 1], height[k], height[k + 1]
                     share = p / (p - q) if turn % 3 < 2 and np.isfinite(q - p) else 0.5
                     y = a + np.clip(share, 0.02, 0.98) * (b - a)
                     near = min(abs(p), abs(q)) <= END * limit
-                    if not near and a < y < b and b - a > 1e-6 * max(1.0, abs(a)):
+                    if not near and a < y < b and b - a > least:
                         start, end = (self.known[i][x].y for x in (a, b))
                         at = start + (y - a) / (b - a) * (end - start)
                         trials.append((i, with_entry(at, i, y)))

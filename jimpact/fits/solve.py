@@ -50,7 +50,7 @@ ROUNDING_EXACT = {"float64": 1e-18, "float32": 1e-11}
 # tolerance of the impact.
 EXACT = {"float64": 1e-14, "float32": 1e-8}
 
-_DAMPING = 1e-2  # first Levenberg-Marquardt damping, relative to the curvatures
+DAMPING = 1e-2  # first Levenberg-Marquardt damping, relative to the curvatures
 # Nielsen (1999): the damping falls by this factor at most after a step that gains what it promised,
 # and grows by a factor that doubles with each step that does not.
 _LEAST_FACTOR, _FIRST_GROWTH = 1 / 3, 2.0
@@ -183,7 +183,7 @@ def default_steps(method: Method) -> int:
     return DEFAULT_STEPS[method if isinstance(method, str) else "adam"]
 
 
-def begin(y: Any, first: tuple[Any, Any, Any], method: Method, max_steps: int) -> SolverState:
+def begin(y: Any, first: Evaluated, search: "Search") -> SolverState:
     """States before the first pass from y (S, P); `first`: arrays like what `evaluate` returns."""
     count, dtype = len(y), y.dtype
 
@@ -191,10 +191,11 @@ def begin(y: Any, first: tuple[Any, Any, Any], method: Method, max_steps: int) -
         """The value of every state."""
         return np.full(count, value, dtype)
 
-    if method == "levenberg-marquardt":
-        memory: Any = Damping(*map(all_are, (_DAMPING, _FIRST_GROWTH, np.inf)))
+    if search.method == "levenberg-marquardt":
+        memory: Any = Damping(*map(all_are, (search.damping, _FIRST_GROWTH, np.inf)))
     else:
-        memory = jax.device_get(jax.vmap(_transformation(method, max_steps).init)(y))
+        init = _transformation(search.method, search.max_steps).init
+        memory = jax.device_get(jax.vmap(init)(y))
     costs = all_are(np.inf), all_are(np.inf)
     ends = all_are(0, int), all_are(False, bool), all_are(False, bool)
     # copies: states are written in place
@@ -269,7 +270,7 @@ def nearest(region: Any, y: jax.Array) -> jax.Array:
         return at - y, identity, ()
 
     infinite, no = jnp.asarray(jnp.inf, y.dtype), jnp.asarray(False)
-    memory = Damping(*jnp.asarray([_DAMPING, _FIRST_GROWTH, jnp.inf], y.dtype))
+    memory = Damping(*jnp.asarray([DAMPING, _FIRST_GROWTH, jnp.inf], y.dtype))
     first = (region.retract(y), y, identity, (), infinite, infinite, y, memory)
     state = SolverState(*first, jnp.asarray(0), no, no)
     return advance(distance, region, method, steps, state, steps, FINE[str(y.dtype)]).y
@@ -315,6 +316,7 @@ class Search(NamedTuple):
     max_steps: int = DEFAULT_STEPS["levenberg-marquardt"]
     show: Show = lambda step, done, total: None
     deadline: float = np.inf  # of `time.monotonic`, after which no pass is begun
+    damping: float = DAMPING  # at first, of Levenberg-Marquardt: less where a minimum is near
 
 
 class Ends(NamedTuple):
@@ -357,7 +359,7 @@ def minimize(
         limit = np.asarray(limit)  # one program serves all limits
     rule: Any = (search.method, limit, np.asarray(max(FINE[str(dtype)], stop), dtype))
     points = points.astype(dtype)
-    states = begin(points, problems.blank(points), search.method, search.max_steps)
+    states = begin(points, problems.blank(points), search)
     converged = np.zeros(count, bool)
     active, lanes = np.arange(count), problems.lanes(count)
     while len(active):
