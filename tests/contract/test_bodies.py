@@ -197,6 +197,7 @@ def test_a_block_on_a_slope():
     np.testing.assert_allclose(weight, [0, -20, 0], atol=1e-14)
 
 
+@pytest.mark.slow
 def test_facing_sides_are_chosen_and_may_part():
     """A block hangs over; its contact moves to the edge below; beside it nothing is known."""
     q = np.array([0.0, 0.5, 0.0, 0.3, 1.5, 0.0])
@@ -320,6 +321,7 @@ def test_contacts_of_odd_polygons_keep_their_places(polygons):
     assert seen(jnp.asarray(np.repeat(at_cut, 300, axis=0)))[1][0] < 0
 
 
+@pytest.mark.slow
 def test_a_contact_keeps_its_place_where_sides_change():
     """A block turns about the edge of a table; beyond 45 degrees its base faces the table's side."""
     table = ji.PlanarBodies([ji.Block(0.4, 0.2), ji.Block(2.0, 1.0)], planes=())

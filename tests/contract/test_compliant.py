@@ -356,6 +356,7 @@ def test_the_status_of_a_history_is_that_of_the_impact():
     assert names(found) == wanted
 
 
+@pytest.mark.slow
 def test_a_contact_that_is_compressed_twice():
     """Figure 6.6: two balls at a wall; approach and force at its turns, by another integration."""
     law, scene = ji.LZB([0.9, 0.8], [1.0, 2**0.5], 1.5), ji.chain([1.0, 1.0], wall=True)

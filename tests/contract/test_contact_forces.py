@@ -63,6 +63,7 @@ def test_a_dashpot_may_slacken_before_its_spring():
     )
 
 
+@pytest.mark.slow
 def test_a_body_may_rest_on_its_springs():
     """Two springs carry the weight m g: nothing moves, and what is disturbed oscillates."""
     block = ji.Block(width=0.2, height=0.4, mass=2.0)

@@ -78,6 +78,7 @@ def test_a_ball_slides_or_rolls(e, mu, rolls):
     assert out.energy_change < 0
 
 
+@pytest.mark.slow
 def test_forces_gaps_and_exponents():
     """Three balls with a gap: v+ by method 'time', for forces of each kind."""
     scene = ji.chain([1.0, 1.0, 1.0], gaps=[0.0, 0.1])

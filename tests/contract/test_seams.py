@@ -100,6 +100,7 @@ def test_summary_says_that_nothing_approaches():
     assert "nothing approaches" in str(ji.compare(pair, v, {"newton": law}))
 
 
+@pytest.mark.slow
 def test_shots_with_different_numbers_of_contacts_are_fitted_together():
     scenes = [
         ji.chain([1.0, 1.0, 2.0]),

@@ -190,6 +190,7 @@ def test_bad_dependence_on_speed(make, message):
         make()
 
 
+@pytest.mark.slow
 def test_the_need_of_a_dependence_on_speed_is_tested():
     falling = 0.8 * SPEED**-0.2
     law = ji.VelocityDependent(ji.Newton(0.7), speed_exponent=0.1)

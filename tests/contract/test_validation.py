@@ -13,7 +13,7 @@ from rows import CASES
 TEXT = page.PAGE.read_text(encoding="utf-8") if page.PAGE.exists() else ""
 
 
-SLOW = ("solitary_wave", "vibrating_plate")
+SLOW = ("solitary_wave", "vibrating_plate", "schroedinger", "spring_and_dashpot")
 
 
 @pytest.mark.parametrize(

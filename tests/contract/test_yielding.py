@@ -56,6 +56,7 @@ def found():
     return [np.asarray(x) for x in outcome(*columns)]
 
 
+@pytest.mark.slow
 def test_restitution_falls_with_the_speed(found):
     """e = 1 up to v_y, then v_y / v: a pair of reduced mass 1/2, the others are fast."""
     v, _, _, change = found

@@ -25,6 +25,8 @@ from jimpact.methods.validity import ValidityMap
 from jimpact.plot.charts import _styles
 from jimpact.plot.style import SMALL, WIDTH
 
+pytestmark = pytest.mark.slow
+
 AFTER = np.array([-0.1, 0.2, 0.9])
 
 
@@ -132,7 +134,7 @@ def stability():
     def piece(names):
         shape = tuple(len(AXES[name]) for name in names)
         codes = np.arange(np.prod(shape)).reshape(shape) % 8
-        return Slice(names, codes, codes * 1.0, codes)
+        return Slice(names, codes, codes * 1.0)
 
     names = [(name,) for name in AXES] + list(itertools.combinations(AXES, 2))
     slices = {method: tuple(piece(x) for x in names) for method in methods}
