@@ -474,7 +474,7 @@ class FitProblem:
         return (self.mixing @ weighted[..., None])[..., 0]
 
     def evaluate(self, y: jax.Array) -> Evaluated:
-        """Residual (R + Q,) over `size`, its Jacobian (R + Q, Q), (predicted values, status).
+        """At y (Q,): residual (R + Q,) over `size`, Jacobian (R + Q, Q), (values, status).
 
         The last Q are those of the priors. Where errors of v- are passed on, `dv+/dv-` (K, n, n)
         of the shots comes last: one program compiles an impact once.
