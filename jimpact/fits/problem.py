@@ -136,10 +136,35 @@ class FitProblem:
     factor of C (J of the start; `fit` takes J of the law it finds). Of shots whose momentum was
     corrected, `post - K m (post - pre)`, the residual has `(I - K m) J` in the place of J.
 
-    Make one with `from_shots` or `from_observable`. It holds what was `measured` (NaN where no
-    value was), `sigma`, `experiments` and `scene` or None, how many independent `values`
-    were measured or are priors; in words, `notes` on what was fixed instead of fitted, and shots
-    `left_out`.
+    Make one with `from_shots` or `from_observable`. Solvers work on y, x in natural scales; arrays
+    of parameters are as long as there are entries in the fitted fields, Q, of which the first P
+    count.
+
+    Attributes:
+        law: with its start values, and with the parts of the scene that are fitted.
+        observe: law -> `Prediction`.
+        owner: (Q,) the parameter that each entry of the fields has, -1 where it is fixed.
+        fixed: (Q,) the entries at the start.
+        scale: (Q,) the size of a change of order 1 of each parameter.
+        log: (Q,) whether a parameter is fitted in its logarithm.
+        low, high: (Q,) bounds of y.
+        matrix: the part of these bounds in which a restitution matrix is admissible, or None.
+        measured: what was measured; NaN where no value was.
+        weight: 1 / sigma, 0 where no value was measured.
+        unit: the largest measured value.
+        size: norm of the weights times `unit`: residuals over it are of order 1.
+        prior_mean, prior_weight: (Q,) of the parameters; weight 1 / std, 0 without a prior.
+        fields: that hold the entries.
+        ties: what follows from parameters by the user's functions.
+        parameters: which entries are free.
+        domains: (P, 2) lowest and highest values.
+        sigma: standard errors of what was measured, or None.
+        values: how many independent values were measured or are priors.
+        priors: of parameters.
+        notes: in words, what was fixed instead of fitted.
+        experiments, scene: of shots, or None.
+        left_out: in words, which shots were left out.
+        mixing: (K, n, n), makes correlated errors of a shot independent, or None.
 
     >>> import jimpact as ji
     >>> data = ji.Experiments(pre=[[1.0, 0.0], [2.0, 0.0]], post=[[0.3, 0.7], [0.6, 1.4]])
@@ -150,23 +175,21 @@ class FitProblem:
     [-0.25, 0.25, -0.5, 0.5]
     """
 
-    law: Law  # with its start values, and with the parts of the scene that are fitted
+    law: Law
     observe: Callable[[Law], Prediction]
-    owner: Any  # (Q,) the parameter that each entry of the fields has, -1 where it is fixed
-    fixed: Any  # (Q,) the entries at the start
-    # (Q,) of the parameters: the size of a change of order 1; whether they are fitted in their
-    # logarithm; bounds of y
+    owner: Any
+    fixed: Any
     scale: Any
     log: Any
     low: Any
     high: Any
-    matrix: AdmissibleMatrices | None  # the part of these bounds in which a matrix is admissible
-    measured: Any  # NaN where not
-    weight: Any  # 1 / sigma, 0 where no value was measured
-    unit: Any  # () the largest measured value
-    size: Any  # () the norm of the weights times `unit`: residuals over it are of order 1
-    prior_mean: Any  # (Q,) of the parameters
-    prior_weight: Any  # (Q,) 1 / standard deviation, 0 where there is no prior
+    matrix: AdmissibleMatrices | None
+    measured: Any
+    weight: Any
+    unit: Any
+    size: Any
+    prior_mean: Any
+    prior_weight: Any
     fields: tuple[str, ...]
     ties: Ties
     parameters: Parameters
@@ -178,7 +201,7 @@ class FitProblem:
     experiments: Experiments | None = None
     scene: Scene | None = None
     left_out: tuple[str, ...] = ()
-    mixing: Any = None  # (K, n, n): makes correlated errors of a shot independent
+    mixing: Any = None
 
     # ------------------------------------------------------------------ how problems are made
 
@@ -451,7 +474,7 @@ class FitProblem:
         return (self.mixing @ weighted[..., None])[..., 0]
 
     def evaluate(self, y: jax.Array) -> Evaluated:
-        """Residual (R + Q,) over `size`, its Jacobian (R + Q, Q), (predicted values, status).
+        """At y (Q,): residual (R + Q,) over `size`, Jacobian (R + Q, Q), (values, status).
 
         The last Q are those of the priors. Where errors of v- are passed on, `dv+/dv-` (K, n, n)
         of the shots comes last: one program compiles an impact once.
