@@ -159,16 +159,21 @@ def test_discs_keep_their_angular_momentum():
 
 
 @pytest.mark.slow
+@pytest.mark.long_run
 @fault(ENGINE)
-def test_a_flat_box_in_an_assembly_bounces_as_it_does_alone():
+def test_flat_boxes_in_an_assembly_bounce_as_they_do_alone():
+    """Which of them end early depends on rounding, which the law enlarges from bounce to bounce."""
     e, t1 = 0.9, np.sqrt(2 / G)
-    body = ji.PlanarBodies([ji.Block(0.74, 0.73)])
-    system = ji.System(body, potential=ji.gravity(body))
-    motion = ji.simulate(system, ji.LZB(e, 1.0), [0, 1.365, 0], [0.0, 0, 0], 10.0, samples=3)
-    assert status_of(motion) == "ok"
-    times = np.asarray(motion.event_times("impact"))[:8]
-    expected = t1 + 2 * t1 * np.cumsum(e ** np.arange(1, 9))
-    np.testing.assert_allclose(times[1:], expected[:7], rtol=1e-6)
+    expected = t1 + 2 * t1 * np.cumsum(e ** np.arange(1, 8))
+    for width in (0.3, 0.5, 0.74, 0.8, 1.0, 1.2):
+        for height in (0.3, 0.73):
+            body = ji.PlanarBodies([ji.Block(width, height)])
+            system = ji.System(body, potential=ji.gravity(body))
+            start = [0, 1 + height / 2, 0]
+            motion = ji.simulate(system, ji.LZB(e, 1.0), start, [0.0, 0, 0], 10.0, samples=3)
+            assert status_of(motion) == "ok"
+            times = np.asarray(motion.event_times("impact"))[1:8]
+            np.testing.assert_allclose(times, expected, rtol=1e-6)
 
 
 @pytest.mark.slow
