@@ -150,7 +150,6 @@ from .motion.system import (
     dimer_system as dimer_system,
     gravity as gravity,
 )
-from .motion.turning_impact import turning_impact as turning_impact
 from .scene import (
     Scene as Scene,
     chain as chain,

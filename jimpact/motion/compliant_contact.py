@@ -28,7 +28,6 @@ from jimpact.motion.flow import (
     selected,
     status_at_start,
     toward_sample,
-    unpacked,
 )
 from jimpact.motion.persistent_contact import (
     Modes,
@@ -83,21 +82,13 @@ class _CompliantRun(NamedTuple):
     apart: jax.Array  # whether all contacts are open and none closes
 
 
-def compliant_motion(
-    problem: MotionProblem, max_events: int, until_apart: bool = False
-) -> tuple[Course, State, jax.Array]:
-    """The motion from `times[0]` to `times[-1]`, or until no contact works any more.
-
-    Returns:
-        The course, the last state, and whether all contacts are open and none closes in it.
-    """
+def compliant_motion(problem: MotionProblem, max_events: int, until_apart: bool) -> Course:
+    """The motion from `times[0]` to `times[-1]`, or until all contacts are open and none closes."""
     end = differentiable(problem, lambda problem: _run(problem, max_events, until_apart))
     start = _start(problem)
     samples = sampled_states(end.table.samples, start, end.reached)
     events = recorded_events(end.table, end.event_count, problem)
-    last = unpacked(start, end.table.samples[-1][:, None])
-    assert end.more is not None
-    return Course(samples, events, end.steps, end.status), last, end.more
+    return Course(samples, events, end.steps, end.status)
 
 
 def _start(problem: MotionProblem) -> State:
@@ -118,10 +109,8 @@ def _run(problem: MotionProblem, max_events: int, until_apart: bool) -> MotionEn
         return on & ~run.apart if until_apart else on
 
     end = jax.lax.while_loop(going, lambda run: _one_pass(problem, max_events, run), start)
-    last = packed(end.flight.state)[:, 0]
-    table = end.table._replace(samples=end.table.samples.at[-1].set(last))
     flight = end.flight
-    return MotionEnd(table, flight.sample, end.event_count, flight.steps, end.status, end.apart)
+    return MotionEnd(end.table, flight.sample, end.event_count, flight.steps, end.status, None)
 
 
 def _begin(problem: MotionProblem, max_events: int) -> _CompliantRun:

@@ -79,6 +79,7 @@ def simulate(
     closed_below: float | None = None,
     slow: float = SLOW,
     max_steps: int = MAX_STEPS,
+    until_apart: bool = False,
     progress: float | None = None,
 ) -> Motion:
     """The whole motion of a system: flights, impacts by `law`, persistent contact.
@@ -115,6 +116,8 @@ def simulate(
             back, remains closed. For contacts that share a body the limit is `sqrt(slow)`
             (docs/motions_reference.md). `events` estimates the skipped time.
         max_steps: total integrator steps.
+        until_apart: by contact forces, end where all contacts are open and none closes, with status
+            `ok`: an impact whose geometry turns. Its outcome is that of the last event.
         progress: bar on stderr with the share of the duration that is done, after each run; None:
             on a terminal, for long motions.
 
@@ -153,6 +156,11 @@ def simulate(
     as_whole("max_steps", max_steps, 1)
     check_values("slow", slow, low=0.0, high=1.0)
     check_choice("method", method, METHODS)
+    if until_apart and method != "contact_forces":
+        raise ValueError(
+            "Argument `until_apart` must be False for motions by other methods than "
+            f"'contact_forces', but `method` has value {method!r}."
+        )
     rtol, atol = _tolerances(method, dtype, rtol, atol)
     mu = friction_of(system, law, friction, q)
     check_pile(system, q, mu, method)
@@ -173,7 +181,8 @@ def simulate(
         arguments = system, law, mu, q, v, start, end, below, substeps, count, joint, rows
         return _waited(_stepped, arguments, progress)
     if method == "contact_forces":
-        arguments = system, force_of(law), mu, settings, q, v, start, end, count, rows
+        force = force_of(law)
+        arguments = system, force, mu, settings, q, v, start, end, count, rows, until_apart
         return _waited(_forced, arguments, progress)
     arguments = system, law, mu, settings, q, v, start, end
     if _on_host(arguments):
@@ -269,12 +278,13 @@ def _forced(
     end: jax.Array,
     samples: int,
     max_events: int,
+    until_apart: bool,
 ) -> Motion:
     """The motion with contact forces."""
     times = _equal_times(start, end, samples)
     m = contacts_of(system, q)
     problem = MotionProblem(system, force, mu, settings, q, v, times, m)
-    course, *_ = compliant_motion(problem, max_events)
+    course = compliant_motion(problem, max_events, until_apart)
     return _recorded(system, times, course)
 
 

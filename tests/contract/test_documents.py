@@ -58,7 +58,7 @@ def as_a_user_runs_them(tmp_path, monkeypatch):
 LONG = (  # all rheologies, laws or methods are compiled
     "laws.calibration", "plot.laws", "plot.charts", "plot.motions", "methods.", "motion.fitting_motion", "comparison",
     "plot.inference", "montecarlo.gaps", "bodies.solids", "bodies.assemblies", "piles", "motion.record",
-    "pile_contacts", "turning_impact",
+    "pile_contacts",
 )  # fmt: skip
 
 
