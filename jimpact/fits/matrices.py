@@ -255,7 +255,7 @@ def admissible_start(scenes: list[Scene]) -> np.ndarray:
         ValueError: redundant or too many contacts, or no matrix that is admissible.
 
     >>> import jimpact as ji
-    >>> from jimpact.fits.matrix_fit import admissible_start
+    >>> from jimpact.fits.matrices import admissible_start
     >>> admissible_start([ji.chain([1.0, 1.0, 1.0])]).tolist()
     [[0.5, 0.0], [0.0, 0.5]]
     """
