@@ -153,14 +153,7 @@ def simulate(
     f = check_motion(system, q, v, start, end)
     count = as_whole("samples", samples, 2)
     rows = CHUNK if max_events is None else as_whole("max_events", max_events, 1)
-    as_whole("max_steps", max_steps, 1)
-    check_values("slow", slow, low=0.0, high=1.0)
-    check_choice("method", method, METHODS)
-    if until_apart and method != "contact_forces":
-        raise ValueError(
-            "Argument `until_apart` must be False for motions by other methods than "
-            f"'contact_forces', but `method` has value {method!r}."
-        )
+    _check_options(method, until_apart, slow, max_steps)
     rtol, atol = _tolerances(method, dtype, rtol, atol)
     mu = friction_of(system, law, friction, q)
     check_pile(system, q, mu, method)
@@ -189,6 +182,18 @@ def simulate(
         most = MOST_EVENTS if max_events is None else max_events
         return _in_runs(arguments, count, most, progress)
     return _events(*(*arguments, None, count, rows))[0]
+
+
+def _check_options(method: str, until_apart: bool, slow: float, max_steps: int) -> None:
+    """Raise a ValueError for options that a motion does not have."""
+    as_whole("max_steps", max_steps, 1)
+    check_values("slow", slow, low=0.0, high=1.0)
+    check_choice("method", method, METHODS)
+    if until_apart and method != "contact_forces":
+        raise ValueError(
+            "Argument `until_apart` must be False for motions by other methods than "
+            f"'contact_forces', but `method` has value {method!r}."
+        )
 
 
 def _tolerances(
