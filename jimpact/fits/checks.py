@@ -69,15 +69,15 @@ class Finding(NamedTuple):
     reservation: str = ""
 
 
-class Row(NamedTuple):
-    """A check: its test yields the numbers of each finding, for the sentences to format."""
+class Check(NamedTuple):
+    """A row: its test yields the numbers of each finding, for the sentences to format."""
 
     test: Callable[[Any], Iterable[dict[str, Any]]]
     sentence: str
     reservation: str = ""
 
 
-def findings(rows: Sequence[Row], judged: Any) -> list[Finding]:
+def findings(rows: Sequence[Check], judged: Any) -> list[Finding]:
     """What the tests of these rows find, in words."""
     return [
         Finding(row.sentence.format(**each), row.reservation.format(**each))
@@ -228,29 +228,29 @@ def _copies(data: _Data) -> Iterable[dict[str, Any]]:
 
 
 DATA_ROWS = (
-    Row(
+    Check(
         _units,
         "Units? The {what} after is {ratio:.3g} times that before: {unit} in one of the columns?",
         "the units are suspect",
     ),
-    Row(
+    Check(
         _momentum,
         "The data violate conservation of momentum (1 = conserved): {shots}; no law can reproduce "
         "that part{floor}.",
         "the data violate conservation of momentum in {share}",
     ),
-    Row(
+    Check(
         _energy,
         "The data gain energy (1 = conserved): {shots}.",
         "kinetic energy grows in {share}",
     ),
-    Row(
+    Check(
         _resting,
         "No contact approaches in {count} of {total} shots ({labels}): are pre and post swapped, "
         "or is a sign wrong?",
         "no contact approaches in {share}",
     ),
-    Row(
+    Check(
         _copies,
         "{which} shots are equal to the last digit, but for a factor: they carry no more "
         "information than one of them, and none on the noise; without `sigma` or `resolution` the "
@@ -684,67 +684,67 @@ def _when(condition: Callable[[_Judged], Any]) -> Callable[[_Judged], Iterable[d
 
 
 FIT_ROWS = (
-    Row(
+    Check(
         _unknown_corrections,
         "The fit weighs shots {shots} as if they were not corrected: they have `lost_freedom`, but "
         "do not conserve momentum, so that the errors that `sigma_pre` leaves in them are unknown; "
         "chi^2 and standard errors are approximate.",
     ),
-    Row(
+    Check(
         _when(lambda judged: judged.solution.stuck),
         "The minimum is a kink of the law (the sequence of contacts changes there, or its "
         "derivatives are wrong): standard errors do not hold.",
     ),
-    Row(
+    Check(
         _when(lambda judged: not judged.solution.converged),
         "The fit has not converged: allow more `max_steps`, `starts` or time (`limit`).",
     ),
-    Row(_statuses, "The fitted law fails in {count}: {name}, {message}."),
-    Row(
+    Check(_statuses, "The fitted law fails in {count}: {name}, {message}."),
+    Check(
         _edges,
         "The matrix ends at the edge of the admissible ones ({edges}): the errors hold for the "
         "side inside.",
     ),
-    Row(
+    Check(
         _unbound_matrix,
         "Nothing keeps this matrix consistent for other approach velocities than the measured: the "
         "conditions are for (m, m) matrices with admissible=True.",
     ),
-    Row(
+    Check(
         _not_finite,
         "The fitted law fails in {count} of {total} values ({which}): they are not finite there "
         "and count as large errors.",
     ),
-    Row(
+    Check(
         _beyond_sigma,
         "Lack of fit: the residuals are {times:.2g} times what sigma allows (chi^2 = {squares:.4g} "
         "with {freedom} degrees of freedom): the law or the stated errors are wrong, or the "
         "parameters scatter; the standard errors {how}.",
     ),
-    Row(
+    Check(
         _beyond_noise,
         "Lack of fit: the residuals are {times:.2g} times the noise that momentum and repeated "
         "shots show ({rest} and {count} degrees of freedom): the law does not fit, and the "
         "standard errors mean little.",
     ),
-    Row(
+    Check(
         _pattern,
         "Lack of fit: the residuals follow the velocities before the impact (F = {ratio:.3g} with "
         "{count} and {rest} degrees of freedom): the law does not fit.",
     ),
-    Row(
+    Check(
         _contradicted_priors,
         "The data contradict the prior {name} = {mean:g} ± {std:g}: what they say without it is "
         "{far:.2g} standard errors off.",
         "the prior of {name} contradicts the data",
     ),
-    Row(
+    Check(
         _suspicious,
         "Suspicious: {shots}, which the others do not expect (of {count}); look there for "
         "errors{advice}.",
         "{shots} {are} suspicious",
     ),
-    Row(
+    Check(
         _when(
             lambda judged: (
                 judged.problem.experiments is not None
@@ -754,27 +754,27 @@ FIT_ROWS = (
         ),
         "Without sigma, velocities in rad/s weigh like those in m/s of the same kinetic energy.",
     ),
-    Row(
+    Check(
         _at_bounds,
         "{name} is at its {end} bound {value:g}; its standard error only holds towards {towards} "
         "values.",
     ),
-    Row(
+    Check(
         _undetermined,
         "The data determine {rank} of {count} parameters (rank {rank} of {count}); the values "
         "given are one choice of many.",
     ),
-    Row(_equally_good, "{several} different minima fit equally well: see the starts."),
-    Row(
+    Check(_equally_good, "{several} different minima fit equally well: see the starts."),
+    Check(
         _when(lambda judged: judged.freedom < 1 and judged.problem.sigma is None),
         "No degree of freedom is left to estimate the noise: errors are unknown without sigma.",
     ),
-    Row(
+    Check(
         _when(lambda judged: judged.freedom >= 1 and _noise_hidden(judged)),
         "The data are reproduced to the last digit and do not show their noise: errors are unknown "
         "without `sigma` or `resolution`.",
     ),
-    Row(
+    Check(
         _when(lambda judged: judged.problem.precision == "float32"),
         "Computed in float32: values are good to about 1e-3, and the rank is judged coarsely. "
         'jax.config.update("jax_enable_x64", True) gives float64.',
@@ -787,7 +787,7 @@ def fit_warnings(
 ) -> list[Finding]:
     """All warnings, those about the data first."""
     judged, data = _Judged(problem, solution, errors, robust), problem.experiments
-    found = findings([Row(_left_out, "{line}", "{count} are left out")], judged)
+    found = findings([Check(_left_out, "{line}", "{count} are left out")], judged)
     if data is not None:
         contacts = data.largest_scene(problem.scene).contacts
         stored = float(np.sum(np.broadcast_to(np.asarray(problem.law.stored), contacts)))

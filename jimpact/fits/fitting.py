@@ -19,6 +19,7 @@ from jimpact.fits.profiles import needs_profiles, profile, walked_profiles
 from jimpact.fits.report import Fit
 from jimpact.fits.solve import (
     DEFAULT_STEPS,
+    Ends,
     Method,
     Minimum,
     Search,
@@ -407,20 +408,9 @@ def fit_many(
         """The problem of one data set."""
         return of_shots(law, scene, many[k], *choice)
 
-    groups = []
     with progress_bar(progress) as show:
         search = Search(max_steps=max_steps, show=show)
-        for members in _alike(many):
-            first, side_by_side = problem(members[0]), _side_by_side(problem, many, members)
-            points = start_points(first, starts, np.random.default_rng(seed))
-            all_starts = jax.tree.map(lambda x: np.repeat(x, starts, axis=0), side_by_side)
-            ends = minimize(all_starts, np.tile(points, (len(members), 1)), search)
-            problems: list[FitProblem] | None = None
-            if ends.slopes is not None:  # errors of v- are passed on by each set's own law
-                best = ends.rows(_best(ends.squares, starts))
-                own = [problem(k) for k in members]
-                problems, ends = settled(own, best.y, search, slopes=best.slopes)
-            groups.append((members, ends, problems))
+        groups = [_solved(problem, many, each, starts, seed, search) for each in _alike(many)]
 
     @functools.cache
     def made(k: int) -> Fit[AnyLaw]:
@@ -434,11 +424,36 @@ def fit_many(
         return as_fit(one, found, "levenberg-marquardt")
 
     order = np.argsort(np.concatenate([members for members, _, _ in groups]))
-    best_ends = [x.rows(_best(x.squares, len(x.y) // len(members))) for members, x, _ in groups]
-    value = np.concatenate([problem(0).values_at(x.y) for x in best_ends])[order]
-    squares = np.concatenate([x.squares for x in best_ends])[order]
-    converged = np.concatenate([x.converged for x in best_ends])[order]
+    best = [x.rows(_best(x.squares, len(x.y) // len(members))) for members, x, _ in groups]
+
+    def in_order(values: Callable[[Ends], np.ndarray]) -> np.ndarray:
+        """Of the best ends of all sets."""
+        return np.concatenate([values(ends) for ends in best])[order]
+
+    value = problem(0).values_at(in_order(lambda x: x.y))
+    squares, converged = in_order(lambda x: x.squares), in_order(lambda x: x.converged)
     return Fits(problem(0).names, value, squares, converged, made)
+
+
+def _solved(
+    problem: Callable[[int], FitProblem],
+    many: Sequence[Experiments],
+    members: list[int],
+    starts: int,
+    seed: int,
+    search: Search,
+) -> tuple[list[int], Ends, list[FitProblem] | None]:
+    """A group of data sets, where their starts ended, and problems with errors of v-, if any."""
+    first, side_by_side = problem(members[0]), _side_by_side(problem, many, members)
+    points = start_points(first, starts, np.random.default_rng(seed))
+    all_starts = jax.tree.map(lambda x: np.repeat(x, starts, axis=0), side_by_side)
+    ends = minimize(all_starts, np.tile(points, (len(members), 1)), search)
+    if ends.slopes is None:
+        return members, ends, None
+    # errors of v- are passed on by each set's own law
+    best, own = ends.rows(_best(ends.squares, starts)), [problem(k) for k in members]
+    problems, ends = settled(own, best.y, search, slopes=best.slopes)
+    return members, ends, problems
 
 
 def _best(squares: np.ndarray, each: int) -> np.ndarray:

@@ -26,6 +26,7 @@ from jimpact.fits.matrices import AdmissibleMatrices, matrix_region
 from jimpact.fits.parameters import (
     DEFAULT_FREE,
     LawInScene,
+    Limits,
     Parameters,
     Prior,
     Ties,
@@ -671,23 +672,7 @@ def _build(
             "Argument `priors` must be left out where no `sigma` (or `resolution`) of the measured "
             "values is known: priors and data weigh against each other by their errors."
         )
-    fixed, count = entries(law, parameters.fields), len(parameters.names)
-    owner, starts = np.full(len(fixed), -1), fixed[parameters.first]
-    arrays: Any = {name: np.zeros(len(fixed)) for name in ("low", "high", "scale")}
-    arrays |= {name: np.zeros(len(fixed)) for name in ("prior_mean", "prior_weight")}
-    arrays |= {"scale": np.ones(len(fixed)), "log": np.zeros(len(fixed), bool)}
-    arrays["log"][:count] = parameters.log
-    natural = np.where(parameters.log, 1.0, np.maximum(np.abs(starts), 1.0))
-    for i, (group, field) in enumerate(zip(parameters.groups, parameters.of_fields)):
-        owner[list(group)] = i
-        natural[i] = energy if field == "initial_energy" else natural[i]
-    for i, mean, std in priors:
-        arrays["prior_mean"][i], arrays["prior_weight"][i] = mean, 1 / std
-        if parameters.of_fields[i] in OF_A_SCENE:  # a gap is far smaller than 1 m
-            natural[i] = std
-    arrays["scale"][:count] = natural
-    for name, end in zip(("low", "high"), limits):
-        arrays[name][:count] = scaled(end, natural, parameters.log)
+    arrays = _of_parameters(law, parameters, limits, priors, energy)
     here = ~np.isnan(measured)
     arrays["weight"] = np.where(here, 1 / np.where(here, errors, 1.0), 0.0)
     unit = unit or 1.0
@@ -695,17 +680,17 @@ def _build(
         "unit": np.asarray(unit),
         "size": np.asarray(unit * np.linalg.norm(arrays["weight"])),
     }
-    moves = np.where(owner[:, None] == np.arange(len(fixed)), arrays["scale"], 0.0)
-    origin, ends = np.where(owner < 0, fixed, 0.0), np.stack([arrays["low"], arrays["high"]])
+    owner, ends = arrays["owner"], np.stack([arrays["low"], arrays["high"]])
+    moves = np.where(owner[:, None] == np.arange(len(owner)), arrays["scale"], 0.0)
+    origin = np.where(owner < 0, arrays["fixed"], 0.0)
     matrix = matrix_region(law, scenes or [], origin, moves, ends)
     if matrix is not None and any(entry_of(name)[0] == "matrix" for name, _ in ties):
         raise ValueError("Argument `ties` must not tie a `matrix` that has to stay admissible.")
     return FitProblem(
         law=_in(dtype, law),
         observe=_in(dtype, observe),
-        owner=owner,
         matrix=matrix,
-        **_in(dtype, arrays | {"fixed": fixed, "measured": measured}),
+        **_in(dtype, arrays | {"measured": measured}),
         fields=parameters.fields,
         ties=ties,
         parameters=parameters,
@@ -715,6 +700,31 @@ def _build(
         priors=priors,
         notes=tuple(notes),
     )
+
+
+def _of_parameters(
+    law: Law, parameters: Parameters, limits: Limits, priors: tuple[Prior, ...], energy: float
+) -> dict[str, Any]:
+    """Entries, natural scales, bounds and priors (Q,) of the parameters of a fit."""
+    fixed, count = entries(law, parameters.fields), len(parameters.names)
+    owner, starts = np.full(len(fixed), -1), fixed[parameters.first]
+    natural = np.where(parameters.log, 1.0, np.maximum(np.abs(starts), 1.0))
+    for i, (group, field) in enumerate(zip(parameters.groups, parameters.of_fields)):
+        owner[list(group)] = i
+        natural[i] = energy if field == "initial_energy" else natural[i]
+    mean, weight = np.zeros((2, count))
+    for prior in priors:
+        i = prior.parameter
+        mean[i], weight[i] = prior.mean, 1 / prior.std
+        if parameters.of_fields[i] in OF_A_SCENE:  # a gap is far smaller than 1 m
+            natural[i] = prior.std
+    low, high = (scaled(end, natural, parameters.log) for end in limits)
+    rest = (0, len(fixed) - count)
+    arrays = {"log": parameters.log, "low": low, "high": high}
+    arrays |= {"prior_mean": mean, "prior_weight": weight}
+    padded = {name: np.pad(array, rest) for name, array in arrays.items()}
+    scale = np.pad(natural, rest, constant_values=1.0)
+    return {"owner": owner, "fixed": fixed, "scale": scale} | padded
 
 
 def scaled(x: np.ndarray, scale: np.ndarray, log: np.ndarray) -> np.ndarray:
