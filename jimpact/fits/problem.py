@@ -45,7 +45,7 @@ from jimpact.fits.parameters import (
 )
 from jimpact.fits.solve import EXACT, BoxRegion, Evaluated
 from jimpact.impacts import impact
-from jimpact.law import AnyLaw, Law
+from jimpact.law import AnyLaw, Law, forward_only
 from jimpact.scene import Scene, dense_mass, stackable
 from jimpact.status import CODE, sign_tolerance
 
@@ -486,7 +486,7 @@ class FitProblem:
             """Residual and prediction of y and a change of v-, and all not differentiated."""
             x = self._values(both[:count])
             moved = self._shifted(both[count:]) if passed else self
-            data, prediction = moved._errors(self.law_in_scene(x))
+            data, prediction = moved._errors(forward_only(self.law_in_scene(x)))
             of_priors = (x - self.prior_mean) * self.prior_weight
             residual = jnp.concatenate([data, of_priors]) / self.size
             out = residual, prediction.value
@@ -741,7 +741,7 @@ def filled_count(count: int) -> int:
 @quick_jit
 def _slopes_before(law: Law, shots: Shots) -> jax.Array:
     """Compiled `dv+/dv-` of every shot."""
-    law, scenes = placed(law, shots.scenes)
+    law, scenes = placed(forward_only(law), shots.scenes)
 
     def after(v: jax.Array, scene: Scene) -> jax.Array:
         """v+ of v-."""
