@@ -230,10 +230,10 @@ def option(
         ValueError: by the law's constructor, where the value is not allowed.
 
     >>> import jimpact as ji
-    >>> ji.LZB(0.9, method="euler")  # doctest: +ELLIPSIS
+    >>> ji.LZB(0.9, method="euler")
     Traceback (most recent call last):
         ...
-    ValueError: Argument `method` must be one of auto, ..., impulse, but has value 'euler'.
+    ValueError: Argument `method` must be one of auto, time, implicit, but has value 'euler'.
     """
     declared = Option(choices, low, high, open_low, converter)
     return _field(declared, default, kw_only, True)
