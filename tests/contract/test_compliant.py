@@ -489,6 +489,7 @@ def test_gap_scale():
     assert "nothing approaches" in str(ji.gap_scale(many, hertz, [-1.0, 0, 0, 0, 0]))
 
 
+@pytest.mark.slow
 def test_symmetric_discontinuity_is_a_smooth_crossover():
     """Balls (m/4, m, m/4) at (1, 0, -1): both orders, both at once, and how wide it is."""
     offset = jnp.linspace(-4, 4, 41)

@@ -193,7 +193,11 @@ def on_a_mesh(function, batch=(None, 0)):
     return jax.shard_map(part, mesh=mesh, in_specs=specs, out_specs=(axis("shot"), axis()))
 
 
-@pytest.mark.parametrize("name", ["binary", "lzb", "friction-moreau", "friction-implicit"])
+@pytest.mark.parametrize(
+    "name",
+    ["binary", "friction-moreau"]
+    + [pytest.param(x, marks=pytest.mark.slow) for x in ("lzb", "friction-implicit")],
+)
 def test_shard_map_takes_laws(name):
     """With its default check of what varies among devices; nothing is compiled."""
     after, e, velocities = sharded(name)

@@ -157,6 +157,7 @@ def test_outliers_do_not_hide_each_other_from_a_robust_loss():
         assert line.startswith("Suspicious: shots 10, 6, 3, which")
 
 
+@pytest.mark.slow
 def test_honest_shots_are_seldom_suspicious():
     """The level holds for all shots of a data set together: 1 in 100 sets, not 1 in 5."""
     pre = np.stack([np.linspace(1, 2, 24), np.zeros(24)], axis=1)
@@ -442,6 +443,7 @@ def test_one_shot_of_three_balls_determines_two_of_three(rank_2_of_3):
     np.testing.assert_allclose(found.rms, 0.0422 / 3, rtol=1e-6)  # the momentum defect alone
 
 
+@pytest.mark.slow
 def test_the_unseen_combination_is_really_unseen(rank_2_of_3):
     law, words = rank_2_of_3.law, rank_2_of_3.identifiability[1]
     step = {}

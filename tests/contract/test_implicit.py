@@ -115,6 +115,7 @@ def edge_problem(sigma=0.01, name="edge", **options):
     return ji.FitProblem.from_shots(law, scene, data, ("restitution", "friction"))
 
 
+@pytest.mark.slow
 def test_second_derivatives_of_a_fit_say_what_auto_is():
     """The error names what the user may not have asked for; nothing is compiled."""
     problem = edge_problem()

@@ -320,6 +320,7 @@ def test_a_packing_is_struck(struck):
     np.testing.assert_allclose(rate, expected, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_step_of_a_packing_is_an_impact(struck):
     """Without friction by Moreau's law; with it, ball 1 rubs on balls 2 and 3, all on the table."""
     spheres, q, v = struck

@@ -96,7 +96,7 @@ MOTIONS = {
 @pytest.mark.parametrize(
     "method",
     [
-        "events",
+        pytest.param("events", marks=pytest.mark.slow),
         "time_stepping",
         pytest.param("contact_forces", marks=pytest.mark.slow),
     ],
