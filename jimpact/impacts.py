@@ -19,7 +19,7 @@ from jimpact._checks import (
 )
 from jimpact.compiling import full_precision, is_top_level_call, quick_jit
 from jimpact.contact import Contact, Groups, contacts_of_groups, coupled_groups
-from jimpact.events.derive import naming_the_adjoint
+from jimpact.derive import naming_the_adjoint
 from jimpact.law import Impulses, Law, check_law, is_separable, restrict_law, within_domains
 from jimpact.scene import (
     Scene,

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from jimpact.contact import Contact
+from jimpact.derive import Arrays, in_lanes, without_derivatives
 from jimpact.events import implicit_steps, stepper
 from jimpact.events.contact_flow import (
     Chain,
@@ -25,19 +26,17 @@ from jimpact.events.contact_flow import (
     Viscous,
     per_row,
 )
-from jimpact.events.derive import Arrays, in_lanes
 from jimpact.events.friction_flow import FrictionFlow
 from jimpact.events.implicit_steps import ImplicitSteps
 from jimpact.events.plastic_limit import final_impulses, to_the_end
 from jimpact.events.slip import SlipFlow
-from jimpact.events.tangents import Dual, is_dual, pushforward, value_of
 from jimpact.solvers.dense import unit
-from jimpact.solvers.sensitivity import without_derivatives
 from jimpact.solvers.sparse import Neighbours
 from jimpact.solvers.step_impulses import descent_lengths
 from jimpact.solvers.tangential import TangentialBlock
 from jimpact.solvers.tridiagonal import Structure, Symmetric, diagonal, off_diagonal, scaled
 from jimpact.status import CODE
+from jimpact.tangents import Dual, is_dual, pushforward, value_of
 
 # Tolerance of a run with derivatives, as a multiple of that of values: derivatives are one or two
 # digits worse at the same one. At order 8 these two digits cost a third more steps; ten times more

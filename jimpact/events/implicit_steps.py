@@ -40,9 +40,9 @@ from jimpact.events.contact_flow import (
     power,
 )
 from jimpact.events.queues import until_over
-from jimpact.events.tangents import dual_like, is_dual, pushforward, value_of
 from jimpact.loops import cond, scan
 from jimpact.solvers.step_impulses import StepProblem, descent_lengths, solve
+from jimpact.tangents import dual_like, is_dual, pushforward, value_of
 
 # The stages of friction: with 1 - 1/sqrt(2) two implicit stages are of order 2 and L-stable. No
 # other value is both.

@@ -26,9 +26,9 @@ from jimpact.events.contact_flow import OFTEN, ContactFlow
 from jimpact.events.look_ahead import comes_to_rest
 from jimpact.events.queues import until_over
 from jimpact.events.stepper import GOES_ON, OVER, PAUSED, any_of, total
-from jimpact.events.tangents import dual_like, pushforward, value_of
 from jimpact.loops import cond, fori_loop, scan
 from jimpact.status import CODE
+from jimpact.tangents import dual_like, pushforward, value_of
 
 # Velocity in tolerances, below which a contact that re-closed often is at rest once the rest of its
 # bounces is neglected. Ten times more: slow contacts of long chains count as plastic ones.

@@ -38,8 +38,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact.events.tableaux import DOP853
-from jimpact.events.tangents import Dual, dual_like, is_dual, pushforward, value_of
 from jimpact.loops import cond, scan
+from jimpact.tangents import Dual, dual_like, is_dual, pushforward, value_of
 
 # Step-size control: a step is at most GROWTH times and at least SHRINK times the one before it, and
 # SAFETY times what its error allows. More growth or less safety: more rejected steps.

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from jimpact._checks import check_choice, check_values
 from jimpact.compiling import full_precision
 from jimpact.contact import Contact
+from jimpact.derive import ADJOINTS
 from jimpact.events.contact_flow import Viscous
-from jimpact.events.derive import ADJOINTS
 from jimpact.events.impact_dynamics import (
     METHODS,
     Dynamics,

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 
 from jimpact._checks import as_whole, check_values, in_common_dtype
 from jimpact.compiling import full_precision, quick_jit
+from jimpact.derive import in_lanes, naming_the_adjoint
 from jimpact.events.contact_flow import ContactStates
-from jimpact.events.derive import in_lanes, naming_the_adjoint
 from jimpact.events.impact_history import history_program
 from jimpact.impacts import NO_OFFSETS, Traced, check_constrained
 from jimpact.law import Law, check_law

@@ -9,7 +9,7 @@ import numpy as np
 from jimpact._checks import as_float_array, check_values
 from jimpact.compiling import full_precision
 from jimpact.contact import Contact
-from jimpact.events.derive import ADJOINTS
+from jimpact.derive import ADJOINTS
 from jimpact.events.impact_dynamics import (
     METHODS,
     Dynamics,

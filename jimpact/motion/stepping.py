@@ -27,6 +27,7 @@ import jax
 import jax.numpy as jnp
 
 from jimpact.bodies.base import ActivePairs, block, over_blocks, with_block
+from jimpact.derive import without_derivatives
 from jimpact.impacts import impact
 from jimpact.law import Law, within_domains
 from jimpact.motion.dynamics import (
@@ -49,7 +50,6 @@ from jimpact.motion.tables import Course
 from jimpact.motion.transitions import FAILS, scene_at
 from jimpact.scene import Scene
 from jimpact.solvers.many_contacts import Many, solve_many
-from jimpact.solvers.sensitivity import without_derivatives
 from jimpact.status import CODE
 
 # Gap velocities below _ROUNDING times the largest speed of the motion, or _ROUNDINGS times its

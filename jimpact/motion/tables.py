@@ -1,7 +1,7 @@
 """What determines a motion, what a run writes down, and the derivatives of that.
 
 JAX pushes tangents through the loop of a run: all that is decided (lengths of steps, events, modes)
-has none. Both modes then follow from its Jacobian (`events/derive.py`).
+has none. Both modes then follow from its Jacobian (`derive.py`).
 """
 
 from collections.abc import Callable
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from jimpact.events.derive import by_jacobian
+from jimpact.derive import by_jacobian
 from jimpact.motion.flow import Settings, State, packed, unpacked
 from jimpact.motion.record import KIND_CODE, Events
 from jimpact.motion.system import System
@@ -83,20 +83,7 @@ class MotionEnd(NamedTuple):
 
 def differentiable(problem: Any, run: Callable[[Any], MotionEnd]) -> MotionEnd:
     """`run(problem)` with derivatives in both modes; those of what is not reached are NaN."""
-    leaves, tree = jax.tree.flatten(problem)
-    fixed = [None if eqx.is_array(x) else x for x in leaves]
-    trees: list[Any] = []
-
-    def of_arrays(*arrays: jax.Array) -> tuple[jax.Array, ...]:
-        """The leaves of the end, from the arrays of the problem."""
-        values = iter(arrays)
-        rebuilt = [next(values) if x is None else x for x in fixed]
-        ends, end_tree = jax.tree.flatten(run(jax.tree.unflatten(tree, rebuilt)))
-        trees[:] = [end_tree]
-        return tuple(ends)
-
-    outs = by_jacobian(of_arrays, *(x for x, y in zip(leaves, fixed) if y is None))
-    end: MotionEnd = jax.tree.unflatten(trees[0], outs)
+    end: MotionEnd = by_jacobian(run, problem)
 
     def known(rows: jax.Array, count: jax.Array) -> jax.Array:
         """The first `count` () rows; derivatives of others, but of the last one, are NaN."""

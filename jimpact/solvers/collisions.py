@@ -12,9 +12,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jimpact.derive import by_jacobian
 from jimpact.loops import while_loop
 from jimpact.solvers.friction import solve as solve_friction
-from jimpact.solvers.sensitivity import both_modes
 from jimpact.solvers.tangential import TangentialBlock, per_tangent
 from jimpact.solvers.tridiagonal import (
     Symmetric,
@@ -117,7 +117,7 @@ def solve(
     """Impulses p (m,), p_t (t,) [N s] and how it ended, differentiable in both modes."""
     inputs = to_inputs(delassus, gamma, restitution, gaps, friction)._replace(ratio=ratio)
     options = Options(cycle, max_collisions, isinstance(delassus, Tridiagonal))
-    (p, tangential), end = both_modes(lambda problem, _: run(problem, options))(inputs)
+    (p, tangential), end = by_jacobian(lambda problem: run(problem, options), inputs)
     return *impulses_of(p, tangential, jnp.sqrt(diagonal(delassus))), end
 
 

@@ -238,3 +238,16 @@ def test_a_chain_is_never_made_dense():
         trace = jax.make_jaxpr(lambda v, law=law: ji.impact(law, ji.chain(masses), v))(masses)
         assert "136]" in str(trace)
         assert "136,136" not in str(trace)
+
+
+def test_second_derivatives_in_every_pair_of_modes():
+    """All are of one program: they agree to rounding of the largest entry."""
+
+    def after(e):
+        return ji.impact(ji.Binary(e), ji.chain([1.0, 2.0, 0.7]), [1.0, 0.0, -0.4]).velocity[2]
+
+    e, modes = jnp.array([0.9, 0.6]), (jax.jacfwd, jax.jacrev)
+    found = [outer(inner(after))(e) for outer in modes for inner in modes]
+    assert np.abs(found[0]).max() > 0.1
+    for other in found[1:]:
+        np.testing.assert_allclose(other, found[0], atol=1e-13)

@@ -18,14 +18,15 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 from jax.custom_derivatives import SymbolicZero
 
 from jimpact.compiling import full_precision
-from jimpact.events.tangents import TANGENT_AXIS, Dual, dual_like, is_dual, is_smooth, value_of
 from jimpact.loops import varying_like
+from jimpact.tangents import TANGENT_AXIS, Dual, dual_like, is_dual, is_smooth, value_of
 
 # Impacts that a CPU solves at a time. A chunk ends with its slowest member, and its stages should
 # stay in a core's cache: 64 are no faster, 1024 take half as long again.
@@ -74,14 +75,50 @@ def naming_the_adjoint() -> Iterator[None]:
         raise TypeError(REVERSE_ONLY) from error
 
 
-def by_jacobian(function: Function, *arrays: jax.Array) -> Arrays:
-    """`function(*arrays)` of arrays of any shape, with derivatives in both modes of every order.
+def by_jacobian(function: Callable[[Any], Any], argument: Any) -> Any:
+    """`function(argument)` with derivatives in both modes of every order.
 
-    `vmap` makes it a batch of runs side by side, as of any function.
+    Both are trees; arrays in them may have any shape. `vmap` makes it a batch of runs side by side,
+    as of any function.
     """
-    wide = _OneLane(function)
-    widened = _as_it_is(wide, wide, "jacobian")(*(x[..., None] for x in arrays))
-    return tuple(x[..., 0] for x in widened)
+    leaves, tree = jax.tree.flatten(argument)
+    others = [None if eqx.is_array(x) else x for x in leaves]
+    trees: list[Any] = []
+
+    def of_arrays(*arrays: jax.Array) -> Arrays:
+        """The leaves of the result, from the arrays of the argument."""
+        values = iter(arrays)
+        rebuilt = [next(values) if x is None else x for x in others]
+        results, result_tree = jax.tree.flatten(function(jax.tree.unflatten(tree, rebuilt)))
+        trees[:] = [result_tree]
+        return tuple(results)
+
+    wide = _OneLane(of_arrays)
+    lanes = (x[..., None] for x, other in zip(leaves, others) if other is None)
+    results = _as_it_is(wide, wide, "jacobian")(*lanes)
+    return jax.tree.unflatten(trees[0], [x[..., 0] for x in results])
+
+
+def without_derivatives(values: Any, why: Exception) -> Any:
+    """`values` as they are; `why` is raised where one of them is differentiated."""
+
+    @jax.custom_jvp
+    def same(numbers: list[Any]) -> list[Any]:
+        """The numbers as they are."""
+        return numbers
+
+    def rule(primals: Any, tangents: Any) -> Any:
+        """Raises where a number is perturbed."""
+        rates = jax.tree.leaves(tangents, is_leaf=lambda t: isinstance(t, SymbolicZero))
+        if any(not isinstance(rate, SymbolicZero) for rate in rates):
+            raise why
+        return primals[0], tangents[0]
+
+    same.defjvp(rule, symbolic_zeros=True)
+    leaves, tree = jax.tree.flatten(values)
+    moving = [i for i, x in enumerate(leaves) if eqx.is_inexact_array(x)]
+    replaced = dict(zip(moving, same([leaves[i] for i in moving])))
+    return jax.tree.unflatten(tree, [replaced.get(i, x) for i, x in enumerate(leaves)])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -277,8 +314,7 @@ def _with_zeros(outs: Arrays, rates: Iterator[jax.Array]) -> tuple[Any, ...]:
 
 def _contracted(rates: jax.Array, direction: jax.Array) -> jax.Array:
     """The tangent (.., B) of a result from its rates (D, .., B) and the direction (D, B)."""
-    each = direction.reshape(len(rates), *[1] * (rates.ndim - 2), -1)
-    return jnp.sum(rates * each, axis=0)
+    return jnp.einsum("d...b,db->...b", rates, direction)
 
 
 @functools.cache
