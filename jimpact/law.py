@@ -247,8 +247,8 @@ def _field(declared: Domain | Option, default: Any, kw_only: bool, static: bool)
     )
 
 
-def _takes(cls: type, *args: Any, **kwargs: Any) -> None:
-    """Raise a TypeError that says what `cls` takes, where these arguments do not fit."""
+def _check_arguments(cls: type, *args: Any, **kwargs: Any) -> None:
+    """Raise a TypeError that lists the arguments of `cls`, where these do not fit them."""
     signature = inspect.signature(cls)
     try:
         signature.bind(*args, **kwargs)
@@ -266,14 +266,14 @@ if TYPE_CHECKING:
 else:
 
     class _Signed(type(eqx.Module)):
-        """The metaclass of equinox; calls that do not fit a class name what it takes."""
+        """The metaclass of equinox, with errors that list the arguments of a class."""
 
         def __call__(cls, *args: Any, **kwargs: Any) -> Any:
             """An instance."""
             try:
                 return super().__call__(*args, **kwargs)
             except TypeError:
-                _takes(cls, *args, **kwargs)
+                _check_arguments(cls, *args, **kwargs)
                 raise
 
 

@@ -26,8 +26,11 @@ Map = Callable[[Work, list[Task]], Iterable[Any]]
 
 def check_executor(executor: Any) -> None:
     """Raise where nothing can compute chunks with it."""
-    known = executor in EXECUTORS or "://" in executor if isinstance(executor, str) else False
-    if not known and not callable(getattr(executor, "map", None)):
+    if isinstance(executor, str):
+        known = executor in EXECUTORS or ":" in executor  # host and port of a scheduler
+    else:
+        known = callable(getattr(executor, "map", None))
+    if not known:
         raise ValueError(
             f"Argument `executor` must be one of {', '.join(EXECUTORS)}, the address of a Dask "
             f"scheduler, or an object with a method `map`, but is {executor!r}."

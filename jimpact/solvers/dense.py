@@ -30,7 +30,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact.compiling import full_precision
-from jimpact.loops import fori_loop, while_loop
+from jimpact.loops import cond, fori_loop, while_loop
 
 # Rows up to which a loop of our own factors a matrix, not LAPACK: in a batch that is three to six
 # times as fast for 4 rows. With ten times more the cubic cost of many contacts would not be
@@ -288,20 +288,27 @@ def pseudoinverse(matrix: jax.Array, held: jax.Array) -> jax.Array:
 
 
 class SingularValues(NamedTuple):
-    """`A = left diag(values) right` of a matrix (n, n), values (n,) falling."""
+    """`A = left diag(values) right` of a matrix (n, n), values (n,) falling; which of them are 0.
+
+    Where values are 0, vectors are an orthonormal basis of the null space.
+    """
 
     left: jax.Array
     values: jax.Array
     right: jax.Array
+    null: jax.Array
 
 
-_ALL_BATCHED: Any = SingularValues(True, True, True)  # type: ignore[arg-type]
+def _are_null(values: jax.Array) -> jax.Array:
+    """Which of falling singular values (n, ..) are rounding of the largest one."""
+    return values <= SINGULAR * len(values) * float(jnp.finfo(values.dtype).eps) * values[:1]
 
 
 @jax.custom_batching.custom_vmap
 def singular_values(matrix: jax.Array) -> SingularValues:
     """Of one matrix (n, n), without derivatives."""
-    return SingularValues(*jnp.linalg.svd(matrix))
+    left, values, right = jnp.linalg.svd(matrix)
+    return SingularValues(left, values, right, _are_null(values))
 
 
 @singular_values.def_vmap
@@ -309,20 +316,21 @@ def _batch_of_singular_values(
     size: int, batched: Any, matrices: jax.Array
 ) -> tuple[SingularValues, Any]:
     """Batches by Jacobi's rotations: A V = U diag(values). A^T has U where values are 0."""
-    n = matrices.shape[-1]
-    if n > _BY_LOOP:
-        return SingularValues(*jnp.linalg.svd(matrices)), _ALL_BATCHED
+    all_batched: Any = SingularValues(True, True, True, True)  # type: ignore[arg-type]
+    if matrices.shape[-1] > _BY_LOOP:
+        left, values, right = jnp.linalg.svd(matrices)
+        return SingularValues(left, values, right, _are_null(values.T).T), all_batched
     matrix = jnp.moveaxis(matrices, 0, -1)
     images, right, values = _orthogonal(matrix)
-    null = values <= SINGULAR * n * float(jnp.finfo(values.dtype).eps) * values[:1]
+    null = _are_null(values)
     left = images / jnp.where(null, 1.0, values)[None]
-    left = jax.lax.cond(
+    left = cond(
         jnp.any(null),
         lambda: jnp.where(null[None], _orthogonal(matrix.swapaxes(0, 1))[1], left),
         lambda: left,
     )
-    parts = SingularValues(left, values, right.swapaxes(0, 1))
-    return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), parts), _ALL_BATCHED
+    parts = SingularValues(left, values, right.swapaxes(0, 1), null)
+    return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), parts), all_batched
 
 
 @jax.custom_batching.custom_vmap

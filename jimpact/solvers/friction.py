@@ -22,14 +22,7 @@ import numpy as np
 
 from jimpact.compiling import full_precision
 from jimpact.loops import fori_loop, while_loop
-from jimpact.solvers.dense import (
-    SINGULAR,
-    block_inverse,
-    block_solve,
-    load_shares,
-    singular_values,
-    times,
-)
+from jimpact.solvers.dense import block_inverse, block_solve, load_shares, singular_values, times
 from jimpact.solvers.interior_points import cones_of, within_cones
 from jimpact.solvers.lcp import gathered_rounding
 from jimpact.solvers.many_contacts import solve_many
@@ -415,8 +408,8 @@ def _inverted(problem: _FrictionProblem, modes: _Modes, x: jax.Array) -> _Invert
     n = x.size
     matrix, _ = _equations(problem, _turned(problem, modes, x[..., None]))
     weight = 1 / jnp.sqrt(_weights(problem, x))
-    left, values, right = singular_values((matrix[..., 0] * weight[None, None]).reshape(n, n))
-    null = values <= SINGULAR * n * float(jnp.finfo(x.dtype).eps) * values[0]
+    scaled = (matrix[..., 0] * weight[None, None]).reshape(n, n)
+    left, values, right, null = singular_values(scaled)
     inverse = (right.T / jnp.where(null, 1.0, values)[None]) @ left.T
     return _Inverted(inverse, jnp.where(null[None], left, 0.0) @ right, weight, jnp.asarray(True))
 
