@@ -130,7 +130,8 @@ def profile(
         fit: by least squares.
         names: of parameters; None: all.
         level: of the confidence intervals, in (0, 1).
-        points: values across the domain that are looked at, at least 3.
+        points: values across the domain that are looked at, at least 3; after a fit from several
+            starts, which have searched the domain, none are.
         progress: bar on stderr; None: on a terminal, once it takes longer than two seconds.
 
     Returns:
@@ -349,8 +350,12 @@ class _Scans(Deviances):
                 return
 
     def find_ends(self) -> None:
-        """Where deviances pass the limit: regula falsi in their roots, all ends side by side."""
-        limit = np.sqrt(self.limit)
+        """Where deviances pass the limit: regula falsi in their roots, all ends side by side.
+
+        Where they jump over it, the minimum outside may have been missed: it is searched for again
+        from the one inside.
+        """
+        limit, again = np.sqrt(self.limit), set()
         for turn in range(ROUNDS):
             trials = []
             for i in self.which:
@@ -359,13 +364,18 @@ class _Scans(Deviances):
                 least = END * max(np.ptp(inside), END * abs(inside[0]))
                 for k in np.flatnonzero((height[:-1] <= 0) != (height[1:] <= 0)):
                     a, b, p, q = values[k], values[k + 1], height[k], height[k + 1]
+                    if min(abs(p), abs(q)) <= END * limit:
+                        continue
                     share = p / (p - q) if turn % 3 < 2 and np.isfinite(q - p) else 0.5
                     y = a + np.clip(share, 0.02, 0.98) * (b - a)
-                    near = min(abs(p), abs(q)) <= END * limit
-                    if not near and a < y < b and b - a > least:
-                        start, end = (self.known[i][x].y for x in (a, b))
+                    start, end = (self.known[i][x].y for x in (a, b))
+                    if a < y < b and b - a > least:
                         at = start + (y - a) / (b - a) * (end - start)
                         trials.append((i, with_entry(at, i, y)))
+                    elif (i, a, b) not in again:
+                        again.add((i, a, b))
+                        near, y = (start, b) if p <= 0 else (end, a)
+                        trials.append((i, with_entry(near, i, y)))
             if not trials:
                 return
             self.solve(trials)

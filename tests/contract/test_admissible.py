@@ -260,6 +260,7 @@ def test_contains_wants_the_momentum_balance():
     assert THREE.contains(np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.01]])).tolist() == [True, False]
 
 
+@pytest.mark.slow
 def test_outcomes_of_laws_lie_inside():
     masses = jnp.asarray(np.random.default_rng(2).uniform(0.3, 3, (6, 4)))
     v = jnp.array([1.0, 0.2, 0.1, -0.5])

@@ -240,6 +240,7 @@ def test_a_chain_is_never_made_dense():
         assert "136,136" not in str(trace)
 
 
+@pytest.mark.slow
 def test_second_derivatives_in_every_pair_of_modes():
     """All are of one program: they agree to rounding of the largest entry."""
 

@@ -257,6 +257,7 @@ def polygons():
     return bodies, jax.jit(jax.vmap(seen))
 
 
+@pytest.mark.slow
 def test_polygons_choose_their_sides(polygons):
     """Anywhere the least gap is the distance; where they overlap it is negative."""
     bodies, seen = polygons

@@ -341,6 +341,7 @@ def test_history_of_one_ball_on_a_linear_spring():
     np.testing.assert_allclose(history.approach[:, 0], x, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_the_status_of_a_history_is_that_of_the_impact():
     """Bad parameters, unknown velocities and energies without a number, inside jit."""
 
@@ -506,6 +507,7 @@ def test_symmetric_discontinuity_is_a_smooth_crossover():
     assert 1.8 < ninety - ten < 2.2
 
 
+@pytest.mark.slow
 def test_offsets_of_gaps_are_in_units_of_the_larger_indentation():
     """The lighter pair indents less: `delta_c^2.5 = m v^2 / k`, m = 2 m1 m2 / (m1 + m2)."""
     masses, v, offset = [0.25, 1.0, 4.0], jnp.array([1.0, 0.0, -1.0]), jnp.linspace(-4, 4, 41)

@@ -55,20 +55,8 @@ def as_a_user_runs_them(tmp_path, monkeypatch):
     jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 
-LONG = (  # all rheologies, laws or methods are compiled
-    "laws.calibration", "plot.laws", "plot.charts", "plot.motions", "methods.", "motion.fitting_motion", "comparison",
-    "plot.inference", "montecarlo.gaps", "bodies.solids", "bodies.assemblies", "piles", "motion.record",
-    "pile_contacts",
-)  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    "module",
-    [
-        pytest.param(x, marks=[pytest.mark.slow] if any(y in x for y in LONG) else [])
-        for x in WITH_EXAMPLES
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("module", WITH_EXAMPLES)
 def test_docstrings_run(module):
     runner = doctest.DocTestRunner(optionflags=OPTIONS)
     tests = examples(module)
@@ -85,20 +73,6 @@ def test_readme_runs():
     assert len(README.splitlines()) <= 120
 
 
-LONG_PAGES = (
-    "compliant",
-    "embedding",
-    "fitting",
-    "fitting_reference",
-    "from_lmfit",
-    "gradient_descent",
-    "motions",
-    "mujoco",
-    "speed_accuracy",
-    "waves",
-)
-
-
 def code_of(path):
     """Python code of a page: fenced blocks, those with prompts by doctest."""
     text = path.read_text(encoding="utf-8")
@@ -107,14 +81,8 @@ def code_of(path):
     return own, ">>>" in text  # (a cluster does not exist here)
 
 
-@pytest.mark.parametrize(
-    "path",
-    [
-        pytest.param(p, id=p.stem, marks=[pytest.mark.slow] if p.stem in LONG_PAGES else [])
-        for p in DOCS
-        if any(code_of(p))
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("path", [pytest.param(p, id=p.stem) for p in DOCS if any(code_of(p))])
 def test_docs_run(path):
     blocks, prompts = code_of(path)
     space = {}

@@ -261,6 +261,7 @@ def test_the_cube():
         ji.cube_impacts(3)
 
 
+@pytest.mark.slow
 def test_nearly_clean_impacts_of_the_cube():
     """Two corners: the clean impacts and 84 more, none twice."""
     two = ji.cube_impacts(2, nearly_clean=True)

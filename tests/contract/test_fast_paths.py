@@ -56,6 +56,7 @@ PATHS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "path",
     [

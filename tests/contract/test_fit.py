@@ -462,6 +462,7 @@ def test_the_unseen_combination_is_really_unseen(rank_2_of_3):
     assert np.abs(change).max() < 0.05 * np.abs(seen).max()
 
 
+@pytest.mark.slow
 def test_the_interval_of_a_valley_is_reported(rank_2_of_3):
     """Whatever e1 is in its interval, others reproduce the shot as well; no lower end of k2."""
     found = rank_2_of_3
@@ -1134,6 +1135,7 @@ def test_bad_level():
         found.confidence_interval(95)
 
 
+@pytest.mark.slow
 def test_report_and_json(rank_2_of_3):
     text = str(rank_2_of_3)
     assert "determined     2 of 3 parameters (rank of the derivatives)" in text

@@ -98,10 +98,7 @@ DISK = (
 
 @pytest.mark.parametrize(
     "name",
-    [
-        pytest.param(x, marks=[pytest.mark.slow] if x in ("compliant", "matrix") else [])
-        for x in LAWS
-    ],
+    [pytest.param(x, marks=[] if x in ("lzb", "moreau") else [pytest.mark.slow]) for x in LAWS],
 )
 def test_disk_in_closed_form(name):
     """It sticks for `-(1 + e_t) v_t / W_tt`; friction gives at most mu p of that."""
@@ -134,6 +131,7 @@ def test_disk_in_closed_form(name):
     assert 0 < stuck.sum() < len(stuck)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("v", [(0.1, -1.0, 0.3), (0.5, -1.0, -1.0), (-0.4, -1.0, 0.0)])
 def test_binary_is_newton_at_one_contact_after_another(v):
     block, e, rubs = ji.rocking_block(1.0, 2.0), 0.5, dict(friction=0.2, tangential_restitution=0.1)
@@ -232,6 +230,7 @@ def test_a_single_contact_in_closed_form():
     assert (least < 0).any()  # drawn back by friction, and compressed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rod", [RODS[16], RODS[54]], ids=["slips", "jams"])
 def test_regularized_friction_is_rouths(rod):
     """The independent integration itself, against the closed form."""
@@ -371,6 +370,7 @@ def misfit(scene, v, out, e, e_t, mu, complementary):
     return max(np.abs(normal).max(), cone.max(), np.abs(power).max() / size) / size
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "rows"),
     [
@@ -556,6 +556,7 @@ def test_lzb_in_space():
     assert (space.velocity[:, 5] == 0.5).all()
 
 
+@pytest.mark.slow
 def test_lzb_without_friction():
     """mu = 0 is the frictionless law; no tangents are needed without `friction`."""
     (mass, normals, tangents, v), e, _, k = random_scenes(16, seed=8)
@@ -620,6 +621,7 @@ def test_derivatives(name, kind):
     assert np.sort(error)[-2] < 2e-5, error  # one of them may cross a change of stick and slip
 
 
+@pytest.mark.slow
 def test_slopes_of_a_plastic_poisson():
     """At e = 0 towards the only side there is: what expands slides as it did."""
     particle = ji.Scene([1.0, 1.0], [[0.0], [1.0]], tangents=[[1.0], [0.0]])

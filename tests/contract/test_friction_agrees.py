@@ -152,6 +152,7 @@ def test_outcomes_do_not_depend_on_the_description(scenes):
     assert same(impacts(given)[0] / unit, expected)
 
 
+@pytest.mark.slow
 def test_planar_scenes_in_space_have_the_same_outcome(scenes):
     given, expected = scenes
     after, statuses = impacts(lifted(given))
@@ -160,6 +161,7 @@ def test_planar_scenes_in_space_have_the_same_outcome(scenes):
     assert np.abs(after[:, 9:]).max() < 1e-8
 
 
+@pytest.mark.slow
 def test_a_disc_rolls_into_a_standing_block():
     """Two corners of the block stand, the disc rolls: four contacts, of which one is new."""
     bodies = ji.PlanarBodies([ji.Block(0.1, 0.4), ji.Disc(0.1)])

@@ -22,6 +22,7 @@ def on_an_edge(tangents=True):
     return ji.Scene(MASS, rows(z).T, sides if tangents else None)
 
 
+@pytest.mark.slow
 def test_tangents_without_friction_change_nothing():
     law = ji.LZB(0.7, [1.0, 1.7])
     plain, other = (ji.impact(law, on_an_edge(t), VELOCITY) for t in (False, True))

@@ -71,6 +71,7 @@ def test_an_elastic_impact_on_four_corners_without_friction():
     assert "VIOLATED" not in ji.summary(out, scene, v)
 
 
+@pytest.mark.slow
 def test_one_outcome_is_not_several():
     """A ball between the nose of a cushion and the cloth: 40 starts of an independent iteration agree."""
     m, r, up = 0.14, 0.026, 0.4
@@ -133,6 +134,7 @@ def test_programs_of_batches_call_no_lapack():
 # ------------------------------------------------------------------------------ motions
 
 
+@pytest.mark.slow
 def test_a_status_of_a_motion_is_a_row_of_the_one_table():
     ball = ji.System(lambda q: q, [1.0], potential=ji.gravity([1.0]))
     motion = ji.simulate(ball, ji.Newton(0.9), [1.0], [0.0], 20.0, samples=2, max_events=3)

@@ -250,6 +250,7 @@ def check_right(point, steps):
     assert error[i] <= HONEST * RTOL
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("point", HARD, ids=HARD.get)
 def test_hard_points(point):
     check_right(point, STEPS)
@@ -542,6 +543,7 @@ def test_contacts_that_an_impact_needs():
     assert ji.simplest_scene(law, scene, v, 0.2).kept == (0,)
 
 
+@pytest.mark.slow
 def test_one_of_two_contacts_at_the_same_place_is_left_out():
     """Two balls fall, each on two contacts that act alike: any two of one ball are too many."""
     scene = ji.Scene(jnp.ones(2), jnp.array([[1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0]]))

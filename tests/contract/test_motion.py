@@ -153,6 +153,7 @@ def test_a_bad_motion_ends_alone(balls):
     assert np.isfinite(slope.events.time).all()
 
 
+@pytest.mark.slow
 def test_a_law_with_friction_may_be_made_outside_of_jit():
     block, law = ji.block_system(0.2, 0.4), ji.LZB(0.5, friction=0.3)
 
@@ -554,6 +555,7 @@ def test_discs_are_a_body_like_others():
             np.testing.assert_allclose(found[:3].reshape(-1), expected[:, column], atol=1e-15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "law", [ji.Moreau(0.5), pytest.param(ji.Newton(0.5), marks=pytest.mark.slow)]
 )

@@ -366,6 +366,7 @@ PLANE = (1.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # of two; the third flie
 DISCS = ji.PlanarBodies([ji.Disc(0.1)] * 3, planes=[], pairs=[(0, 1), (2, 0)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("body", "way", "speed", "expected"),
     [

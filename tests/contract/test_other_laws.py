@@ -129,6 +129,7 @@ def test_statement_of_bowling():
     assert np.abs(routh.velocity[2] - lzb.velocity[2]).max() > 0.1
 
 
+@pytest.mark.slow
 def test_unequal_coefficients_of_routh_are_one():
     """e^2 is the mean of e_j^2 by the work of compression: of (.8, .4) at works 3 to 1, .72111."""
     # contacts at pi/2: works of compression gamma_j^2 / (2 W_jj)

@@ -31,6 +31,7 @@ def contacts(spheres, q, later):
     return spheres.active_pairs(q, later, jnp.asarray(0.01))
 
 
+@pytest.mark.slow
 def test_closed_contacts_are_those_with_small_gaps(packing):
     spheres, q, later = packing
     assert 0 < spheres.crowd < 60  # by the grid

@@ -31,6 +31,7 @@ def found():
     return {eta: solved(BOTH, E, eta) for eta in (1.0, 1.5)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("a", "eta", "e", "expected"),
     [

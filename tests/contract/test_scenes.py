@@ -280,6 +280,7 @@ def test_scenes_are_differentiable_in_their_arguments():
     np.testing.assert_allclose(slope, (values[:3] - values[3:]) / 2e-6, rtol=1e-7, atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["newton", "moreau", "poisson", "binary", "lzb"])
 def test_float32_is_kept(name):
     """Scene, law and velocities in single precision; mixed with Python numbers and with float64."""

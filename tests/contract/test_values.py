@@ -102,6 +102,7 @@ def test_lzb_values():
     check_held("lzb", states, allowed=1e-7)  # ten times the default tolerance
 
 
+@pytest.mark.slow
 def test_light_and_stiff_chains():
     """Linear contacts, e >= .3, masses over four decades and stiffness over six: several events
     inside one period of the fastest. Held: exact propagation phase by phase, rtol 1e-11 beside it.
@@ -157,6 +158,7 @@ LIGHT = [
 ]
 
 
+@pytest.mark.slow
 def test_light_balls_that_bounce_thousands_of_times():
     """A tenth of the passes that integration to the tolerance takes is enough."""
     out, _ = programs.values("lzb")(LIGHT)

@@ -21,6 +21,7 @@ def test_redundant_contacts_share_in_equal_parts():
     assert names(solution.code) == ["impulse_not_unique"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rounding", [lcp._ROUNDING, lcp._ROUNDING / 10])
 def test_ties_within_rounding(monkeypatch, rounding):
     """Redundant contacts, masses that are no whole numbers: ties of ratios are ties but for rounding.

@@ -109,6 +109,7 @@ def test_every_iterate_is_admissible(method):
 project = jax.jit(jax.vmap(PROBLEM.project))
 
 
+@pytest.mark.slow
 def test_the_projection_is_the_nearest_admissible_matrix():
     """Of a convex set: it is seen from the point at no acute angle with any other member."""
     rng, g_inverse = np.random.default_rng(0), inverse(CHAIN)
