@@ -75,7 +75,7 @@ def test_what_is_refused():
         ji.contact_problem(BLOCK, Q, [0.0, np.nan, 0.0])
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_accelerations_of_a_motion():
     """A tilted block slides down on one corner without friction: those of the sampled velocities."""
     start = BLOCK.body.touching(0.3)

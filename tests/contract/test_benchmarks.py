@@ -28,7 +28,7 @@ def test_three_balls_run(tmp_path):
     assert errors["jimpact", "default"] < 1e-7
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_compiled_impacts_agree():
     """The C++ yardstick solves the same problem as jimpact, for other e and stiffness too."""
     code = """

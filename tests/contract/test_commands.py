@@ -78,7 +78,7 @@ def test_fit_of_a_study(tmp_path, capsys):
     np.testing.assert_allclose(result["parameters"][0]["value"], 0.604, atol=2e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_every_law_is_fitted(tmp_path, capsys):
     study = written(tmp_path)
     code, said = call(capsys, "fit", study, "--law", "all", "--starts", "1", "--out", tmp_path)
@@ -147,7 +147,7 @@ def test_fit_refuses_data(tmp_path, capsys):
     assert "shots.csv, line 2, column `post_1[m/s]`: the value must be a number" in said.err
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_compare(tmp_path, capsys):
     code, said = call(capsys, "compare", "--out", tmp_path, "--json")
     result = json.loads(said.out)
@@ -216,7 +216,7 @@ def test_failed_samples_are_reported_on_stderr(tmp_path, capsys):
     assert ", left out (" in said.out
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_simulate(tmp_path, capsys):
     options = ["--out", "m.png", "--gif", "m.gif", "--portrait", "p.svg", "--json"]
     short = ["--t-end", "0.3", "--samples", "11", "--coordinate", "3"]
@@ -304,7 +304,7 @@ def test_fit_of_a_body(tmp_path, capsys):
         assert message in said.err
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_compare_of_a_body(tmp_path, capsys):
     code, said = call(capsys, "compare", written(tmp_path, ON_GROUND, TILTED), "--json")
     assert code == 0
@@ -312,7 +312,7 @@ def test_compare_of_a_body(tmp_path, capsys):
     np.testing.assert_allclose(result, [0.0, 0.9, 0.0], atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_simulate_in_space(tmp_path, capsys):
     """A bundled study by time stepping: the picture has its name; replacing it is reported."""
     study = (files("jimpact") / "data" / "tossed_brick.toml").read_text()
@@ -375,7 +375,7 @@ def test_chart(tmp_path, capsys):
     assert (tmp_path / "jimpact-chart.png").stat().st_size > 10_000
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_stability(tmp_path, capsys):
     code, said = call(capsys, "stability", "--methods", "verlet", "--out", tmp_path, "--json")
     assert code == 0
@@ -419,7 +419,7 @@ def test_a_new_study_like_another(tmp_path, capsys):
     assert (code, "bundled studies are cradle_motion.toml" in said.err) == (2, True)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize("kind", ["fit", "compare", "montecarlo", "simulate"])
 def test_the_notebook_of_a_new_study_runs(tmp_path, capsys, kind):
     assert call(capsys, "new", kind, ".")[0] == 0
@@ -598,7 +598,7 @@ def interrupted(arguments, folder, moment):
     return None if ended else process.returncode, message
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_ctrl_c_keeps_finished_chunks(tmp_path):
     path = written(tmp_path, SAMPLED.replace("samples = 600", "samples = 100_000_000"))
     run = tmp_path / "run"
@@ -642,7 +642,7 @@ def test_ctrl_c_while_importing_and_compiling(verb, tmp_path, monkeypatch):
         assert "Traceback" not in message
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_fit_as_a_user_runs_it(tmp_path, monkeypatch):
     """The bundled three balls: one e; corrected; all free, since asked for; a picture."""
     command = [sys.executable, "-m", "jimpact.cli", "fit", "--json", "--all-free"]

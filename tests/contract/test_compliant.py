@@ -240,7 +240,7 @@ def test_calibration_is_differentiable():
     np.testing.assert_allclose(reverse, forward, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_user_forces():
     """One's own force is the built-in one; without a value it is reported; it cannot pull."""
     gaps = jnp.array([0.0, 0.2])

@@ -105,7 +105,7 @@ def slid(mu, angle):
     return -0.5 / up + 0.5 * down * (1 - 1 / up) ** 2
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_friction_on_a_slope():
     """Sliding, sticking and work in closed form."""
     run = jax.jit(on_a_slope)
@@ -121,7 +121,7 @@ def test_friction_on_a_slope():
         np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_derivatives_of_friction_on_a_slope():
     """In reverse mode, of the rest on its spring too."""
     run = jax.jit(jax.grad(on_a_slope, (0, 1), has_aux=True))
@@ -129,7 +129,7 @@ def test_derivatives_of_friction_on_a_slope():
         np.testing.assert_allclose(run(*start)[0], jax.grad(slid, (0, 1))(*start), atol=1e-8)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_ball_in_space_slides_and_rolls():
     """Slip at 1.25 m/s ends at 2 u / (7 mu g), in rolling at 5/7 of it; a bounce gives mu p."""
     ball, stiffness, mu = ji.Sphere(0.1), 1e3, 0.2
@@ -164,7 +164,7 @@ def test_a_block_comes_to_rest_with_friction():
     np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_box_strikes_on_its_corners_with_friction():
     """In space: no energy is gained, and friction takes what the ledger says."""
     box = ji.Box([0.2, 0.3, 0.1])

@@ -120,7 +120,7 @@ def test_promises(name):
             pytest.param(
                 name,
                 marks=[
-                    pytest.mark.slow,
+                    pytest.mark.release,
                     pytest.mark.xfail(reason="ends with an approach", strict=True),
                 ],
             )

@@ -193,7 +193,7 @@ def on_a_mesh(function, batch=(None, 0)):
     return jax.shard_map(part, mesh=mesh, in_specs=specs, out_specs=(axis("shot"), axis()))
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize(
     "name",
     ["binary", "friction-moreau"]

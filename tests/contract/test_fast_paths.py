@@ -56,7 +56,7 @@ PATHS = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize(
     "path",
     [
@@ -77,7 +77,7 @@ def test_exponents_and_chains(path):
     np.testing.assert_array_equal(out.status, same.status)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_single_impact_is_one_of_a_batch():
     """Not batched, eager, filled up with open contacts; chains and their dense scenes."""
     given = [
@@ -115,7 +115,7 @@ def test_numbers_of_contacts_share_one_program(caplog):
     assert "impact" not in caplog.text
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_directions_at_one_point():
     """Their steps are found once: as one direction alone, and in reverse."""
     given, way = jnp.array([0.9, 0.7, 1.0, 2.5]), jnp.array([0.3, -1.0, 0.5, 2.0])
@@ -144,7 +144,7 @@ def long_chain(dense):
     return run
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_windows_of_long_chains():
     masses, v = np.linspace(1, 2, 12), np.eye(12)[0]
     out, same = long_chain(False)(masses, v), long_chain(True)(masses, v)

@@ -251,7 +251,7 @@ def held(contacts):
 
 
 HELD_CONTACTS = [
-    pytest.param(1, marks=pytest.mark.slow),
+    pytest.param(1, marks=pytest.mark.release),
     pytest.param(2, marks=pytest.mark.release),
 ]
 
@@ -320,7 +320,7 @@ def test_block_lying_flat(name):
     assert names(out.status) == ["ok", "impulse_not_unique", "ok"]
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_given_slip_agrees_with_the_law():
     """(6.54)-(6.57) with xi = 1: the law finds that slip by itself, and the same impulses."""
     e, mu, fast = np.array([[0.5, 0.1], [0.2, 0.3]]), 0.2, np.array([2.0, -0.6, -0.3])
@@ -370,7 +370,7 @@ def misfit(scene, v, out, e, e_t, mu, complementary):
     return max(np.abs(normal).max(), cone.max(), np.abs(power).max() / size) / size
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize(
     ("name", "rows"),
     [
@@ -514,7 +514,7 @@ def test_lzb_of_a_flat_block():
         close(out.velocity[i], found, atol=1e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_flat_block_at_a_fine_tolerance():
     """How the corners share what they hold is known to 1e-8 only: no step need be short for it."""
     e, mu = np.array([0.71, 0.58, 0.98, 0.47]), np.array([0.81, 0.83, 0.71, 0.42])
@@ -758,7 +758,7 @@ def test_slopes_where_a_real_cube_comes_to_stick():
     assert np.abs(slope[0, 0, sticks]).max() < 0.01
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_history_of_contacts_with_friction():
     """It starts and ends as the impact does, in the cone and against the slip meanwhile."""
     law, scene = ji.LZB(0.8, friction=0.3), ji.rocking_block(width=1.0, height=2.0)

@@ -29,7 +29,7 @@ def test_tangents_without_friction_change_nothing():
     np.testing.assert_allclose(other.velocity, plain.velocity, atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize("friction", [None, 0.4])
 def test_damped_forces_keep_rtol(friction):
     """A force that ends at an indentation has a kink, and friction needs the force of its step."""

@@ -171,7 +171,7 @@ def test_derivatives_with_friction():
     np.testing.assert_allclose(forward, CORNER_JACOBIAN, atol=5e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_reverse_mode_is_the_forward_one():
     """Of a box on an edge, in its mass matrix: so many numbers that steps are walked back."""
     scene, v = pressed("edge")
@@ -187,7 +187,7 @@ def test_reverse_mode_is_the_forward_one():
     assert jnp.sum(gradient * change) == pytest.approx(float(forward), rel=1e-8)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize("contacts", [1, 2, 4])
 def test_agrees_with_an_independent_integration(contacts):
     """Boxes and the measured cube, mu up to 1, by regularized friction (see space_reference.py)."""

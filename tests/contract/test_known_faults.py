@@ -50,7 +50,7 @@ BRICK = np.array([1.3, 1.3, 1.3, 0.05, 0.04, 0.03])
 THROWN = np.array([0.3, 0.2, -1, 1.2, -0.4, 0.7])
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize(
     "law", [ji.LZB(0.7, [1.0, 1.7]), ji.Compliant(ji.HuntCrossley([1e4, 1.7e4], 0.4))]
 )
@@ -160,7 +160,7 @@ def test_discs_keep_their_angular_momentum():
     np.testing.assert_allclose(momentum[1], momentum[0], atol=1e-13)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.long_run
 @fault(ENGINE)
 def test_flat_boxes_in_an_assembly_bounce_as_they_do_alone():
@@ -178,7 +178,7 @@ def test_flat_boxes_in_an_assembly_bounce_as_they_do_alone():
             np.testing.assert_allclose(times, expected, rtol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @fault(ENGINE)
 def test_a_block_on_springs_passes_the_flat_position():
     """Both corners carry, one sticks: Radau with regularized friction gets through."""
@@ -202,7 +202,7 @@ def test_a_block_on_springs_passes_the_flat_position():
     assert {ji.STATUS[int(code)].name for code in ends} == {"ok"}
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @fault(ENGINE)
 def test_a_domino_reaches_the_next_one():
     height, width, gap = 0.048, 0.0075, 0.0185
@@ -248,3 +248,6 @@ def test_a_fit_of_four_balls_and_a_wall_reaches_its_minimum():
     assert not any("converge" in text for text in fit.warnings)
     chi_squared = np.sum((np.asarray(fit.residual) / 0.01) ** 2)
     assert chi_squared == pytest.approx(56.2206, abs=1e-3)
+    # MINPACK with this stiffness fixed at 3.84 is 3.6226 above the least: 3.8415 lies beyond
+    ((_, high),) = ji.profile(fit, "stiffness[4]")[0].intervals
+    assert high == pytest.approx(3.867, abs=5e-3)

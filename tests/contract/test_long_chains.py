@@ -18,7 +18,7 @@ def row(e, k, masses):
     return out.velocity, out.status
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_row_of_balls_ends_as_a_block_or_apart():
     """e = .5: the common velocity, long before all closings are over; e = .9: v+ as it is without
     looks ahead."""
@@ -31,7 +31,7 @@ def test_a_row_of_balls_ends_as_a_block_or_apart():
     np.testing.assert_allclose(after[1][jnp.array([0, 1, 8, 9, 10, 11])], apart, atol=2e-8)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_bodies_at_the_end_of_a_row_may_separate_slowly():
     """Ten bodies come to rest, two separate at 1e-4: steps without events at rtol 1e-7 say so."""
     masses = [8.52, 2.61, 0.268, 1.23, 2.58, 0.127, 2.29, 0.545, 1.51, 2.18, 2.18, 1.11]

@@ -223,7 +223,7 @@ def check_hypercube(n, steps):
     return np.mean(~flagged)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_right_or_flagged():
     assert check_hypercube(3, STEPS) > 0.6  # and not all flagged
 
@@ -290,7 +290,7 @@ THIRTY = {  # the first three and the last three
 }
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_long_chains():
     """Right where Siconos ends with 981 times the energy; long chains re-close below e = 0.5."""
 
@@ -316,7 +316,7 @@ def test_long_chains():
     np.testing.assert_allclose(out.velocity[0, -1], 0.985679, atol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_stability_map():
     axes = {"setting": [0.0, 0.6], "exponent": [1.5, 3.0], "restitution": [0.0, 0.9]}
     result = ji.stability_map(("rk4", "verlet"), axes, slices="pairs", samples=3, max_steps=2000)
@@ -480,7 +480,7 @@ def test_friction_is_part_of_every_law():
     assert "contacts 3, 4 too far open to close during the impact" in str(advice).replace("\n", " ")
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_contacts_that_close_again():
     """Two balls at a wall: LZB re-closes at once, Compliant waits for its gap and is right."""
     options = {"exponent": 1.0, "stiffness": 1.0, "tolerance": 5e-3}

@@ -278,7 +278,7 @@ def test_a_folder_of_another_run_is_refused(tmp_path):
         sampled(folder=tmp_path)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_the_linearization_beside_monte_carlo():
     law = Compliant(Hertz(1.0))  # indentations of about 0.5 m: metre-sized gaps
     sampler = {"law": law, "samples": 256, "bins": 50}
@@ -306,7 +306,7 @@ def test_the_linearization_beside_monte_carlo():
     np.testing.assert_allclose(exact.covariance(np.eye(2)), exact.jacobian @ exact.jacobian.T)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_where_the_linearization_has_nothing_to_say(whole):
     assert whole.gap_scale is None
     jumps = gap_sensitivity(LAW, BALLS, BEFORE, whole.gap_mean, whole)

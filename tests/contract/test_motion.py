@@ -82,7 +82,7 @@ def test_hops_below_the_rounding_of_gaps_are_passed(balls):
     np.testing.assert_allclose(end, first * (1 + 0.5) / (1 - 0.5), rtol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_contacts_that_share_bodies_come_to_rest_together():
     """What is passed lies within its estimates: in time, and in the gaps meanwhile."""
     dropped = 0.9, [0.1, 0.101, 0.102], [0.0] * 3
@@ -250,7 +250,7 @@ def first_contact(plate, q0, v0):
     return high
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_no_event_is_missed_between_two_looks():
     """384 vibrating plates, 120 that rise for a moment; a wall that an oscillator grazes."""
     r, n, k = np.random.default_rng(0), 384, 120
@@ -600,7 +600,7 @@ def test_time_stepping_reports_what_it_cannot_resolve():
     assert status(coarse) == "coarse_step"
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_contacts_that_still_approach_have_another_impact_at_once():
     """Moreau's law lets a separating contact close: the next impact is at the same instant."""
     system = ji.column_system([1.0, 1.0, 1.0])
@@ -619,7 +619,7 @@ def test_contacts_that_still_approach_have_another_impact_at_once():
         ji.raise_on_failed_motion(squeezed)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_mass_matrix_that_turns_singular():
     system = ji.System(lambda q: q + 1, lambda q: 1 - q, force=lambda q, v, t: jnp.ones(1))
     assert status(ji.simulate(system, ji.Newton(0.5), [0.0], [1.0], 3.0)) == "singular_mass"

@@ -78,7 +78,7 @@ def test_a_coin_with_corners_is_thrown_and_comes_to_rest():
     np.testing.assert_allclose(np.sort(np.asarray(motion.gaps[-1]))[:6], 0, atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_derivatives_at_no_displacement_take_two_terms():
     q, v = BRICK.at([0.1, 0.2, 0.3], [0.8, 0.6, 0.0, 0.0]), jnp.arange(1.0, 7.0)
 

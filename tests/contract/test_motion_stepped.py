@@ -68,7 +68,7 @@ def overturns(width, height, amplitude, frequency, duration):
         side = np.sign(spin)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_pulses_overturn_the_blocks_that_housner_says():
     """24 pulses; a fallen block lies on its side, on corners that did not touch before."""
     width, height, fallen = 0.2, 1.0, 0
@@ -148,7 +148,7 @@ def test_a_superball_leaves_with_its_slip_reversed():
     np.testing.assert_allclose(x - 1.0, 0.5 * 0.5 * (spin - 3.0), rtol=1e-6)  # m x' r = I spin
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_spinning_brick_comes_to_rest_on_a_face():
     brick = ji.Box([0.1, 0.06, 0.04], mass=0.5)
     motion = ji.simulate(
@@ -239,7 +239,7 @@ def test_impacts_closer_than_a_step_are_one():
         np.testing.assert_allclose(motion.velocity[-1], after, atol=1e-8)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_tossed_block_never_gains_energy():
     """From step to step: at rest, in a stop, with unequal e, in impacts whose slip turns round."""
     rng, n = np.random.default_rng(0), 60
@@ -417,7 +417,7 @@ def slid_off(**options):
 TOPPLES = (1.5 - np.sqrt(1.5**2 - 2 * 0.2 * G * 0.28)) / (0.2 * G)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_block_slides_off_a_table():
     motion = slid_off(samples=201, method="time_stepping", step=1e-3)
     ji.raise_on_failed_motion(motion)

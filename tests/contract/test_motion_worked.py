@@ -24,7 +24,7 @@ def ended(motion):
     return [lane.to_dict()["status"] for lane in lanes]
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_cradle_over_fifty_swings():
     """Repeatable, energy monotone, the ledger closes, and in the end all swing in phase."""
     system = ji.cradle_system([0.1] * 3, length=0.1, diameter=0.02)
@@ -56,7 +56,7 @@ def upright(theta, width=0.2, height=0.6):
     return [0.0, half, theta]
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_free_rocking_to_rest():
     """Each impact keeps e of the angular velocity; swings last as Housner's quadrature says."""
     e = float(ji.theory.housner_restitution(3.0))
@@ -116,7 +116,7 @@ def test_a_corner_hops_while_the_other_is_the_pivot():
     np.testing.assert_allclose(motion.gaps[-1, :2], 0, atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_three_touching_beads_come_to_rest():
     """Nested accumulations: 4183 events if each contact came to rest for itself."""
     beads = 0.1 + 0.01 * np.array([1.0, 3.0, 5.0])
@@ -137,7 +137,7 @@ def test_three_touching_beads_come_to_rest():
         np.testing.assert_allclose(found.ledger_residual, 0, atol=1e-13)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_open_contacts_take_no_part_in_an_impact():
     """Not by a law either that resolves the collisions to come (it knows no gravity meanwhile)."""
     beads, start = ji.column_system([0.1] * 3), [0.1, 0.101, 0.102]
@@ -148,7 +148,7 @@ def test_open_contacts_take_no_part_in_an_impact():
     assert gaps[np.asarray(motion.events.contacts)[:count]].max() < 1e-9
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_an_overturned_block_lies_on_its_side():
     motion = ji.simulate(
         ji.block_system(0.2, 0.6), ji.LZB(0.3), upright(0.5), [0.0] * 3, 3.0, samples=31
@@ -204,7 +204,7 @@ def test_overturning_on_a_harmonic_base():
     np.testing.assert_allclose(motion.ledger_residual[:3], 0, atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize("law", [ji.LZB(0.9, exponent=1.5), ji.Binary(0.9)])
 def test_basketball_and_tennis_ball(law):
     """With a gap they collide one after another, whatever the law; (1 + e)^2 v - v of a light one."""
@@ -308,7 +308,7 @@ def test_friction_is_fitted_through_a_motion():
     assert (found.standard_error < 1e-3).all()
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_motion_that_sees_nothing():
     before = ji.fit_motion(
         ji.ball_system(), ji.Newton(0.7), [[1.0], [0.9]], [1.0], [0.0], 0.1,

@@ -25,7 +25,7 @@ file = "heights.csv"
 """
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_study_of_a_motion_is_fitted(tmp_path):
     ball = ji.ball_system()
     q = np.asarray(ji.simulate(ball, ji.Newton(0.8), [1.0], [0.0], 1.5, samples=16).q)[:, 0]

@@ -109,7 +109,7 @@ def test_a_law_without_friction_on_a_scene_with_tangents():
     assert contact.whole_delassus.shape == (4, 4)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_it_has_a_history_and_a_gap_scale():
     """What a law or a force declares counts, not its class."""
     law, same = Elastic(0.5), ji.LZB(1.0, 1.0)

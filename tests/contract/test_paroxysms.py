@@ -20,7 +20,7 @@ from scipy.integrate import solve_ivp
 
 import jimpact as ji
 
-pytestmark = pytest.mark.slow  # they share a program, a dear one
+pytestmark = pytest.mark.release  # they share a program, a dear one
 
 
 def test_its_outcome_is_the_limit_of_a_stiff_contact():

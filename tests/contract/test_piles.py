@@ -168,7 +168,7 @@ def test_spheres_fall_into_a_box_and_come_to_rest():
     assert -1e-3 < float(np.min(motion.gaps)) < 0
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_mixed_pile_has_the_contacts_of_planar_bodies():
     """The same gaps, normals and tangents, up to their sides; infinite gaps only fill rows."""
     pentagon = 0.2 * np.stack(
@@ -204,7 +204,7 @@ def test_a_mixed_pile_has_the_contacts_of_planar_bodies():
         np.testing.assert_allclose(off, 0, atol=1e-14)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_mixed_pile_finds_its_contacts_by_the_grid():
     """Those of all pairs that are near, now or later, and the least gap of all."""
     rng = np.random.default_rng(3)
@@ -245,7 +245,7 @@ def test_bad_mixed_piles_are_named():
         ji.PlanarPile([ji.Disc(0.1)], walls=[0.0])
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_mixed_pile_comes_to_rest_and_goes_on():
     """Without kinetic energy, with the weight on the floor; the next motion begins where it ends."""
     bodies = [
@@ -284,7 +284,7 @@ def struck():
     return spheres, spheres.at(places), v
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_packing_has_the_contacts_of_its_body(struck):
     spheres, q, _ = struck
     scene, places, columns = spheres.touching(q), np.asarray(q).reshape(8, 6)[:, :3], []
@@ -321,7 +321,7 @@ def test_a_packing_is_struck(struck):
     np.testing.assert_allclose(rate, expected, atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_step_of_a_packing_is_an_impact(struck):
     """Without friction by Moreau's law; with it, ball 1 rubs on balls 2 and 3, all on the table."""
     spheres, q, v = struck
@@ -361,7 +361,7 @@ def test_bad_packings_are_named(struck):
         spheres.touching(q[1:])
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize("method", ["time", "implicit"])
 def test_dynamics_of_a_packing_are_those_of_the_dense_scene(struck, method):
     spheres, q, v = struck

@@ -97,9 +97,9 @@ MOTIONS = {
 @pytest.mark.parametrize(
     "method",
     [
-        pytest.param("events", marks=pytest.mark.slow),
+        pytest.param("events", marks=pytest.mark.release),
         "time_stepping",
-        pytest.param("contact_forces", marks=pytest.mark.slow),
+        pytest.param("contact_forces", marks=pytest.mark.release),
     ],
 )
 def test_motions(method):

@@ -154,7 +154,7 @@ def test_particle_has_no_coupling():
     np.testing.assert_allclose(parts, [-4, 0, -1.5], atol=1e-15)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_basis_is_smooth_in_the_scene():
     """The derivative is that of the value: v(qn, qt) for given quasi-velocities."""
     scene = random_scene(1)

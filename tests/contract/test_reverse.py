@@ -44,7 +44,7 @@ def test_an_adjoint_that_does_not_exist():
         ji.LZB(0.9, adjoint="chekpoints")
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_adjoints_agree_where_they_have_a_mode():
     exact = jax.jit(jax.jacfwd(last_velocity("jacobian")))(AT)
     for mode, adjoint in ((jax.grad, "jacobian"), (jax.jacfwd, "forward")):
@@ -62,7 +62,7 @@ def test_adjoints_agree_where_they_have_a_mode():
     )
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_checkpoints_have_the_reverse_mode_only():
     exact = jax.jit(jax.jacfwd(last_velocity("jacobian")))(AT)
     checkpoints = last_velocity("checkpoints")

@@ -122,7 +122,7 @@ def test_the_tip_is_found_by_impacts_alone():
     np.testing.assert_allclose(angle[:, 0], ji.theory.critical_kinetic_angle(mu), atol=1e-7)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_it_is_a_v():
     a = np.linspace(0.3, 5.0, 60)
     out = ji.theory.rocking_dispersion(a, [0.0, 0.1, 0.3, 1.0], [0.5, 1.0])

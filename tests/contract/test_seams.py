@@ -121,7 +121,7 @@ def test_shots_with_different_numbers_of_contacts_are_fitted_together():
     np.testing.assert_allclose(excess[[0, 2]][:, 0], 0.0, atol=1e-14)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_padding_with_friction():
     """A cube's corner and its edge in one fit: contacts that are not there change nothing."""
     corner = ji.Scene([1.0, 1.0, 0.5], [[0.0], [1.0], [0.4]], tangents=[[1.0], [0.0], [0.3]])
@@ -141,7 +141,7 @@ def test_scenes_that_cannot_be_fitted_together():
         ji.Experiments(np.ones((2, 2)), np.ones((2, 2)), scenes=[one, ji.chain([1.0, 1.0])])
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_poisson_with_friction():
     """Coulomb's law in both phases, on random planar scenes; compression is a plastic Moreau impact."""
     rng = np.random.default_rng(0)
@@ -172,7 +172,7 @@ def test_poisson_with_friction():
     assert not slides.all()
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_poisson_of_one_contact_in_space():
     """A sphere that does not roll: with e_t = 0 both phases together are Moreau's impact."""
     sphere = ji.Scene(np.ones(3), [[0.0], [0.0], [1.0]], tangents=np.eye(3)[:, :2])
@@ -207,7 +207,7 @@ def test_ill_conditioned_is_reported_and_nothing_else_is(dtype):
     assert list(status) == [CODE["ill_conditioned"], CODE["ok"]]
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_light_balls_with_gaps_and_knife_edges_are_right_or_reported():
     """Masses and stiffnesses over three decades behind gaps; gaps of 1e-8 that open and close."""
     rng, half = np.random.default_rng(0), 48
@@ -239,7 +239,7 @@ def test_light_balls_with_gaps_and_knife_edges_are_right_or_reported():
     assert reported.mean() < 0.05
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_derivatives_of_a_checked_outcome_are_those_of_the_plain_one():
     balls, v = ji.chain(np.ones(3)), jnp.array([1.0, 0.0, 0.0])
 

@@ -34,7 +34,7 @@ def every():
     return ji.fit_laws(PAIR, data, ["moreau", "newton", "restitution_matrix"], speed=True)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_laws_that_agree_are_listed_by_what_they_must_know(every):
     assert list(every.entries) == ["newton", "moreau"]
     newton, moreau = every.entries.values()
@@ -92,7 +92,7 @@ def test_bad_laws(change, message):
         ji.fit_laws(PAIR, data, **change)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_the_law_that_made_the_data_is_found():
     """Of three balls: dispersion that only LZB has; the simpler laws predict worse."""
     balls, rng = ji.chain([1.0, 1.0, 1.0]), np.random.default_rng(2)
@@ -126,7 +126,7 @@ def test_restitution_by_speed_is_what_it_says():
     assert float(none.restitution_at(7.0)) == 0.3
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_slopes_of_restitution_by_speed_at_its_edges_are_whole():
     """Where e reaches 1, at the yield speed, at e = 0: one side's, not the mean of two."""
 
@@ -190,7 +190,7 @@ def test_bad_dependence_on_speed(make, message):
         make()
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_the_need_of_a_dependence_on_speed_is_tested():
     falling = 0.8 * SPEED**-0.2
     law = ji.VelocityDependent(ji.Newton(0.7), speed_exponent=0.1)

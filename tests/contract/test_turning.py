@@ -43,7 +43,7 @@ def turning_impact(gaps, mass, q, v, force):
     return Turned(events.velocity_after[last], events.q[last], ended)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize(("force", "power"), [(LinearSpring, 1 / 2), (Hertz, 2 / 5)])
 def test_frozen_geometry_is_the_stiff_limit(force, power):
     """The error of frozen geometry is of the order of indentation over size: k^(-1/(eta+1))."""
@@ -72,7 +72,7 @@ def test_block_on_one_corner():
     assert float(0.5 * MASS @ moving.velocity**2) == pytest.approx(0.125, rel=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize("force", [Hertz(jnp.ones(2)), HuntCrossley(1.0, 0.4)])
 def test_straight_chain_does_not_turn(force):
     gaps = jnp.array([0.0, 0.2])
@@ -108,7 +108,7 @@ def test_mass_that_depends_on_the_configuration():
     assert float(cartesian.velocity[1]) == pytest.approx(-float((turn @ v)[1]), abs=1e-7)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_derivative():
     """Beside the kink at LANDING, where one corner neither approaches nor leaves."""
 

@@ -203,7 +203,7 @@ def test_lzb_between_the_limits():
         ([0.4649, 0.7916, 0.8412], [6.6944, 0.0506], (1.3, 2.0), [1.38e-6, 0.0]),
     ],
 )
-@pytest.mark.slow
+@pytest.mark.release
 def test_slow_plastic_limits(masses, k, exponent, u0):
     """Mixed exponents let the last approach fade slowly: still the common velocity, reported."""
     out = ji.impact(ji.LZB(0.0, k, exponent, u0), ji.chain(masses), [1.0, 0.0, 0.0])

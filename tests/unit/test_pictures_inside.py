@@ -25,7 +25,7 @@ from jimpact.methods.validity import ValidityMap
 from jimpact.plot.charts import _styles
 from jimpact.plot.style import SMALL, WIDTH
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.release
 
 AFTER = np.array([-0.1, 0.2, 0.9])
 
