@@ -35,8 +35,8 @@ from matplotlib.figure import Figure
 import jimpact as ji
 
 began = time.perf_counter()
-ellipse, square = ji.ellipse_impacts(), ji.square_impacts()
-drops, seconds, poses = ji.square_drops()
+ellipse, square = ji.data.ellipse_impacts(), ji.data.square_impacts()
+drops, seconds, poses = ji.data.square_drops()
 block = ji.Block(0.06, 0.06)
 figure = Figure(figsize=(6, 2.2), layout="constrained")
 axes = figure.subplots()

@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 
 import jimpact as ji
+from jimpact.bodies.solids import Solid
 from jimpact.fits.fitting import LOSSES
 from jimpact.fits.solve import DEFAULT_STEPS
 from jimpact.methods.contenders import METHODS
@@ -20,7 +21,7 @@ def bodies():
     arguments = {
         name: list(inspect.signature(kind.__init__).parameters.values())[1:]
         for name, kind in bodies.items()
-        if kind not in (ji.Body, ji.Solid)  # of which the others are made
+        if kind not in (ji.Body, Solid)  # of which the others are made
     }
     return {k: {x.name: x.default is x.empty for x in rows} for k, rows in arguments.items()}
 

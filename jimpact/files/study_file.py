@@ -214,7 +214,7 @@ def check_study(path: str | Path, law: str | None = None) -> tuple[CheckedStudy,
 
 
 def check_motion_study(path: str | Path, law: str | None = None) -> CheckedStudy:
-    """The study of a motion, all checked; see `read_motion_study`."""
+    """The study of a motion, all checked; see `read_study`."""
 
     def check(tables: dict[str, Any], file: Path) -> CheckedStudy:
         """Check the tables and the positions."""

@@ -132,7 +132,7 @@ def simulate(
     Raises:
         NotImplementedError: derivatives of time stepping, which do not converge with the step.
         ValueError: shapes, t_end <= t_start, penetration, NaN in base motion or mass, on the
-            host; inside jit the status reports them (`raise_on_failed_motion`).
+            host; inside jit the status reports them (`raise_on_failure`).
 
     Source: Brogliato, Nonsmooth Mechanics (2016), Remark 6.9 for the time stepping.
 

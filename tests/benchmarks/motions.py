@@ -43,7 +43,7 @@ def main():
         runs[name, "batch"] = lambda f=many: f(e).events.count
         runs[name, "one"] = lambda f=single: f(one).events.count
         runs[name, "gradient"] = lambda f=slope: f(one)
-        ji.raise_on_failed_motion(many(e))
+        ji.raise_on_failure(many(e))
         events[name, "batch"] = int(many(e).events.count.sum())
         events[name, "one"] = events[name, "gradient"] = int(single(one).events.count)
     timings = alternating(runs, repeats)

@@ -183,7 +183,7 @@ def draw_of(kind, count):
         return spatial_scenes.random_boxes(kind, count)
     import jimpact as ji
 
-    shots = ji.cube_impacts(CUBES[kind])
+    shots = ji.data.cube_impacts(CUBES[kind])
     each = [i for i in range(len(shots.pre)) for _ in spatial_scenes.CUBE_MU]
     mu = np.tile(spatial_scenes.CUBE_MU, len(shots.pre))[:count]
     each = each[:count]

@@ -311,10 +311,10 @@ def test_bilateral_chain_and_newby():
 
 
 def test_distributing_rule():
-    rule = ji.distributing_rule([0.2, 0.3], [1.0, 2.0], [1.0, 1.5])
+    rule = ji.theory.distributing_rule([0.2, 0.3], [1.0, 2.0], [1.0, 1.5])
     np.testing.assert_allclose(rule[1, 0], 1.7555724651363151, rtol=1e-14)
     np.testing.assert_allclose(rule * rule.T, 1.0, rtol=1e-14)
-    rule = ji.distributing_rule([1.0, 0.3], [1.0, 2.0], 1.5)
+    rule = ji.theory.distributing_rule([1.0, 0.3], [1.0, 2.0], 1.5)
     np.testing.assert_allclose(rule[1, 0], 0.640744299507361192, rtol=1e-14)
 
 
@@ -494,7 +494,7 @@ def test_symmetric_discontinuity_is_a_smooth_crossover():
     """Balls (m/4, m, m/4) at (1, 0, -1): both orders, both at once, and how wide it is."""
     offset = jnp.linspace(-4, 4, 41)
     scene, v = ji.chain(jnp.array([0.25, 1.0, 0.25])), jnp.array([1.0, 0.0, -1.0])
-    found = ji.crossover(scene, ji.Compliant(ji.Hertz(1.0)), v, offset)
+    found = ji.theory.crossover(scene, ji.Compliant(ji.Hertz(1.0)), v, offset)
     w = np.asarray(found.velocity)
     assert (np.asarray(found.status) == 0).all()
     np.testing.assert_allclose(w[0], (-3 / 5, -4 / 25, 31 / 25), atol=1e-7)
@@ -510,7 +510,7 @@ def test_offsets_of_gaps_are_in_units_of_the_larger_indentation():
     """The lighter pair indents less: `delta_c^2.5 = m v^2 / k`, m = 2 m1 m2 / (m1 + m2)."""
     masses, v, offset = [0.25, 1.0, 4.0], jnp.array([1.0, 0.0, -1.0]), jnp.linspace(-4, 4, 41)
     scene, law = ji.chain(jnp.array(masses)), ji.Compliant(ji.Hertz(1.0))
-    outcome = ji.crossover(scene, law, v, offset)
+    outcome = ji.theory.crossover(scene, law, v, offset)
     larger = (2 * 1.0 * 4.0 / 5.0) ** 0.4
     gaps = larger * (2.0 + 0.5 * offset[:, None] * jnp.array([[1.0, -1.0]]))
     direct = jax.vmap(lambda g: ji.impact(law, ji.chain(jnp.array(masses), gaps=g), v))(gaps)

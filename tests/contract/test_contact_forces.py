@@ -156,7 +156,7 @@ def test_a_block_comes_to_rest_with_friction():
     motion = ji.simulate(
         ji.block_system(0.2, 0.3), law, [0, 0.4, 0.3], [1.0, 0, 2.0], 3.0, **options
     )
-    ji.raise_on_failed_motion(motion)
+    ji.raise_on_failure(motion)
     np.testing.assert_allclose(motion.velocity[-1], 0, atol=1e-12)
     assert float(motion.q[-1, 1]) == pytest.approx(0.1 - G / 2e5, abs=1e-9)
     np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-9)
@@ -171,7 +171,7 @@ def test_a_box_strikes_on_its_corners_with_friction():
     at = [0, 0, 0.3, 0.9, 0.1, 0.3, 0.09**0.5]
     options = {"samples": 5, "max_events": 400, "method": "contact_forces"}
     motion = ji.simulate(system, law, at, [1.0, 0, 0, 1.0, 2.0, 3.0], 0.6, **options)
-    ji.raise_on_failed_motion(motion)
+    ji.raise_on_failure(motion)
     assert int(motion.events.count) > 10
     assert float(jnp.max(jnp.diff(motion.energy))) < 1e-9
     np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-9)

@@ -56,7 +56,7 @@ LAWS = [
     (lambda: ji.LinearSpring("hard"), r"`stiffness`"),
     (lambda: ji.UserForce(3.0), r"`function`"),
     (lambda: ji.UserForce(lambda x, rate, p: x, "hard"), r"`parameters`"),
-    (lambda: ji.distributing_rule([-1.0, 1.0], 1.0, 1.5), r"`energy`"),
+    (lambda: ji.theory.distributing_rule([-1.0, 1.0], 1.0, 1.5), r"`energy`"),
     (lambda: ji.precompression_energy(-1.0, 1.0), r"`force`"),
     (lambda: ji.precompression_energy(1.0, 0.0), r"`stiffness`"),
 ]
@@ -219,8 +219,11 @@ CALLS = [
     (lambda: ji.hertz_stiffness(1.0, 0.3, 1.0, radius2=0.0), r"`radius2"),
     (lambda: ji.gap_scale(PAIR, ji.Newton(1.0), [1.0, 0.0]), r"`law`"),
     (lambda: ji.gap_scale(PAIR, ji.LZB(1.0), [1.0]), r"`velocity`"),
-    (lambda: ji.crossover(PAIR, ji.Compliant(ji.Hertz(1.0)), [1.0, 0.0], [0.0]), r"two contacts"),
-    (lambda: ji.crossover(BALLS, ji.Compliant(ji.Hertz(1.0)), V, [[0.0]]), r"`offset`"),
+    (
+        lambda: ji.theory.crossover(PAIR, ji.Compliant(ji.Hertz(1.0)), [1.0, 0.0], [0.0]),
+        r"two contacts",
+    ),
+    (lambda: ji.theory.crossover(BALLS, ji.Compliant(ji.Hertz(1.0)), V, [[0.0]]), r"`offset`"),
     (lambda: ji.theory.rocking_dispersion(0.0), r"`aspect`"),
     (lambda: ji.theory.rocking_dispersion([[1.0]]), r"`aspect`.*one axis"),
     (lambda: ji.theory.rocking_dispersion(1.0, friction=-0.1), r"`friction`"),

@@ -141,7 +141,7 @@ def test_a_bad_motion_ends_alone(balls):
     ends = [status(lane(balls[0], i)) for i in range(5)]
     assert ends == ["ok", "not_finite", "penetration", "max_events", "ok"]
     with pytest.raises(RuntimeError, match=r"max_events.*\(1 at 3\)"):
-        ji.raise_on_failed_motion(balls[0])
+        ji.raise_on_failure(balls[0])
     assert str(balls[0]) == "6 motions: 3 ok, 1 max_events, 1 penetration, 1 not_finite"
     impacts = kinds(lane(balls[0], 0)).count("impact")
     assert f"  events: {impacts} impact, 1 accumulation\n" in str(lane(balls[0], 0))
@@ -614,7 +614,7 @@ def test_contacts_that_still_approach_have_another_impact_at_once():
     squeezed = ji.simulate(system, ji.Newton(0.9), [0.0] * 3, [-1.0, 5.0, 5.0], 0.01, samples=2)
     assert status(squeezed) == "law_failed"
     with pytest.raises(RuntimeError, match="law_failed"):
-        ji.raise_on_failed_motion(squeezed)
+        ji.raise_on_failure(squeezed)
 
 
 @pytest.mark.slow

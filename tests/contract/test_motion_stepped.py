@@ -202,7 +202,7 @@ def test_a_motion_says_how_its_law_fails():
         lambda m: (m.status, m.events.status), motion, (jnp.int32(CODE["law_failed"]), codes)
     )
     with pytest.raises(RuntimeError, match=r"law_failed: .*: negative_impulse"):
-        ji.raise_on_failed_motion(failed)
+        ji.raise_on_failure(failed)
 
 
 def test_friction_below_0_is_reported():
@@ -419,7 +419,7 @@ TOPPLES = (1.5 - np.sqrt(1.5**2 - 2 * 0.2 * G * 0.28)) / (0.2 * G)
 @pytest.mark.slow
 def test_a_block_slides_off_a_table():
     motion = slid_off(samples=201, method="time_stepping", step=1e-3)
-    ji.raise_on_failed_motion(motion)
+    ji.raise_on_failure(motion)
     time, (x, y, angle) = np.asarray(motion.time), np.asarray(motion.q)[:, 3:].T
     slides = time < TOPPLES - 0.005
     np.testing.assert_allclose(angle[slides], 0, atol=1e-6)
@@ -432,7 +432,7 @@ def test_a_block_slides_off_a_table():
 
 @pytest.mark.release
 def test_a_block_topples_off_a_table_at_its_moment():
-    motion = ji.raise_on_failed_motion(slid_off(samples=41))
+    motion = ji.raise_on_failure(slid_off(samples=41))
     assert float(motion.event_times("detachment")[0]) == pytest.approx(TOPPLES, abs=1e-7)
     np.testing.assert_allclose(motion.q[-1, 4:], [0.1, 0.0], atol=1e-9)
     assert float(np.nanmin(motion.gaps)) > -1e-9

@@ -159,7 +159,7 @@ def test_spheres_fall_into_a_box_and_come_to_rest():
         system, ji.Moreau(0.3, friction=0.5), spheres.at(0.014 + 0.024 * grid), v0, 1.5,
         samples=16, method="time_stepping", step=1e-3,
     )  # fmt: skip
-    ji.raise_on_failed_motion(motion)
+    ji.raise_on_failure(motion)
     speed = np.abs(np.asarray(motion.velocity[-1]).reshape(-1, 6)[:, :3])
     assert np.median(speed) < 1e-6
     assert speed.max() < 2e-2  # a last sphere may roll
@@ -257,7 +257,7 @@ def test_a_mixed_pile_comes_to_rest_and_goes_on():
     places = [[-0.1, 0.06], [0.13, 0.07], [0.0, 0.2], [-0.1, 0.32], [0.13, 0.3], [0.0, 0.45]]
     options = dict(samples=5, method="time_stepping", step=1e-3)
     motion = ji.simulate(system, law, pile.at(places), np.zeros(18), 1.5, **options)
-    ji.raise_on_failed_motion(motion)
+    ji.raise_on_failure(motion)
     assert motion.kinetic_energy[-1] < 1e-9
     np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-10)
     assert -2e-3 < float(motion.gaps.min()) < -1e-9  # steps leave overlaps, with which it goes on

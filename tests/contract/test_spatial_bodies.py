@@ -162,7 +162,7 @@ def test_a_sphere_falls_over_the_edge_of_a_finite_wall_in_steps():
     motion = ji.simulate(
         system, ji.Newton(0.5), q, np.zeros(12), 0.3, samples=4, method="time_stepping", step=1e-3
     )
-    ji.raise_on_failed_motion(motion)
+    ji.raise_on_failure(motion)
     rebound = 0.5 * np.sqrt(2 * 10 * 0.2)
     assert motion.velocity[-1, 2] == pytest.approx(rebound - 10 * (0.3 - 0.2), abs=0.02)
     assert motion.q[-1, 9] == pytest.approx(1.3 - 0.5 * 10 * 0.3**2, abs=2e-3)

@@ -84,7 +84,7 @@ def quasi_lagrange(
 
     >>> import jimpact as ji
     >>> block = ji.block_system(1.0, 2.0**0.5, acceleration=10.0, corners="base")
-    >>> terms = ji.quasi_lagrange(block, [0.0, 0.5**0.5, 0.0], [1.0, 0.0, 0.0])
+    >>> terms = ji.theory.quasi_lagrange(block, [0.0, 0.5**0.5, 0.0], [1.0, 0.0, 0.0])
     >>> [round(float(f), 6) for f in terms.normal]  # g / sqrt(W_jj), W_jj = 2: kinetic angle pi/2
     [7.071068, 7.071068]
     """
@@ -188,7 +188,7 @@ def contact_problem(system: System, q: Any, velocity: Any, time: Any = 0.0) -> C
 
     >>> import jimpact as ji
     >>> block = ji.block_system(1.0, 2.0, acceleration=10.0, corners="base")
-    >>> problem = ji.contact_problem(block, [0.0, 1.0, 0.0], [0.0, 0.0, 0.0])
+    >>> problem = ji.theory.contact_problem(block, [0.0, 1.0, 0.0], [0.0, 0.0, 0.0])
     >>> problem.forces().round(6).tolist()  # half of its weight each
     [5.0, 5.0]
     """

@@ -1,0 +1,78 @@
+"""Ratios of impulses at contacts beside each other: what laws give, what mechanics allows."""
+
+from typing import Any
+
+import jax
+import numpy as np
+
+from jimpact._checks import as_float_array, check_per_contact, check_values
+from jimpact.laws.impulse_correlation import interval
+from jimpact.scene import Scene
+
+
+def distributing_rule(energy: Any, stiffness: Any, exponent: Any) -> jax.Array:
+    """`Gamma_ji = dp_j / dp_i` (m, m), the ratio of impulse increments at two contacts.
+
+    Equation: `Gamma_ji = F_j / F_i`, `F_j = ((1 + eta_j) E_j)^(eta_j / (1 + eta_j))
+    k_j^(1 / (1 + eta_j))`.
+
+    Args:
+        energy: E_j >= 0 (m,) [J], potential energy of each contact.
+        stiffness: k_j > 0, scalar or (m,) [N / m^eta_j].
+        exponent: eta_j >= 1, scalar or (m,).
+
+    Returns:
+        Row j, column i: Gamma_ji; NaN or inf in columns with E_i = 0 (0/0 at the first touch:
+        why the law is integrated in time form, see `LZB`).
+
+    Raises:
+        ValueError: energy < 0, stiffness <= 0, exponent < 1.
+
+    Source: Liu, Zhao and Brogliato (2008); Brogliato (2016), (6.70).
+
+    >>> import jimpact as ji
+    >>> round(float(ji.theory.distributing_rule([1.0, 0.3], [1.0, 2.0], 1.5)[1, 0]), 5)
+    0.64074
+    """
+    energy = as_float_array("energy", energy)
+    stiffness = as_float_array("stiffness", stiffness)
+    eta = as_float_array("exponent", exponent)
+    check_values("energy", energy, low=0.0)
+    check_values("stiffness", stiffness, low=0.0, open_low=True)
+    check_values("exponent", eta, low=1.0)
+    force = ((1 + eta) * energy) ** (eta / (1 + eta)) * stiffness ** (1 / (1 + eta))
+    return force[:, None] / force[None, :]
+
+
+def correlation_interval(scene: Scene, restitution: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Ratios `r_j = dp_j / dp_i` that mechanics allows a contact j at rest beside contact i.
+
+    Equation: `r_j >= -W_ij / W_jj`, or contact j would approach; and contact i ends apart only
+    where `W_ii + 2 W_ij r + W_jj r^2 <= (1 + e_i^2) (W_ii + W_ij r)`, with
+    `W_ii + W_ij r > 0`. For three equal balls that hit at e = 1: 1/2 to 1, the whole arc of
+    outcomes that conserve energy.
+
+    Args:
+        scene: m contacts.
+        restitution: energetic coefficient e in [0, 1], scalar or (m,).
+
+    Returns:
+        Least and largest ratios, each (m, m): row i, column j; NaN where contact i does not press
+        contact j (`W_ij >= 0`), which then gets no impulse. Least above largest: there is none.
+
+    Raises:
+        ValueError: restitution out of range or of a wrong size.
+
+    Host function, not differentiable.
+
+    Source: own derivation, from `ImpulseCorrelation` of two contacts.
+
+    >>> import jimpact as ji
+    >>> low, high = ji.theory.correlation_interval(ji.chain([1.0, 1.0, 1.0]), 0.9)
+    >>> round(float(low[0, 1]), 6), round(float(high[0, 1]), 6)
+    (0.5, 0.948753)
+    """
+    e = as_float_array("restitution", restitution)
+    check_values("restitution", e, low=0.0, high=1.0)
+    check_per_contact("restitution", e, scene.contacts)
+    return interval(scene, e)
