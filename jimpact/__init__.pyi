@@ -4,17 +4,14 @@ from . import data as data, plot as plot, theory as theory
 from .audits import audit as audit, summary as summary
 from .bodies.assemblies import PlanarBodies as PlanarBodies
 from .bodies.base import Body as Body, scene_from_gaps as scene_from_gaps
-from .bodies.blocks import Block as Block, rocking_block as rocking_block
+from .bodies.blocks import Block as Block
 from .bodies.dimers import (
     Dimer as Dimer,
     SpatialDimer as SpatialDimer,
-    dimer as dimer,
-    dimer_3d as dimer_3d,
 )
-from .bodies.discs import DiskBalls as DiskBalls, disk_balls as disk_balls
 from .bodies.mujoco_scene import from_mujoco as from_mujoco
-from .bodies.particles import Column as Column, Corner as Corner, corner as corner
-from .bodies.pendulums import PendulumCradle as PendulumCradle, pendulum_cradle as pendulum_cradle
+from .bodies.particles import Column as Column, Corner as Corner
+from .bodies.pendulums import PendulumCradle as PendulumCradle
 from .bodies.piles import Discs as Discs, Spheres as Spheres
 from .bodies.planar_piles import PlanarPile as PlanarPile
 from .bodies.polygons import Disc as Disc, Polygon as Polygon
@@ -109,18 +106,12 @@ from .motion.simulate import simulate as simulate
 from .motion.system import (
     HarmonicBase as HarmonicBase,
     System as System,
-    ball_system as ball_system,
-    block_system as block_system,
-    column_system as column_system,
-    cradle_system as cradle_system,
-    dimer_system as dimer_system,
     gravity as gravity,
 )
 from .saved import load as load
 from .scene import (
     Scene as Scene,
     chain as chain,
-    column as column,
     gap_velocity as gap_velocity,
     kinetic_energy as kinetic_energy,
     momentum as momentum,

@@ -31,7 +31,7 @@ def load(path: str | Path) -> Fit[Any] | Motion:
     >>> fit = ji.fit(ji.Newton(0.9), ji.chain([1.0, 1.0]), data)
     >>> ji.load(fit.save(folder / "fit.json")).verdict == fit.verdict
     True
-    >>> ball, law = ji.ball_system(), ji.Newton(0.5)
+    >>> ball, law = ji.System(ji.Column([1.0]), gravity=True), ji.Newton(0.5)
     >>> motion = ji.simulate(ball, law, [1.0], [0.0], 1.0, samples=21)
     >>> loaded = ji.load(motion.save(folder / "ball.npz"))
     >>> both = loaded.then(ji.simulate(ball, law, **loaded.end, t_end=2.0, samples=21))

@@ -127,7 +127,7 @@ print("e of each impact, quartiles:", np.quantile(-gap_after / gap, [0.25, 0.5, 
 # time stepping, all at once. Where is it, and on which side does it come to rest?
 
 # %%
-system = ji.System(block, potential=ji.gravity(block, 9.81))
+system = ji.System(block, gravity=9.81)
 heights = np.asarray(jax.vmap(jax.vmap(block.gap_function))(poses)).min(axis=2)
 flies = heights > 2e-3
 FRAMES, REST = 9, 200

@@ -64,7 +64,7 @@ def start(value, count):
 def rocked(base=None):
     """A dimer and its motion as if simulated: contact 1 strikes at 0.25 s, between two samples."""
     body = ji.Dimer(radius=0.1, length=1.0)
-    system = ji.System(body, potential=ji.gravity(body), base=base)
+    system = ji.System(body, gravity=True, base=base)
     time, zero = np.linspace(0.0, 0.5, 6), np.zeros(6)
     q = np.stack([zero, 0.2 + 0.01 * time, 0.3 - time], axis=1)
     before, after = np.array([0.0, -1.0, -2.0]), np.array([0.0, 1.0, 3.0])

@@ -73,5 +73,4 @@ BODIES = {
     "Discs": "masses_kg = 1\nradii_m = [0.1, 0.1]\nwalls = [[0, 1, 0]]",
     "PlanarPile": "walls = [[0, 1, 0]]\n[[system.bodies]]\nkind = 'disc'\nradius_m = 0.1",
     "Spheres": "masses_kg = 1\nradii_m = [0.1, 0.1]\nwalls = [[0, 0, 1, 0]]",
-    "DiskBalls": "disk_radius_m = 1\nball_radius_m = 0.1\ndisk_mass_kg = 1\nball_masses_kg = [1]",
 }

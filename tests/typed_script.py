@@ -43,7 +43,7 @@ assert_type(fit.warnings, tuple[str, ...])
 found = ji.monte_carlo(law, cradle, [1.0, 0.0, 0.0], gaps=ji.Uniform(0.0, 1e-5), samples=100)
 assert_type(found, MonteCarlo)
 assert_type(ji.compare(cradle, [1.0, 0.0, 0.0]).velocity, np.ndarray)
-assert_type(ji.simulate(ji.ball_system(), law, [1.0], [0.0], 1.0), Motion)
+assert_type(ji.simulate(ji.System(ji.Column([1.0]), gravity=True), law, [1.0], [0.0], 1.0), Motion)
 
 # name spaces
 assert_type(ji.plot.fit(fit), Figure)

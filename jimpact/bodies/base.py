@@ -265,17 +265,22 @@ class Body(eqx.Module):
         """Planes to draw, (angle, offset) each; in space and where all hang none."""
         return ((0.0, 0.0),)
 
-    def scene(self, q: Any, closed_below: float = CLOSED_BELOW) -> Scene:
+    def touching(self, *where: Any, **options: Any) -> Any:
+        """q (n,) at which it touches what is around it."""
+        raise TypeError(f"{type(self).__name__} has no `touching`: give its `q` yourself.")
+
+    def scene(self, q: Any = None, closed_below: float = CLOSED_BELOW) -> Scene:
         """The scene at configuration q, its normals and tangents in the velocities (n,).
 
-        Gaps up to `closed_below` [m] (or a few roundings of q) count as closed.
+        q None is where it touches, `touching()`. Gaps up to `closed_below` [m] (or a few roundings
+        of q) count as closed.
 
         Raises:
             ValueError: q of another size, not finite, or out of the range of the gap function
                 (inside jit: normals that are NaN, so that `impact` says `not_finite`);
                 penetration; a mass that is not positive.
         """
-        q = as_float_array("q", q)
+        q = as_float_array("q", self.touching() if q is None else q)
         mass = self.mass
         if callable(mass):
             mass = jax.eval_shape(mass, q)

@@ -78,7 +78,7 @@ def pile_contacts(
 
     >>> import jimpact as ji
     >>> discs = ji.Discs([1.0, 2.0], [0.1, 0.1], walls=[[0.0, 1.0, 0.0]])
-    >>> system = ji.System(discs, potential=ji.gravity(discs, 10.0))
+    >>> system = ji.System(discs, gravity=10.0)
     >>> q = discs.at([[0.0, 0.3], [0.0, 0.1]])
     >>> found = ji.pile_contacts(system, ji.Moreau(0.0), q, [0.0] * 6, step=1e-3)
     >>> found.bodies.tolist(), [round(float(p) / 1e-3, 3) for p in found.impulse]

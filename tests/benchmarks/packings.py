@@ -155,7 +155,7 @@ def steps_of(dimensions, count, steps=100, step=1e-3, mixed=False):
     if mixed:
         shapes = [ji.Disc(0.5), ji.Block(np.sqrt(0.5), np.sqrt(0.5))]
         body = ji.PlanarPile([shapes[i % 2] for i in range(count)], walls=[floor])
-    system = ji.System(body, potential=body.gravity(9.81))
+    system = ji.System(body, gravity=9.81)
     law, start = ji.Moreau(0.3, friction=0.5), body.at(at[:, :3] if dimensions == 3 else at[:, ::2])
 
     def run():

@@ -85,7 +85,7 @@ def as_parts(value):
 ARC = "ji.theory.admissible_set(three, hit).conserving_arc(2)"
 SECTIONS = {
     "6.1 Multiple impacts": [
-        Row("Def. 6.1", "balls on the ground: number of contacts", "ji.column([1.0] * 5).contacts",
+        Row("Def. 6.1", "balls on the ground: number of contacts", "ji.chain([1.0] * 5, wall='right').contacts",
             "N - 1 for N balls, l >= 0", 5, "N contacts, an N-impact; l >= 1"),
         Row("6.1.1", "stiffness of two steel beads [N/m^1.5]",
             "ji.hertz_stiffness(21.6e10, 0.276, 4e-3)", "6.9716e9 of E = 210 GPa", 6.97089e9,
@@ -105,7 +105,7 @@ SECTIONS = {
         Row(
             "6.1.1",
             "largest force at the wall, 2 beads [N]; one: 51.65",
-            "ji.history(ji.LZB([0.96, 0.92], [6.9716e9, 9.858e9]), ji.column([2.05e-3] * 2),"
+            "ji.history(ji.LZB([0.96, 0.92], [6.9716e9, 9.858e9]), ji.chain([2.05e-3] * 2, wall='right'),"
             " [(2 * 9.80665 * 3.1e-3) ** 0.5] * 2).maximum_force[-1]",
             "almost independent of N",
             LARGEST,
@@ -113,7 +113,7 @@ SECTIONS = {
             allowed=2e-4,
         ),
         Row("6.1.1", "how long one bead presses [us]",
-            "ji.history(ji.LZB(0.92, [9.858e9]), ji.column([2.05e-3]),"
+            "ji.history(ji.LZB(0.92, [9.858e9]), ji.chain([2.05e-3], wall='right'),"
             " [(2 * 9.80665 * 3.1e-3) ** 0.5]).duration * 1e6",
             "less than 32", 1e6 * PRESSES, "34.6 for N = 1, 225.5 for 8, 316 for 12 at 5.1 mm",
             slow=True, allowed=1e-6),
@@ -230,7 +230,7 @@ SECTIONS = {
         Row(
             "(6.24)-(6.27)",
             "quasi-normal forces of a resting block, kinetic angle pi/2, g = 10",
-            "ji.theory.quasi_lagrange(ji.block_system(1.0, 2.0**0.5, acceleration=10.0, corners='base'),"
+            "ji.theory.quasi_lagrange(ji.System(ji.Block(1.0, 2.0**0.5, corners='base'), gravity=10.0),"
             " [0.0, 0.5**0.5, 0.0], [0.0, 0.0, 0.0]).normal",
             "(6.26)",
             [50**0.5, 50**0.5],
@@ -239,7 +239,7 @@ SECTIONS = {
         Row(
             "(6.28)-(6.30)",
             "forces of the contact LCP on a resting block of 1 kg",
-            "ji.theory.contact_problem(ji.block_system(1.0, 2.0, acceleration=10.0, corners='base'),"
+            "ji.theory.contact_problem(ji.System(ji.Block(1.0, 2.0, corners='base'), gravity=10.0),"
             " [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]).forces()",
             "(6.74)",
             [5.0, 5.0],
@@ -323,7 +323,7 @@ SECTIONS = {
             "pi/2, pi/4", [np.pi / 2, np.pi / 3], "pi/3 for the flat one"),
         Figure("6.8a"),
         Row("Rem. 6.11", "dimer: L = infinity, L = 0, and R/L = 5/24 [rad]",
-            "[ji.kinetic_angles(ji.dimer(r, length))[0, 1] for r, length in"
+            "[ji.kinetic_angles(ji.Dimer(r, length).scene())[0, 1] for r, length in"
             " ((1e-9, 1.0), (1.0, 0.0), (5.0, 24.0))]",
             "1.445, 1.536, between", [1.4454684956, 1.5363067308, 1.4242044517],
             "not monotone: least at 5/24", slow=True),

@@ -8,7 +8,7 @@ import jimpact as ji
 
 WIDE, HIGH, MASS, G = 1.0, 0.6, 2.0, 10.0
 INERTIA = MASS * (WIDE**2 + HIGH**2) / 12
-BLOCK = ji.block_system(WIDE, HIGH, MASS, G, corners="base")
+BLOCK = ji.System(ji.Block(WIDE, HIGH, MASS, corners="base"), gravity=G)
 Q, V = np.array([0.2, 0.5, 0.3]), np.array([0.4, -0.2, 1.7])
 
 
@@ -68,7 +68,9 @@ def test_force_of_a_bilateral_constraint():
 
 
 def test_what_is_refused():
-    base = ji.block_system(1.0, 2.0, base=ji.HarmonicBase(0.1, 1.0, direction="vertical"))
+    base = ji.System(
+        ji.Block(1.0, 2.0), gravity=True, base=ji.HarmonicBase(0.1, 1.0, direction="vertical")
+    )
     with pytest.raises(ValueError, match="`system` must not have a moving base"):
         ji.theory.quasi_lagrange(base, [0.0, 1.0, 0.0], [0.0, 0.0, 0.0])
     with pytest.raises(ValueError, match="`velocity`"):

@@ -168,7 +168,7 @@ def test_flat_boxes_in_an_assembly_bounce_as_they_do_alone():
     for width in (0.3, 0.5, 0.74, 0.8, 1.0, 1.2):
         for height in (0.3, 0.73):
             body = ji.PlanarBodies([ji.Block(width, height)])
-            system = ji.System(body, potential=ji.gravity(body))
+            system = ji.System(body, gravity=True)
             start = [0, 1 + height / 2, 0]
             motion = ji.simulate(system, ji.LZB(e, 1.0), start, [0.0, 0, 0], 10.0, samples=3)
             assert status_of(motion) == "ok"
@@ -191,7 +191,7 @@ def test_a_block_on_springs_passes_the_flat_position():
         block = ji.Block(w, h, m)
         law = ji.Compliant(ji.LinearSpring(k), friction=mu)
         return ji.simulate(
-            ji.System(block, potential=ji.gravity(block)), law, q, v, 0.35,
+            ji.System(block, gravity=True), law, q, v, 0.35,
             method="contact_forces", samples=2, max_events=100,
         ).status  # fmt: skip
 
@@ -208,7 +208,7 @@ def test_a_domino_reaches_the_next_one():
     q = np.array([0.0, height / 2, 0.0, width + gap, height / 2, 0.0])
     v = np.array([2 * height, 2 * width, -4.0, 0.0, 0.0, 0.0])
     motion = ji.simulate(
-        ji.System(bodies, potential=ji.gravity(bodies)), ji.Moreau(0.0, friction=0.2), q, v, 0.12,
+        ji.System(bodies, gravity=True), ji.Moreau(0.0, friction=0.2), q, v, 0.12,
         samples=24, max_events=200, max_steps=2000,
     )  # fmt: skip
     assert status_of(motion) == "ok"

@@ -77,7 +77,7 @@ def test_pulses_overturn_the_blocks_that_housner_says():
             amplitude = strength * G * width / height
             base = Pulse(jnp.asarray(amplitude), jnp.asarray(frequency))
             motion = ji.simulate(
-                ji.block_system(width, height, base=base), ji.Moreau(0.0, friction=1.0),
+                ji.System(ji.Block(width, height), gravity=True, base=base), ji.Moreau(0.0, friction=1.0),
                 [0.0, height / 2, 0.0], [0.0] * 3, 6.0,
                 samples=2, method="time_stepping", step=2e-3,
             )  # fmt: skip
@@ -140,7 +140,7 @@ def test_a_superball_leaves_with_its_slip_reversed():
     disc, e_t = ji.Disc(0.5), 0.6
     law = ji.Moreau(0.8, friction=50.0, tangential_restitution=e_t)
     motion = ji.simulate(
-        ji.System(disc, potential=disc.gravity(G)), law, [0.0, 0.5, 0.0], [1.0, -5.0, 3.0], 0.02,
+        ji.System(disc, gravity=G), law, [0.0, 0.5, 0.0], [1.0, -5.0, 3.0], 0.02,
         samples=2, method="time_stepping", step=1e-3,
     )  # fmt: skip
     x, _, spin = motion.velocity[-1]
@@ -152,7 +152,7 @@ def test_a_superball_leaves_with_its_slip_reversed():
 def test_a_spinning_brick_comes_to_rest_on_a_face():
     brick = ji.Box([0.1, 0.06, 0.04], mass=0.5)
     motion = ji.simulate(
-        ji.System(brick, potential=ji.gravity(brick)), ji.Moreau(0.3, friction=0.4),
+        ji.System(brick, gravity=True), ji.Moreau(0.3, friction=0.4),
         brick.at([0.0, 0.0, 0.3], [0.8, 0.6, 0.0, 0.0]), [0.5, 0.2, 0.0, 3.0, 12.0, 5.0], 2.0,
         samples=21, method="time_stepping", step=1e-3,
     )  # fmt: skip
@@ -208,7 +208,10 @@ def test_a_motion_says_how_its_law_fails():
 def test_friction_below_0_is_reported():
     run = jax.jit(
         lambda mu: stepped(
-            ji.block_system(0.2, 0.4), ji.Moreau(0.0, friction=mu), [0.0, 0.2, 0.0], [1.0, 0.0, 0.0]
+            ji.System(ji.Block(0.2, 0.4), gravity=True),
+            ji.Moreau(0.0, friction=mu),
+            [0.0, 0.2, 0.0],
+            [1.0, 0.0, 0.0],
         )
     )
     assert status(run(-0.3)) == "law_failed"
@@ -253,7 +256,7 @@ def test_a_tossed_block_never_gains_energy():
     @jax.vmap
     def toss(q, v, e, mu, e_t):
         return ji.simulate(
-            ji.block_system(0.2, 0.4), ji.Moreau(e, friction=mu, tangential_restitution=e_t),
+            ji.System(ji.Block(0.2, 0.4), gravity=True), ji.Moreau(e, friction=mu, tangential_restitution=e_t),
             q, v, 0.6, samples=601, method="time_stepping", step=1e-3,
         )  # fmt: skip
 
@@ -397,7 +400,13 @@ def test_bodies_that_pass_each_other_in_a_step_are_reported(body, way, speed, ex
 def test_steps_too_many_to_count_are_refused():
     with pytest.raises(ValueError, match="`step` must give at most"):
         ji.simulate(
-            ji.ball_system(), ji.Moreau(0.5), [1.0], [0.0], 1.0, method="time_stepping", step=1e-300
+            ji.System(ji.Column([1.0]), gravity=True),
+            ji.Moreau(0.5),
+            [1.0],
+            [0.0],
+            1.0,
+            method="time_stepping",
+            step=1e-300,
         )
 
 
@@ -406,7 +415,7 @@ def slid_off(**options):
     bodies = ji.PlanarBodies(
         [ji.Block(2.0, 1.0, mass=1e6), ji.Block(0.4, 0.2)], planes=[0.0], pairs=[(1, 0)]
     )
-    system = ji.System(bodies, potential=ji.gravity(bodies))
+    system = ji.System(bodies, gravity=True)
     law, start = ji.Moreau(0.3, friction=0.2), [0.0, 0.5, 0.0, 0.7, 1.1, 0.0]
     return ji.simulate(system, law, start, [0.0, 0.0, 0.0, 1.5, 0.0, 0.0], 2.0, **options)
 

@@ -27,7 +27,7 @@ file = "heights.csv"
 
 @pytest.mark.slow
 def test_a_study_of_a_motion_is_fitted(tmp_path):
-    ball = ji.ball_system()
+    ball = ji.System(ji.Column([1.0]), gravity=True)
     q = np.asarray(ji.simulate(ball, ji.Newton(0.8), [1.0], [0.0], 1.5, samples=16).q)[:, 0]
     lines = [f"{100 * i},{100 * x:.8f}" for i, x in enumerate(q)]
     (tmp_path / "heights.csv").write_text("t[ms],q_1[cm]\n" + "\n".join(lines) + "\n")

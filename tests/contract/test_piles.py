@@ -121,7 +121,7 @@ def test_walls_that_do_not_fit_are_named():
 def test_a_sphere_slides_and_then_rolls():
     """It ends at 5/7 of its speed, whatever the friction, at the time 2 v / (7 mu g)."""
     spheres = ji.Spheres(2.0, [0.1, 0.1], walls=[[0.0, 0.0, 1.0, 0.0]])
-    system = ji.System(spheres, potential=ji.gravity(spheres))
+    system = ji.System(spheres, gravity=True)
     start = spheres.at([[0.0, 0.0, 0.1], [0.0, 5.0, 0.1]])
     v0 = np.zeros(12)
     v0[[0, 7]] = 1.0, 2.0  # along x, and twice as fast along y
@@ -153,7 +153,7 @@ def test_spheres_fall_into_a_box_and_come_to_rest():
         [0, -1.0, 0, -0.08],
     ]
     spheres = ji.Spheres(4e6 * radii**3, radii, walls=walls)
-    system = ji.System(spheres, potential=ji.gravity(spheres))
+    system = ji.System(spheres, gravity=True)
     v0 = np.pad(0.1 * rng.standard_normal((27, 3)), ((0, 0), (0, 3))).reshape(-1)
     motion = ji.simulate(
         system, ji.Moreau(0.3, friction=0.5), spheres.at(0.014 + 0.024 * grid), v0, 1.5,
@@ -253,7 +253,7 @@ def test_a_mixed_pile_comes_to_rest_and_goes_on():
         ji.Polygon([[0, 0], [0.2, 0], [0.1, 0.1]]),
     ]
     pile = ji.PlanarPile(bodies * 2, walls=[[0, 1.0, 0], [1.0, 0, -0.25], [-1.0, 0, -0.25]])
-    system, law = ji.System(pile, potential=ji.gravity(pile, 10.0)), ji.Moreau(0.0, friction=0.5)
+    system, law = ji.System(pile, gravity=10.0), ji.Moreau(0.0, friction=0.5)
     places = [[-0.1, 0.06], [0.13, 0.07], [0.0, 0.2], [-0.1, 0.32], [0.13, 0.3], [0.0, 0.45]]
     options = dict(samples=5, method="time_stepping", step=1e-3)
     motion = ji.simulate(system, law, pile.at(places), np.zeros(18), 1.5, **options)
@@ -340,7 +340,9 @@ def test_a_step_of_a_packing_is_an_impact(struck):
     np.testing.assert_allclose(rough.tangential[falls], [-0.9, 0, 0], atol=1e-5)
     np.testing.assert_allclose(rough.velocity[[18, 20]], [9 - 0.45, 1.5], atol=1e-5)
     with pytest.raises(ValueError, match=r"must be of a body with many contacts .* of Column"):
-        ji.pile_contacts(ji.ball_system(), ji.Moreau(0.5), [0.0], [-1.0], step=1e-3)
+        ji.pile_contacts(
+            ji.System(ji.Column([1.0]), gravity=True), ji.Moreau(0.5), [0.0], [-1.0], step=1e-3
+        )
     with pytest.raises(ValueError, match="must lead to a contact within the step"):
         ji.pile_contacts(system, ji.Moreau(0.5, friction=0.1), 9 * q, 0 * v, step=1e-9)
 

@@ -104,7 +104,7 @@ MOTIONS = {
 def test_motions(method):
     law, options = MOTIONS[method]
     block = ji.Block(0.3, 0.4, 1.3)
-    system = ji.System(block, potential=ji.gravity(block))
+    system = ji.System(block, gravity=True)
 
     def end(e, v):
         motion = ji.simulate(

@@ -157,7 +157,7 @@ def test_a_sphere_falls_over_the_edge_of_a_finite_wall_in_steps():
     bodies = ji.SpatialBodies(
         [ji.Sphere(RADIUS), ji.Sphere(RADIUS)], fixed=[wall], places=[wall.at([0.0, 0.0, 0.5])]
     )
-    system = ji.System(bodies, potential=ji.gravity(bodies, 10.0))
+    system = ji.System(bodies, gravity=10.0)
     q = bodies.at([[0.0, 0.5, 1.3], [0.0, 1.101, 1.3]])
     motion = ji.simulate(
         system, ji.Newton(0.5), q, np.zeros(12), 0.3, samples=4, method="time_stepping", step=1e-3

@@ -129,7 +129,7 @@ class Simulator:
 
 def of_jimpact() -> Simulator:
     """Moreau's law, one e and one mu for all corners, by time stepping."""
-    system = ji.System(BLOCK, potential=ji.gravity(BLOCK, GRAVITY))
+    system = ji.System(BLOCK, gravity=GRAVITY)
 
     def one(x: jax.Array, state: jax.Array, frames: int) -> jax.Array:
         """Poses (frames + 1, 3)."""
