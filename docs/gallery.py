@@ -293,7 +293,7 @@ def force_chains():
     at = np.array([*at, (rows // 2, rows * np.sqrt(0.75))]) + np.array([0, radius])
     at[-1, 0] += (rows % 2) / 2
     radii = np.append(np.where(small, 0.9 * radius, radius), radius)
-    discs = ji.Discs(1.0, radii, walls=[[0.0, 1.0, 0.0]])
+    discs = ji.Bodies([ji.Disc(r) for r in radii])
     q = discs.at(at)
     packing = discs.touching(q)
     velocity = np.zeros(packing.size)

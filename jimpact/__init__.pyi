@@ -2,7 +2,7 @@
 
 from . import data as data, plot as plot, theory as theory
 from .audits import audit as audit, summary as summary
-from .bodies.assemblies import PlanarBodies as PlanarBodies
+from .bodies.assembly import Bodies as Bodies
 from .bodies.base import Body as Body, scene_from_gaps as scene_from_gaps
 from .bodies.blocks import Block as Block
 from .bodies.dimers import (
@@ -12,18 +12,13 @@ from .bodies.dimers import (
 from .bodies.mujoco_scene import from_mujoco as from_mujoco
 from .bodies.particles import Column as Column, Corner as Corner
 from .bodies.pendulums import PendulumCradle as PendulumCradle
-from .bodies.piles import Discs as Discs, Spheres as Spheres
-from .bodies.planar_piles import PlanarPile as PlanarPile
 from .bodies.polygons import Disc as Disc, Polygon as Polygon
 from .bodies.solids import Box as Box, Coin as Coin, Sphere as Sphere
-from .bodies.spatial_bodies import SpatialBodies as SpatialBodies
 from .cli.study_motion import read_study as read_study
 from .contact import (
     Contact as Contact,
     delassus_matrix as delassus_matrix,
     kinetic_angles as kinetic_angles,
-    normalized_delassus as normalized_delassus,
-    normalized_gap_velocity as normalized_gap_velocity,
 )
 from .fits.data import Experiments as Experiments, read_experiments as read_experiments
 from .fits.fitting import (
@@ -76,7 +71,6 @@ from .laws.kinematic import (
 )
 from .laws.lzb import (
     LZB as LZB,
-    precompression_energy as precompression_energy,
 )
 from .laws.materials import hertz_stiffness as hertz_stiffness, sphere_mass as sphere_mass
 from .laws.mujoco_contact import (

@@ -501,6 +501,34 @@ def positives(
     return numbers
 
 
+def as_planes(planes: Any, dimension: int) -> jax.Array:
+    """Planes as rows (k, d + 1): unit normal into the free half space `n . x >= c`, and c [m].
+
+    In the plane also an angle a [rad], or (a, c): n = (-sin a, cos a). None: the ground.
+    """
+    d = dimension
+    if planes is None:
+        return jnp.eye(1, d + 1, d - 1)
+    rows = []
+    for plane in planes:
+        row = as_float_array("planes", plane)
+        if d == 2 and row.shape in ((), (2,)):
+            a, c = (row, jnp.zeros_like(row)) if row.ndim == 0 else row
+            row = jnp.stack([-jnp.sin(a), jnp.cos(a), c])
+        angles = ", or an angle, or an angle and a distance, of each" if d == 2 else " of each"
+        check_shape("planes", row, (d + 1,), f"a normal and a distance{angles}")
+        check_values("planes", row)
+        length, n = lengths(row[None, :d])
+        check_values("planes", length, low=0.0, open_low=True)
+        rows.append(jnp.concatenate([n[0], row[d:]]))
+    return jnp.stack(rows) if rows else jnp.zeros((0, d + 1))
+
+
+def floors_of(planes: Any) -> list[tuple[float, float]]:
+    """(angle, offset) of planes (k, 3), for pictures."""
+    return [(float(np.arctan2(-x, y)), float(c)) for x, y, c in np.asarray(planes)]
+
+
 def planar_directions(mass: jax.Array) -> jax.Array:
     """Of a base that carries planar bodies of diagonal mass (n,) in x and y (n, 2)."""
     return jnp.tile(jnp.eye(3, 2, dtype=mass.dtype), (mass.shape[0] // 3, 1))

@@ -153,9 +153,9 @@ def _experiments(table: Mapping[str, Any], path: Path, place: Scene | Body) -> E
 def body_of(where: str, table: Mapping[str, Any], others: tuple[str, ...] = ()) -> Body:
     """The body that a table of a study describes.
 
-    `kind` is the name of a body's class (`Block`, `Box`, `PlanarBodies`, ..., in any case); the
+    `kind` is the name of a body's class (`Block`, `Box`, `Bodies`, ..., in any case); the
     other keys are the arguments of that class, with their units behind them: `width_m`, `mass_kg`,
-    `inertia_kg_m2`, `angle_rad`. Bodies of `PlanarBodies` and `SpatialBodies` are tables of this
+    `inertia_kg_m2`, `angle_rad`. Bodies of `Bodies` are tables of this
     kind themselves.
     `others` are keys of the table that mean something else.
 

@@ -76,7 +76,7 @@ MOTION_TABLES = {
 }
 # Units of the bodies' arguments, which a study writes behind their names. Words and directions have
 # no unit here, nor have lists of points [m] or of mixed units (`corners` of a Polygon, `planes`,
-# `walls`, `at`), which the classes document.
+# `at`), which the classes document.
 _UNITS = {
     **dict.fromkeys(("mass", "masses", "sphere_mass", "rod_mass"), "kg"),
     **dict.fromkeys(("disk_mass", "ball_masses"), "kg"),

@@ -60,7 +60,7 @@ def motion(
         bodies: the ones to show, counted from 0, of a system whose coordinates are numbered by
             body (x1, y1, ...).
         contacts: the ones whose gaps to show, counted from 0; None: those of `bodies`, if the
-            system says which these are (`PlanarBodies.between`).
+            system says which these are (`between` of `Bodies`).
 
     Returns:
         A matplotlib figure: `.savefig(path)` writes it.

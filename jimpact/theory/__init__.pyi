@@ -25,6 +25,7 @@ from .gaps import crossover as crossover, gap_sensitivity as gap_sensitivity
 from .impulse_ratios import (
     correlation_interval as correlation_interval,
     distributing_rule as distributing_rule,
+    precompression_energy as precompression_energy,
 )
 from .linear_chain import (
     SeparationTimes as SeparationTimes,
@@ -37,6 +38,8 @@ from .quasi_velocities import (
     contact_power as contact_power,
     from_quasi_velocities as from_quasi_velocities,
     kinetic_energy_split as kinetic_energy_split,
+    normalized_delassus as normalized_delassus,
+    normalized_gap_velocity as normalized_gap_velocity,
     quasi_basis as quasi_basis,
     to_quasi_velocities as to_quasi_velocities,
 )

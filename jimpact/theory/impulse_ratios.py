@@ -1,4 +1,4 @@
-"""Ratios of impulses at contacts beside each other: what laws give, what mechanics allows."""
+"""Ratios of impulses at contacts beside each other, and the energy of precompression."""
 
 from typing import Any
 
@@ -76,3 +76,35 @@ def correlation_interval(scene: Scene, restitution: Any) -> tuple[np.ndarray, np
     check_values("restitution", e, low=0.0, high=1.0)
     check_per_contact("restitution", e, scene.contacts)
     return interval(scene, e)
+
+
+def precompression_energy(force: Any, stiffness: Any, exponent: Any = 1.5) -> jax.Array:
+    """Energy stored in contacts that press on each other before an impact: `initial_energy`.
+
+    Equation: `U_0j = F_0j^((eta_j + 1) / eta_j) / ((eta_j + 1) k_j^(1 / eta_j))`, the integral of
+    `F = k x^eta` up to the force F_0.
+
+    Args:
+        force: F_0j >= 0, scalar or (m,) [N].
+        stiffness: k_j > 0, scalar or (m,) [N / m^eta_j].
+        exponent: eta_j >= 1, scalar or (m,).
+
+    Returns:
+        U_0 [J], of the common shape, for `LZB` and `Compliant`.
+
+    Raises:
+        ValueError: force < 0, stiffness <= 0, exponent < 1.
+
+    Source: Brogliato (2016), 6.3.1, with the exponent 1 / eta of `docs/equations.md`.
+
+    >>> import jimpact as ji
+    >>> float(ji.theory.precompression_energy(2.0, stiffness=8.0, exponent=1.0))  # F^2 / (2 k)
+    0.25
+    """
+    force = as_float_array("force", force)
+    stiffness = as_float_array("stiffness", stiffness)
+    eta = as_float_array("exponent", exponent)
+    check_values("force", force, low=0.0)
+    check_values("stiffness", stiffness, low=0.0, open_low=True)
+    check_values("exponent", eta, low=1.0)
+    return force ** ((eta + 1) / eta) / ((eta + 1) * stiffness ** (1 / eta))

@@ -307,7 +307,7 @@ SECTIONS = {
         Row("(6.68)", "distributing rule, E2/E1 = .3, k2/k1 = 2",
             "ji.theory.distributing_rule([1.0, 0.3], [1.0, 2.0], 1.5)[1, 0]", "(6.68)", 0.6407442995),
         Row("6.3.1", "E0 of F0 = .328634, k = 2, eta = 1.5",
-            "ji.precompression_energy(0.328633534503099668, 2.0, 1.5)", "exponent 1/(eta + 1) of k",
+            "ji.theory.precompression_energy(0.328633534503099668, 2.0, 1.5)", "exponent 1/(eta + 1) of k",
             0.0394360241403719602, "exponent 1/eta"),
         Figure("6.6"),
         Row("(6.74)", "gaps of the block, q = (0, 1.5, 0)",

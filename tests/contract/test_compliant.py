@@ -320,10 +320,10 @@ def test_distributing_rule():
 
 def test_precompression_energy():
     """`k x^(eta + 1) / (eta + 1)` at the x of the force; the chapter's number."""
-    energy = ji.precompression_energy(0.328633534503099668, 2.0, 1.5)
+    energy = ji.theory.precompression_energy(0.328633534503099668, 2.0, 1.5)
     np.testing.assert_allclose(energy, 0.0394360241403719602, rtol=1e-14)
     x, k, eta = np.array([0.1, 2.0]), np.array([3.0, 0.7]), np.array([1.0, 3.0])
-    energy = ji.precompression_energy(k * x**eta, k, eta)
+    energy = ji.theory.precompression_energy(k * x**eta, k, eta)
     np.testing.assert_allclose(energy, k * x ** (eta + 1) / (eta + 1), rtol=1e-14)
 
 

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import piles
 import pytest
 from motion_cases import G, bounce_times, dropped, height, stack, status
 from programs import OPTIMIZED, both_ways
@@ -501,7 +502,7 @@ def discs_in_a_box(n, columns, duration, step, samples):
         [0.013 - half + 0.024 * (place % columns), 0.02 + 0.024 * (place // columns)]
     )
     walls = [[0.0, 1.0, 0.0], [1.0, 0.0, -half], [-1.0, 0.0, -half]]
-    pile = ji.Discs(np.pi * radii**2 * 1000, radii, walls=walls)
+    pile = piles.discs(np.pi * radii**2 * 1000, radii, planes=walls)
     system = ji.System(pile, gravity=True)
     v0 = np.pad(0.1 * rng.standard_normal((n, 2)), ((0, 0), (0, 1))).reshape(-1)
     law = ji.Moreau(0.3, friction=0.5)
@@ -532,7 +533,7 @@ def test_discs_fall_into_a_box_and_come_to_rest(n, columns, duration):
 
 def test_discs_are_a_body_like_others():
     """Gaps, slips and their gradients against those of the closed contacts in time stepping."""
-    pile = ji.Discs([1.0, 2.0, 3.0], [0.1, 0.2, 0.1], walls=[[0.0, 2.0, 0.0], [3.0, 4.0, -1.0]])
+    pile = piles.discs([1.0, 2.0, 3.0], [0.1, 0.2, 0.1], planes=[[0.0, 2.0, 0.0], [3.0, 4.0, -1.0]])
     q = pile.at([[0.0, 0.1], [0.3, 0.1], [-0.2, 0.1]]) + jnp.array([0, 0, 0.3] * 3)
     near, gradients, slips = jax.jit(
         lambda q: (
@@ -578,7 +579,7 @@ def test_time_stepping_of_many_beads_comes_to_rest(law):
 
 @pytest.mark.slow
 def test_time_stepping_reports_what_it_cannot_resolve():
-    pile = ji.Discs(1.0, [0.1, 0.1], walls=[[0.0, 1.0, 0.0]], room=1)
+    pile = piles.discs(1.0, [0.1, 0.1], planes=[[0.0, 1.0, 0.0]], room=1)
     system, q = ji.System(pile, gravity=True), pile.at([[0.0, 0.1], [0.3, 0.1]])
     crowded = ji.simulate(
         system, ji.Moreau(0.0), q, np.zeros(6), 0.1, samples=2, method="time_stepping", step=0.05

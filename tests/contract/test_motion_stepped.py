@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import piles
 import pytest
 from programs import CODE
 from scipy.integrate import solve_ivp
@@ -277,7 +278,7 @@ def test_a_tossed_block_never_gains_energy():
     ],
 )
 def test_coefficients_that_do_not_fit_are_named(law, named):
-    pile = ji.Discs(1.0, [0.1, 0.1], walls=[[0.0, 1.0, 0.0]])
+    pile = piles.discs(1.0, [0.1, 0.1], planes=[[0.0, 1.0, 0.0]])
     for body, q0 in ((pile, pile.at([[0.0, 0.1], [0.5, 0.1]])), (ji.Block(0.2, 0.4), [0, 0.2, 0])):
         with pytest.raises(ValueError, match=named):
             stepped(ji.System(body), law, q0, np.zeros(len(q0)))
@@ -333,7 +334,7 @@ def test_functions_of_a_system_compute_in_the_precision_of_the_start(given, opti
 
 
 def test_a_disc_without_walls_is_refused():
-    disc = ji.Discs(1.0, [0.1])
+    disc = piles.discs(1.0, [0.1])
     with pytest.raises(ValueError, match="each of m >= 1 contacts"):
         stepped(ji.System(disc), ji.Moreau(0.5), disc.at([[0.0, 1.0]]), np.zeros(3))
 
@@ -366,7 +367,7 @@ LINE = (1.0, -1.0)
 PLANE = (1.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # of two; the third flies away much faster
 
 
-DISCS = ji.PlanarBodies([ji.Disc(0.1)] * 3, planes=[], pairs=[(0, 1), (2, 0)])
+DISCS = ji.Bodies([ji.Disc(0.1)] * 3, planes=[], pairs=[(0, 1), (2, 0)])
 
 
 @pytest.mark.parametrize(
@@ -412,7 +413,7 @@ def test_steps_too_many_to_count_are_refused():
 
 def slid_off(**options):
     """A block slides over the right end of a heavy table, 2 m wide, and falls to the ground."""
-    bodies = ji.PlanarBodies(
+    bodies = ji.Bodies(
         [ji.Block(2.0, 1.0, mass=1e6), ji.Block(0.4, 0.2)], planes=[0.0], pairs=[(1, 0)]
     )
     system = ji.System(bodies, gravity=True)

@@ -173,7 +173,7 @@ def test_an_overturned_block_lies_on_its_side():
 @pytest.mark.release
 def test_a_body_on_a_tilted_plane_slides():
     """By its tangents alone, no displacements: s'' = g (sin a - mu cos a)."""
-    slope = ji.PlanarBodies([ji.Block(0.2, 0.1)], planes=[0.3])
+    slope = ji.Bodies([ji.Block(0.2, 0.1)], planes=[0.3])
     system = ji.System(slope, gravity=True)
     rest = [0.0] * 3
     motion = ji.simulate(

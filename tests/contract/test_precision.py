@@ -128,7 +128,7 @@ def test_what_surrounds_an_impact():
             ji.momentum(BODY, v),
             ji.velocity_change(BODY, out.impulse),
             ji.delassus_matrix(BODY),
-            ji.normalized_gap_velocity(BODY, v),
+            ji.theory.normalized_gap_velocity(BODY, v),
             ji.history(ji.LZB(0.6, 1.0), BODY, v).force,
             ji.theory.to_quasi_velocities(BODY, v),
         )

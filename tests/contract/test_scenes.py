@@ -44,9 +44,11 @@ def test_chain_is_the_dense_scene(wall):
 
 def test_normalized_quantities_and_kinetic_angles():
     chain = ji.chain([1.0, 2.0, 3.0])
-    assert dense(ji.normalized_delassus(chain))[0, 1] == pytest.approx(-1 / 5**0.5, abs=1e-15)
+    assert dense(ji.theory.normalized_delassus(chain))[0, 1] == pytest.approx(
+        -1 / 5**0.5, abs=1e-15
+    )
     assert float(ji.kinetic_angles(chain)[0, 1]) == pytest.approx(1.1071487177940905, abs=1e-14)
-    qn = ji.normalized_gap_velocity(ji.chain([2.0] * 4), [0.3, -0.2, 0.5, 0.7])
+    qn = ji.theory.normalized_gap_velocity(ji.chain([2.0] * 4), [0.3, -0.2, 0.5, 0.7])
     np.testing.assert_allclose(qn, [-0.5, 0.7, 0.2], atol=1e-15)
 
 
@@ -59,7 +61,7 @@ def test_constraints_reduce_and_distort():
     free = every.T @ np.linalg.solve(mass, every)
     free = free / np.sqrt(np.outer(np.diag(free), np.diag(free)))
     bb, bu, uu = free[:2, :2], free[:2, 2:], free[2:, 2:]
-    g = ji.normalized_delassus(ji.Scene(mass, normals, constraints=h))
+    g = ji.theory.normalized_delassus(ji.Scene(mass, normals, constraints=h))
     np.testing.assert_allclose(g, uu - bu.T @ np.linalg.solve(bb, bu), atol=1e-12)
     assert (np.diag(g) < 1).all()
 
@@ -111,7 +113,7 @@ def around_a_disk(phi, masses, m0, radius=1.0, radii=(1.0,) * 3, gaps=(0.0,) * 3
     """Balls around a disc, contact i with ball i."""
     balls = [ji.Disc(r, m, 0.4 * m * r**2) for r, m in zip(radii, masses)]
     pairs = [(i + 1, 0) for i in range(len(phi))]
-    bodies = ji.PlanarBodies([ji.Disc(radius, m0), *balls], planes=[], pairs=pairs)
+    bodies = ji.Bodies([ji.Disc(radius, m0), *balls], planes=[], pairs=pairs)
     far = [radius + r + gap for r, gap in zip(radii, gaps)]
     q = [[x * np.cos(a), x * np.sin(a), 0.0] for x, a in zip(far, phi)]
     return bodies.scene(np.ravel([[0.0] * 3, *q]))
@@ -139,7 +141,7 @@ def test_kinetic_angles_of_bodies():
         )
         dimer = jax.vmap(lambda r: ji.kinetic_angles(ji.Dimer(2 * r, 2.0).scene())[0, 1])
         together = ji.kinetic_angles(ji.Dimer(2.0, 0.0).scene())[0, 1]
-        cosine = jax.grad(lambda r: ji.normalized_delassus(ji.Dimer(r, 1.0).scene())[0, 1])
+        cosine = jax.grad(lambda r: ji.theory.normalized_delassus(ji.Dimer(r, 1.0).scene())[0, 1])
         return (
             block(aspects),
             dimer(ratios),
@@ -160,7 +162,7 @@ def test_kinetic_angles_of_bodies():
     disk = built(around_a_disk, phi, masses, m0, 0.3, [0.1, 0.2, 0.1])
     g = np.cos(phi[:, None] - phi) / np.sqrt((1 + m0 / masses)[:, None] * (1 + m0 / masses))
     away = ~np.eye(3, dtype=bool)
-    found = dense(jax.jit(ji.normalized_delassus)(disk))
+    found = dense(jax.jit(ji.theory.normalized_delassus)(disk))
     np.testing.assert_allclose(found[away], g[away], atol=1e-14)
 
 

@@ -226,7 +226,7 @@ def test_picture_of_a_motion(tmp_path):
 
 def many_discs(count=8):
     """As if simulated: disc i rises by i, disc 1 only by rounding; contact i strikes i times."""
-    system = ji.System(ji.PlanarBodies([ji.Disc(0.1)] * count, planes=[0.0], pairs=[]))
+    system = ji.System(ji.Bodies([ji.Disc(0.1)] * count, planes=[0.0], pairs=[]))
     time, number = np.linspace(0.0, 1.0, 5), np.arange(count)
     q = np.zeros((5, count, 3))
     q[:, :, 1] = 1.0 + number * time[:, None]
