@@ -219,7 +219,7 @@ def gaps_decide():
 @picture
 def motion_cradle():
     """Newton's cradle with three balls: angles, velocities, gaps and the energy ledger."""
-    system = ji.cradle_system([0.1, 0.1, 0.1], length=0.15, diameter=0.025)
+    system = ji.System(ji.PendulumCradle([0.1, 0.1, 0.1], 0.15, 0.0125), gravity=True)
     motion = ji.simulate(system, ji.LZB(0.95), [-0.5, 0, 0], [0.0, 0.0, 0.0], 8.0)
     return ji.plot.motion(motion, system=system)
 
@@ -293,7 +293,7 @@ def force_chains():
     at = np.array([*at, (rows // 2, rows * np.sqrt(0.75))]) + np.array([0, radius])
     at[-1, 0] += (rows % 2) / 2
     radii = np.append(np.where(small, 0.9 * radius, radius), radius)
-    discs = ji.Discs(1.0, radii, walls=[[0.0, 1.0, 0.0]])
+    discs = ji.Bodies([ji.Disc(r) for r in radii])
     q = discs.at(at)
     packing = discs.touching(q)
     velocity = np.zeros(packing.size)

@@ -13,6 +13,7 @@ import shutil
 import tokenize
 from operator import attrgetter
 from pathlib import Path
+from typing import get_args, get_origin
 
 import jimpact as ji
 
@@ -23,16 +24,18 @@ GENERATED = DOCS / "generated"
 # ------------------------------------------------------------------------------------ the API
 
 API = {  # a page, and the modules whose public names it holds: the longest match decides
-    "Impacts": ("impacts", "audits", "laws.histories", "methods.comparison", "status"),
-    "Scenes and bodies": ("scene", "bodies", "contact"),
+    "Impacts": ("impacts", "audits", "laws.histories", "status"),
+    "Scenes": ("scene", "bodies.base.scene_from_gaps", "bodies.mujoco_scene", "contact"),
+    "Bodies": ("bodies",),
     "Laws": ("law", "registry", "laws"),
     "Contact forces": ("laws.forces", "laws.calibration", "laws.materials"),
-    "Shots and fits": ("fits", "measured", "cli.study", "files"),
+    "Shots and fits": ("fits", "cli", "saved"),
     "Monte Carlo": ("montecarlo",),
-    "Motions": ("motion", "cli.study_motion"),
+    "Motions": ("motion",),
     "Methods": ("methods",),
     "Pictures": ("plot",),
     "Theory": ("theory",),
+    "Measured data": ("data",),
 }
 
 DATA = {
@@ -44,21 +47,22 @@ DATA = {
 def public_names() -> dict[str, list[str]]:
     """Public names by page, from the stubs that list them."""
     pages: dict[str, list[str]] = {title: [] for title in API}
-    for package, prefix in (("", ""), ("plot", "plot."), ("theory", "theory.")):
+    for package, prefix in (("", ""), ("plot", "plot."), ("theory", "theory."), ("data", "data.")):
         stub = ROOT / "jimpact" / package / "__init__.pyi"
         for line in ast.parse(stub.read_text(encoding="utf-8")).body:
             if not isinstance(line, ast.ImportFrom) or line.module is None:
                 continue
-            module = package or line.module
-            matches = [
-                (len(start), title)
-                for title, starts in API.items()
-                for start in starts
-                if module == start or module.startswith((start + ".", start + "_"))
-            ]
-            if not matches:
-                raise ValueError(f"API must have a page for {module}: see docs/pages.py")
-            pages[max(matches)[1]] += [prefix + name.name for name in line.names]
+            for name in line.names:
+                place = f"{package or line.module}.{name.name}"
+                matches = [
+                    (len(start), title)
+                    for title, starts in API.items()
+                    for start in starts
+                    if place.startswith(start + ".") or place == start
+                ]
+                if not matches:
+                    raise ValueError(f"API must have a page for {place}: see docs/pages.py")
+                pages[max(matches)[1]].append(prefix + name.name)
     return pages
 
 
@@ -84,18 +88,44 @@ def in_table(text: str) -> str:
     return text.replace("|", r"\|")
 
 
+def names_page() -> str:
+    """`docs/names.md`: every public name in one line, by task."""
+    top = (
+        "Every public name, by task, as `import jimpact as ji` shows it. Classes of results are "
+        "described on the pages of the functions that return them."
+    )
+    text = ["<!-- written by `python docs/pages.py` -->", "", "# Names", "", top, ""]
+    for title, names in public_names().items():
+        text += [f"## {title}", "", "| name | |", "|---|---|"]
+        for name in sorted(names, key=str.lower):
+            text.append(f"| `ji.{name}` | {in_table(first_line(name))} |")
+        text.append("")
+    return "\n".join(text)
+
+
+def results_of(names: list[str]) -> dict[str, type]:
+    """Classes without a public name that these functions return, by module and name."""
+    public = {attrgetter(name)(ji) for names in public_names().values() for name in names
+              if name not in DATA}  # fmt: skip
+    found = {}
+    for name in names:
+        value = DATA.get(name) or attrgetter(name)(ji)
+        returns = [inspect.signature(value).return_annotation] if inspect.isfunction(value) else []
+        for kind in (part for each in returns for part in (get_args(each) or (each,))):
+            kind = get_origin(kind) or kind
+            ours = inspect.isclass(kind) and kind.__module__.startswith("jimpact.")
+            if ours and kind not in public:
+                found[f"{kind.__module__}.{kind.__name__}"] = kind
+    return found
+
+
 def api_pages() -> dict[str, str]:
-    """A page for each group of public names, and an index with one line for each name."""
+    """A page for each group of public names, and their list."""
     laws = law_names()
-    top = "Public names: `ji.` and, for pictures and theory, `ji.plot.` and `ji.theory.`."
-    index = ["# API", "", top, ""]
-    pages = {}
+    index = ["# API", "", "[Names](../../names.md) lists all of them.", ""]
+    pages, described = {}, set()
     for title, names in public_names().items():
         text = [f"# {title}", ""]
-        index += [f"## [{title}]({slug(title)}.md)", "", "| name | |", "|---|---|"]
-        for name in sorted(names, key=str.lower):
-            index.append(f"| `ji.{name}` | {in_table(first_line(name))} |")
-        index.append("")
         for name in names:
             if name in laws:
                 text += [f"- [`ji.{name}`](../laws/{laws[name]}.md): its own page", ""]
@@ -109,6 +139,10 @@ def api_pages() -> dict[str, str]:
             if kind == "class":
                 text.append("   :members:")
             text += ["```", ""]
+        results = sorted(results_of(names).keys() - described)
+        described.update(results)
+        for place in results:
+            text += ["```{eval-rst}", f".. autoclass:: {place}", "   :members:", "```", ""]
         if title == "Impacts":
             text += status_table()
         pages[f"api/{slug(title)}.md"] = "\n".join(text)
@@ -274,9 +308,10 @@ def constants_page() -> dict[str, str]:
 ROOMS = (  # from above: (name, task, modules); a room imports from rows below its own
     (("cli", "commands", ("cli",)),),
     (("plot", "pictures", ("plot",)),),
-    (("methods", "comparison, charts", ("methods",)), ("motion", "whole motions", ("motion",)),
-     ("theory", "outcomes, bounds", ("theory",))),
-    (("fits", "shots, fits, verdicts", ("fits", "measured")),),
+    (("methods", "comparison, charts", ("methods",)), ("saved", "saved results", ("saved",))),
+    (("theory", "outcomes, bounds", ("theory",)),),
+    (("motion", "whole motions", ("motion",)), ("data", "measured impacts", ("data",))),
+    (("fits", "shots, fits, verdicts", ("fits",)),),
     (("montecarlo", "random gaps", ("montecarlo",)),),
     (("laws", "one file for each law", ("laws",)), ("bodies", "gaps, tangents, mass", ("bodies",)),
      ("files", "studies, tables", ("files",))),
@@ -375,3 +410,7 @@ def write() -> None:
             path.write_text(text, encoding="utf-8")
     for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
         shutil.copy2(path, GENERATED / "notebooks")
+
+
+if __name__ == "__main__":
+    (DOCS / "names.md").write_text(names_page(), encoding="utf-8")

@@ -359,7 +359,7 @@ def normalized_delassus(scene: Scene) -> Symmetric:
         G (m, m), or `Tridiagonal` for a chain.
 
     >>> import jimpact as ji
-    >>> ji.normalized_delassus(ji.chain([1.0, 1.0, 1.0])).off_diagonal.round(3).tolist()
+    >>> ji.theory.normalized_delassus(ji.chain([1.0, 1.0, 1.0])).off_diagonal.round(3).tolist()
     [-0.5]
     """
     return scaled(delassus_matrix(scene), 1 / kinetic_norm(scene))
@@ -382,7 +382,7 @@ def normalized_gap_velocity(scene: Scene, velocity: Any) -> jax.Array:
     Source: Brogliato (2016), (6.23).
 
     >>> import jimpact as ji
-    >>> ji.normalized_gap_velocity(ji.chain([0.5, 0.5]), [1.0, 0.0]).tolist()
+    >>> ji.theory.normalized_gap_velocity(ji.chain([0.5, 0.5]), [1.0, 0.0]).tolist()
     [-0.5]
     """
     return gap_velocity(scene, velocity) / kinetic_norm(scene)

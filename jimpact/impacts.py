@@ -2,7 +2,7 @@
 
 import dataclasses
 import warnings
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import equinox as eqx
 import jax
@@ -392,13 +392,24 @@ def _signs(
     return jnp.where(pull, CODE["negative_impulse"], code)
 
 
-def raise_on_failure(out: Impact) -> Impact:
-    """Raise a RuntimeError naming every failed impact of `out` (batched or not); else return it.
+class _Outcome(Protocol):
+    """What has a status: an `Impact` or a `Motion`, one or a batch."""
+
+    @property
+    def status(self) -> Any:
+        """Codes () or of a batch."""
+
+
+OutcomeT = TypeVar("OutcomeT", bound=_Outcome)
+
+
+def raise_on_failure(out: OutcomeT) -> OutcomeT:
+    """Raise a RuntimeError naming every failed impact or motion (batched or not); else return it.
 
     Codes that only inform (`plastic_limit`, `ill_conditioned`, `order_dependent`, ..) pass.
 
     Args:
-        out: what `impact` returned, one or a batch.
+        out: what `impact` or `simulate` returned, one or a batch.
 
     Returns:
         `out` itself.
@@ -414,5 +425,6 @@ def raise_on_failure(out: Impact) -> Impact:
     RuntimeError: Failed impacts among 1:
       negative_impulse: a contact would have to pull (p < 0) (1)
     """
-    raise_for(out.status, STATUS, "impacts", lambda row, at: "")
+    explain = getattr(out, "explain_failure", lambda row, lanes: "")
+    raise_for(out.status, STATUS, f"{type(out).__name__.lower()}s", explain)
     return out

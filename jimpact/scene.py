@@ -241,26 +241,6 @@ def chain(masses: Any, wall: bool | str = False, gaps: Any = None) -> Scene:
     return chain_scene(mass, (left, right), gaps)
 
 
-def column(masses: Any, gaps: Any = None) -> Scene:
-    """A column of bodies above a floor: `chain(masses, wall='right')`, +x down, body 1 on top.
-
-    Args:
-        masses: (n,) > 0 [kg], from the top.
-        gaps: (n,) >= 0 [m], that of the floor last; None: all closed.
-
-    Returns:
-        `Scene` of n coordinates and n contacts.
-
-    Raises:
-        ValueError: as of `chain`.
-
-    >>> import jimpact as ji
-    >>> ji.column([1.0, 1.0]).contacts
-    2
-    """
-    return chain(masses, wall="right", gaps=gaps)
-
-
 def with_gaps(scene: Scene, gaps: jax.Array) -> Scene:
     """The scene with these gaps (m,)."""
     return eqx.tree_at(lambda tree: tree.gaps, scene, gaps, is_leaf=lambda x: x is None)

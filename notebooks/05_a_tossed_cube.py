@@ -64,7 +64,7 @@ figure
 # from each other. They have equal vertical velocities.
 
 # %%
-shots = ji.cube_impacts()
+shots = ji.data.cube_impacts()
 vertical = np.stack([shots.pre[:, 2], shots.post[:, 2]], axis=1)
 close = np.abs(vertical[:, None] - vertical).max(axis=2) < 2e-4
 copies = np.triu(close, 1).any(axis=0)
@@ -120,7 +120,7 @@ def predicted(laws, data, group):
 
 laws = {name: [f.law for f in found] for name, found in fits.items()}
 errors = {name: predicted(own, one, groups[1]) for name, own in laws.items()}
-apart = np.isin(one.shots, ji.cube_impacts(1, near=0.01).shots)  # the next corner far away
+apart = np.isin(one.shots, ji.data.cube_impacts(1, near=0.01).shots)  # the next corner far away
 for name, off in errors.items():
     alone = np.nanmedian(off[:, apart])
     print(f"{name}: median error {np.nanmedian(off):.1%}; the next corner 1 cm away: {alone:.1%}")

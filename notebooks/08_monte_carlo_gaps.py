@@ -54,7 +54,7 @@ ji.plot.system(ji.chain([small, large, small], gaps=[1e-5, 1e-5]), v, "Gaps not 
 # %%
 delta = float(scale.delta[0])
 offset = jnp.linspace(-4.0, 4.0, 161)
-curve = ji.crossover(balls, law, v, offset)
+curve = ji.theory.crossover(balls, law, v, offset)
 velocities = np.asarray(curve.velocity)
 figure = Figure(figsize=(7, 4), layout="constrained")
 axes = figure.subplots()

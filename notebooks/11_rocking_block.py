@@ -116,7 +116,7 @@ for i in range(0, 480, 80):
     print(f"{a:5.2f} {float(ji.theory.housner_restitution(a)):8.4f}     {ratios.round(4)}")
 
 before = [1.5, -0.5, -1.0]  # a = 3: rotating about A, corner B comes down with 1
-block = ji.rocking_block(width=1.0, height=3.0)
+block = ji.Block(1.0, 3.0, corners="base").scene()
 out = ji.impact(
     ji.RestitutionMatrix(ji.theory.rocking_matrix(ji.theory.housner_restitution(3.0))),
     block,
@@ -148,7 +148,7 @@ for row in ji.theory.rocking_ratios():
 # angular momentum about B while B does not slip (except for gravity in the meantime).
 
 # %%
-system, theta = ji.block_system(0.2, 0.6), 0.15
+system, theta = ji.System(ji.Block(0.2, 0.6), gravity=True), 0.15
 start = [0.0, 0.1 * np.sin(theta) + 0.3 * np.cos(theta), theta]
 law = {e_n: ji.LZB(e_n, friction=0.8) for e_n in (0.0, 0.1)}
 motions = {

@@ -32,7 +32,7 @@ import numpy as np
 
 import jimpact as ji
 
-cradle = ji.cradle_system([0.1, 0.1, 0.1], length=0.15, diameter=0.025)
+cradle = ji.System(ji.PendulumCradle([0.1, 0.1, 0.1], 0.15, 0.0125), gravity=True)
 ji.plot.system(cradle, [-0.3, 0.0, 0.0], "One ball is lifted by 0.3 rad")
 
 # %% [markdown]

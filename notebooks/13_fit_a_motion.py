@@ -30,7 +30,7 @@ import numpy as np
 
 import jimpact as ji
 
-ball = ji.ball_system()
+ball = ji.System(ji.Column([1.0]), gravity=True)
 ji.plot.system(ball, [1.0], "A ball is dropped from 1 m")
 
 # %% [markdown]

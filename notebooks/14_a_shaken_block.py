@@ -56,7 +56,7 @@ def rock(tilt, acceleration):
     base = ji.HarmonicBase(amplitude, 2.0, jnp.pi / 2, "horizontal")
     height = 0.1 * jnp.sin(tilt) + 0.3 * jnp.cos(tilt)
     law = ji.RestitutionMatrix(ji.theory.rocking_matrix(e))
-    block = ji.block_system(0.2, 0.6, base=base, corners="base")
+    block = ji.System(ji.Block(0.2, 0.6, corners="base"), gravity=True, base=base)
     start = jnp.stack([amplitude, height, tilt])
     return ji.simulate(block, law, start, jnp.zeros(3), 3.0, friction=5.0)
 

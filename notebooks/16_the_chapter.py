@@ -63,7 +63,8 @@ laws = {
 }
 result = ji.compare(three, hit, laws)
 for name, entry in result.entries.items():
-    kept, spread = entry.energy_ratio, float(ji.energy_dispersion(three, entry.outcome.velocity))
+    kept = entry.energy_ratio
+    spread = float(ji.theory.energy_dispersion(three, entry.outcome.velocity))
     print(f"{name:15s} K_ER {kept:.4f}  C_KE {spread:.4f}")
 ji.plot.energy_plane(result, "Three equal balls, e = 0.5")
 

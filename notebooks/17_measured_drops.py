@@ -35,8 +35,8 @@ from matplotlib.figure import Figure
 import jimpact as ji
 
 began = time.perf_counter()
-ellipse, square = ji.ellipse_impacts(), ji.square_impacts()
-drops, seconds, poses = ji.square_drops()
+ellipse, square = ji.data.ellipse_impacts(), ji.data.square_impacts()
+drops, seconds, poses = ji.data.square_drops()
 block = ji.Block(0.06, 0.06)
 figure = Figure(figsize=(6, 2.2), layout="constrained")
 axes = figure.subplots()
@@ -127,7 +127,7 @@ print("e of each impact, quartiles:", np.quantile(-gap_after / gap, [0.25, 0.5, 
 # time stepping, all at once. Where is it, and on which side does it come to rest?
 
 # %%
-system = ji.System(block, potential=ji.gravity(block, 9.81))
+system = ji.System(block, gravity=9.81)
 heights = np.asarray(jax.vmap(jax.vmap(block.gap_function))(poses)).min(axis=2)
 flies = heights > 2e-3
 FRAMES, REST = 9, 200

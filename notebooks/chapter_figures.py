@@ -456,13 +456,13 @@ def dispersion() -> Figure:
     found = ji.validity_map(balls, before)
     figure = new_figure(4.6)
     axes = figure.subplots()
-    spread = jax.vmap(jax.vmap(lambda v: ji.energy_dispersion(balls, v)))(
+    spread = jax.vmap(jax.vmap(lambda v: ji.theory.energy_dispersion(balls, v)))(
         jnp.asarray(found.velocity)
     )
     for i, eta in enumerate(found.exponents):
         axes.plot(found.ratios, spread[i], color=COLOURS[i], lw=2, label=rf"LZB, $\eta$ = {eta:g}")
     for name, style in (("binary", "--"), ("moreau", ":")):
-        level = float(ji.energy_dispersion(balls, found.laws[name]))
+        level = float(ji.theory.energy_dispersion(balls, found.laws[name]))
         axes.axhline(level, color="black", ls=style, label=name)
     axes.set_ylim(0, 1.5)
     axes.set_xscale("log")

@@ -4,10 +4,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import jimpact as ji
-from jimpact import Fit
+from jimpact.fits.report import Fit
 from jimpact.fits.uncertainty import FitMinimum
 from jimpact.laws.histories import History
-from jimpact.motion.record import KIND_CODE, no_events, with_row
+from jimpact.motion.record import KIND_CODE, Motion, no_events, with_row
 
 
 def canned(shots, **change):
@@ -64,7 +64,7 @@ def start(value, count):
 def rocked(base=None):
     """A dimer and its motion as if simulated: contact 1 strikes at 0.25 s, between two samples."""
     body = ji.Dimer(radius=0.1, length=1.0)
-    system = ji.System(body, potential=ji.gravity(body), base=base)
+    system = ji.System(body, gravity=True, base=base)
     time, zero = np.linspace(0.0, 0.5, 6), np.zeros(6)
     q = np.stack([zero, 0.2 + 0.01 * time, 0.3 - time], axis=1)
     before, after = np.array([0.0, -1.0, -2.0]), np.array([0.0, 1.0, 3.0])
@@ -80,7 +80,7 @@ def rocked(base=None):
     events = with_row(no_events(4, jnp.asarray(q[0]), jnp.asarray(before), 2), jnp.array(True), row)
     work = np.zeros((6, 2, 2))
     work[3:, 0, 0] = -0.5
-    record = ji.Motion(
+    record = Motion(
         *(time, q, velocity, 1 + zero, 2 - 0.5 * (time > 0.25)),
         *(zero, zero, work, np.full((6, 2), 0.1), events, jnp.int32(9), jnp.int32(0)),
     )

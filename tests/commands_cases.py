@@ -58,20 +58,12 @@ BODIES = {
     "Polygon": "corners = [[0, 0], [1, 0], [0, 1]]\nmass_kg = 2",
     "Disc": "radius_m = 0.1\ninertia_kg_m2 = 0.01",
     "Dimer": "radius_m = 0.1\nlength_m = 1\nrod_mass_kg = 0",
-    "PlanarBodies": "planes = [0.1]\n[[system.bodies]]\nkind = 'disc'\nradius_m = 0.1",
+    "Bodies": "planes = [0.1]\n[[system.bodies]]\nkind = 'disc'\nradius_m = 0.1",
     "Box": "sizes_m = [0.2, 0.1, 0.3]\nrounding_m = 0.01",
     "Sphere": "radius_m = 0.1\nnormal = [0.1, 0, 1]",
     "Coin": "radius_m = 0.1\nthickness_m = 0.01\ncorners = 8",
-    "SpatialBodies": (
-        "places = [[0, 0, 0, 1, 0, 0, 0]]\n[[system.bodies]]\nkind = 'sphere'\nradius_m = 0.1\n"
-        "[[system.fixed]]\nkind = 'box'\nsizes_m = [0.1, 1, 1]"
-    ),
     "SpatialDimer": "radius_m = 0.1\nlength_m = 1",
     "Column": "masses_kg = [1, 2]\nradii_m = 0.1",
     "Corner": "angle_rad = 1.0",
     "PendulumCradle": "masses_kg = [1, 1]\nlength_m = 0.3\nradius_m = 0.01\ngaps_m = 0.01",
-    "Discs": "masses_kg = 1\nradii_m = [0.1, 0.1]\nwalls = [[0, 1, 0]]",
-    "PlanarPile": "walls = [[0, 1, 0]]\n[[system.bodies]]\nkind = 'disc'\nradius_m = 0.1",
-    "Spheres": "masses_kg = 1\nradii_m = [0.1, 0.1]\nwalls = [[0, 0, 1, 0]]",
-    "DiskBalls": "disk_radius_m = 1\nball_radius_m = 0.1\ndisk_mass_kg = 1\nball_masses_kg = [1]",
 }

@@ -31,8 +31,10 @@ for name, (law, after) in LAWS.items():
 data = ji.Experiments(pre=[[1.0, 0.0], [2.0, 0.0]], post=[[0.3, 0.7], [0.6, 1.4]])
 found = ji.fit(ji.Newton(0.9), ji.chain([1.0, 1.0]), data)
 np.testing.assert_allclose(found.value, [0.4], atol=ABOUT)
-motion = ji.simulate(ji.ball_system(), ji.Newton(0.8), [1.0], [0.0], 5.0, samples=21)
-ji.raise_on_failed_motion(motion)
+motion = ji.simulate(
+    ji.System(ji.Column([1.0]), gravity=True), ji.Newton(0.8), [1.0], [0.0], 5.0, samples=21
+)
+ji.raise_on_failure(motion)
 assert len(motion.event_times("accumulation")) == 1
 assert motion.q[-1] == motion.velocity[-1] == 0
 np.testing.assert_allclose(motion.events.time[0], np.sqrt(2 / 9.80665), atol=ABOUT)

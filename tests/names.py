@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 
 import jimpact as ji
+from jimpact.bodies.solids import Solid
 from jimpact.fits.fitting import LOSSES
 from jimpact.fits.solve import DEFAULT_STEPS
 from jimpact.methods.contenders import METHODS
@@ -16,11 +17,12 @@ PATH = Path(ji.__file__).parent / "data" / "names.json"
 def bodies():
     """Whether each argument must be given, by name, of each public body."""
     public = {name: getattr(ji, name) for name in ji.__all__}
-    bodies = {k: x for k, x in public.items() if isinstance(x, type) and issubclass(x, ji.Body)}
+    kinds = {k: x for k, x in public.items() if isinstance(x, type) and issubclass(x, ji.Body)}
+    bodies = kinds | {"Bodies": ji.Bodies}
     arguments = {
-        name: list(inspect.signature(kind.__init__).parameters.values())[1:]
+        name: list(inspect.signature(kind).parameters.values())
         for name, kind in bodies.items()
-        if kind not in (ji.Body, ji.Solid)  # of which the others are made
+        if kind not in (ji.Body, Solid)  # of which the others are made
     }
     return {k: {x.name: x.default is x.empty for x in rows} for k, rows in arguments.items()}
 

@@ -1,6 +1,7 @@
 """What tests of pictures share."""
 
 import numpy as np
+import piles
 
 import jimpact as ji
 
@@ -18,7 +19,7 @@ def samples(gaps):
 
 def force_chains():
     """A disc on two others on a floor, whose left contact carries twice as much."""
-    discs = ji.Discs(1.0, [1.0] * 3, walls=[[0.0, 1.0, 0.0]])
+    discs = piles.discs(1.0, [1.0] * 3, planes=[[0.0, 1.0, 0.0]])
     q = discs.at([[0.0, 1.0], [2.0, 1.0], [1.0, 1.0 + np.sqrt(3)]])
     impulse = [0.0, 2.0, 1.0, np.sqrt(3), np.sqrt(0.75)]  # 1-2, 1-3, 2-3, the floor
     return ji.plot.force_chains(discs, q, discs.touching(q), impulse, "three discs")

@@ -10,6 +10,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jimpact as ji
+from jimpact.montecarlo.results import MonteCarlo
+from jimpact.motion.record import Motion
 
 cradle = ji.chain([1.0, 1.0, 1.0])
 law = ji.LZB(0.9, [1.0, 2.0], exponent=1.5, rtol=1e-9)
@@ -39,9 +41,9 @@ assert_type(fit.standard_error, np.ndarray)
 assert_type(fit.warnings, tuple[str, ...])
 
 found = ji.monte_carlo(law, cradle, [1.0, 0.0, 0.0], gaps=ji.Uniform(0.0, 1e-5), samples=100)
-assert_type(found, ji.MonteCarlo)
+assert_type(found, MonteCarlo)
 assert_type(ji.compare(cradle, [1.0, 0.0, 0.0]).velocity, np.ndarray)
-assert_type(ji.simulate(ji.ball_system(), law, [1.0], [0.0], 1.0), ji.Motion)
+assert_type(ji.simulate(ji.System(ji.Column([1.0]), gravity=True), law, [1.0], [0.0], 1.0), Motion)
 
 # name spaces
 assert_type(ji.plot.fit(fit), Figure)

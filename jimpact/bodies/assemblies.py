@@ -15,7 +15,9 @@ from jimpact.bodies.base import (
     ContactPoints,
     LinearPotential,
     OnGround,
+    as_planes,
     dot,
+    floors_of,
     lengths,
     moving,
     number,
@@ -61,7 +63,7 @@ class PlanarBodies(Body):
 
     Args:
         bodies: `Polygon`, `Block`, `Disc`; `Dimer` on planes only.
-        planes: angle a [rad] of each, or (a, d); 0: the ground, pi/2: a wall on the right.
+        planes: as of `as_planes`; angle 0: the ground, pi/2: a wall on the right.
         pairs: (i, j) of bodies, counted from 0, in contact with each other; None: all. Two
             polygons may be given as ((i, side), (j, side)), sides counted counter-clockwise: of a
             `Block` 0 is the base, of a `Polygon` it begins at the first corner.
@@ -75,11 +77,11 @@ class PlanarBodies(Body):
     Source: Ericson, Real-Time Collision Detection (2005), ch. 5 and 7 (distances, separating axes).
 
     >>> import jimpact as ji
-    >>> slope = ji.PlanarBodies([ji.Block(0.2, 0.1)], planes=[0.3])
+    >>> slope = ji.Bodies([ji.Block(0.2, 0.1)], planes=[0.3])
     >>> slope.scene(slope.touching()).closed.tolist()
     [True, True, False, False]
     >>> q = [0.0, 0.5, 0.0, 0.3, 1.5, 0.0]
-    >>> stack = ji.PlanarBodies([ji.Block(1.0, 1.0), ji.Block(1.0, 1.0)])
+    >>> stack = ji.Bodies([ji.Block(1.0, 1.0), ji.Block(1.0, 1.0)])
     >>> stack.scene(q).gaps[-2:].tolist()
     [0.0, 0.0]
     """
@@ -87,14 +89,14 @@ class PlanarBodies(Body):
     range_in_words = "see `PlanarBodies`: no centre in a body, fixed sides face each other"
 
     bodies: tuple[OnGround, ...]
-    planes: jax.Array  # (k, 2) angle, offset
+    planes: jax.Array  # (k, 3) unit normal, distance
     between: tuple[tuple[int, int], ...] = eqx.field(static=True)  # bodies of contacts; plane: -1
     pairs: "_Pairs" = eqx.field(static=True)
 
     def __init__(
         self,
         bodies: Sequence[OnGround],
-        planes: Any = (0.0,),
+        planes: Any = None,
         pairs: Sequence[Any] | None = None,
         at: Any = None,
     ):
@@ -102,15 +104,13 @@ class PlanarBodies(Body):
         for body in self.bodies:
             if not isinstance(body, OnGround):
                 raise TypeError(
-                    "Argument `bodies` must hold planar bodies, but holds a "
-                    f"{type(body).__name__}; boxes and spheres go into `SpatialBodies`."
+                    f"Argument `bodies` must hold planar bodies, but holds a {type(body).__name__}."
                 )
-        rows = [_plane(plane) for plane in planes]
-        self.planes = jnp.stack(rows) if rows else jnp.zeros((0, 2))
+        self.planes = as_planes(planes, 2)
         counts = [body.points.shape[0] for body in self.bodies]
-        ground = [(b, -1) for _ in rows for b, count in enumerate(counts) for _ in range(count)]
+        on_each = [(b, -1) for b, count in enumerate(counts) for _ in range(count)]
         self.pairs = _sorted_pairs(self.bodies, pairs, at)
-        self.between = (*ground, *self.pairs.between)
+        self.between = (*on_each * len(self.planes), *self.pairs.between)
         if not self.between:
             raise ValueError("Arguments `bodies`, `planes` and `pairs` must give a contact.")
 
@@ -185,11 +185,16 @@ class PlanarBodies(Body):
     ) -> jax.Array:
         """(x, y, theta) of one body on one plane, turned by `angle` from it, `along` it [m]."""
         turn, distance = number("angle", angle), number("along", along)
-        a, offset = self.planes[plane]
-        x, y, _ = self.bodies[body].touching(turn)
-        c, s = jnp.cos(a), jnp.sin(a)
+        (n_x, n_y, offset), (x, y, _) = self.planes[plane], self.bodies[body].touching(turn)
         right, up = x + distance, y + offset
-        return jnp.stack([c * right - s * up, s * right + c * up, turn + a])
+        place = [n_y * right + n_x * up, n_y * up - n_x * right, turn + jnp.arctan2(-n_x, n_y)]
+        return jnp.stack(place)
+
+    def at(self, centres: Any) -> jax.Array:
+        """q (3 b,) with the bodies, not turned, at these centres (b, 2) [m]."""
+        places = as_float_array("centres", centres)
+        check_shape("centres", places, (len(self.bodies), 2), "one for each body")
+        return jnp.pad(places, ((0, 0), (0, 1))).reshape(-1)
 
     def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
         """Those of all bodies."""
@@ -204,7 +209,7 @@ class PlanarBodies(Body):
     @property
     def floors(self) -> list[Any]:
         """The planes."""
-        return np.asarray(self.planes).tolist()
+        return floors_of(self.planes)
 
     def _places(self, q: jax.Array) -> "_Places":
         """Contact points and corners at q (3 b,)."""
@@ -222,8 +227,7 @@ class PlanarBodies(Body):
 
     def _on_planes(self, places: "_Places") -> ContactPoints:
         """Contacts of all points with all planes."""
-        a, offset = self.planes.T
-        n = jnp.stack([-jnp.sin(a), jnp.cos(a)], axis=1)[:, None]
+        n, offset = self.planes[:, None, :2], self.planes[:, 2]
         height = jnp.sum(n * places.points[None], axis=2) - offset[:, None]
         point = places.points[None] - height[..., None] * n
         gap, normal = height - places.rim[places.owner][None], jnp.broadcast_to(n, point.shape)
@@ -450,15 +454,6 @@ def _overlap(places: _Places, first: Side, second: Side) -> jax.Array:
 
 
 # ------------------------------------------------------------------------------ construction
-
-
-def _plane(plane: Any) -> jax.Array:
-    """(angle, offset) of an angle, or of both."""
-    row = as_float_array("planes", plane)
-    row = jnp.stack([row, jnp.zeros_like(row)]) if row.ndim == 0 else row
-    check_shape("planes", row, (2,), "an angle, or an angle and an offset, of each")
-    check_values("planes", row)
-    return row
 
 
 def _sorted_pairs(bodies: tuple[OnGround, ...], pairs: Sequence[Any] | None, at: Any) -> _Pairs:

@@ -265,17 +265,22 @@ class Body(eqx.Module):
         """Planes to draw, (angle, offset) each; in space and where all hang none."""
         return ((0.0, 0.0),)
 
-    def scene(self, q: Any, closed_below: float = CLOSED_BELOW) -> Scene:
+    def touching(self, *where: Any, **options: Any) -> Any:
+        """q (n,) at which it touches what is around it."""
+        raise TypeError(f"{type(self).__name__} has no `touching`: give its `q` yourself.")
+
+    def scene(self, q: Any = None, closed_below: float = CLOSED_BELOW) -> Scene:
         """The scene at configuration q, its normals and tangents in the velocities (n,).
 
-        Gaps up to `closed_below` [m] (or a few roundings of q) count as closed.
+        q None is where it touches, `touching()`. Gaps up to `closed_below` [m] (or a few roundings
+        of q) count as closed.
 
         Raises:
             ValueError: q of another size, not finite, or out of the range of the gap function
                 (inside jit: normals that are NaN, so that `impact` says `not_finite`);
                 penetration; a mass that is not positive.
         """
-        q = as_float_array("q", q)
+        q = as_float_array("q", self.touching() if q is None else q)
         mass = self.mass
         if callable(mass):
             mass = jax.eval_shape(mass, q)
@@ -494,6 +499,34 @@ def positives(
         raise ValueError(f"Argument `{name}` must have shape ({size},), but has {numbers.shape}.")
     check_values(name, numbers, low=0.0, open_low=not low_allowed)
     return numbers
+
+
+def as_planes(planes: Any, dimension: int) -> jax.Array:
+    """Planes as rows (k, d + 1): unit normal into the free half space `n . x >= c`, and c [m].
+
+    In the plane also an angle a [rad], or (a, c): n = (-sin a, cos a). None: the ground.
+    """
+    d = dimension
+    if planes is None:
+        return jnp.eye(1, d + 1, d - 1)
+    rows = []
+    for plane in planes:
+        row = as_float_array("planes", plane)
+        if d == 2 and row.shape in ((), (2,)):
+            a, c = (row, jnp.zeros_like(row)) if row.ndim == 0 else row
+            row = jnp.stack([-jnp.sin(a), jnp.cos(a), c])
+        angles = ", or an angle, or an angle and a distance, of each" if d == 2 else " of each"
+        check_shape("planes", row, (d + 1,), f"a normal and a distance{angles}")
+        check_values("planes", row)
+        length, n = lengths(row[None, :d])
+        check_values("planes", length, low=0.0, open_low=True)
+        rows.append(jnp.concatenate([n[0], row[d:]]))
+    return jnp.stack(rows) if rows else jnp.zeros((0, d + 1))
+
+
+def floors_of(planes: Any) -> list[tuple[float, float]]:
+    """(angle, offset) of planes (k, 3), for pictures."""
+    return [(float(np.arctan2(-x, y)), float(c)) for x, y, c in np.asarray(planes)]
 
 
 def planar_directions(mass: jax.Array) -> jax.Array:

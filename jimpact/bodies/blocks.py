@@ -9,7 +9,6 @@ import jax.numpy as jnp
 from jimpact._checks import check_choice
 from jimpact.bodies.base import heights, positive
 from jimpact.bodies.polygons import Cornered
-from jimpact.scene import Scene
 
 
 class Block(Cornered):
@@ -79,36 +78,3 @@ class Block(Cornered):
         if self.contacts == "all":
             return super().valid(q)
         return jnp.min(heights(self.corners[2:], q))
-
-
-def rocking_block(
-    width: Any, height: Any, mass: Any = 1.0, angle: Any = 0.0, inertia: Any = None
-) -> Scene:
-    """Scene of a block on the ground, at rest on its lower corner; q = (x, y, theta).
-
-    Equation: see `Block`. Contact 1 is the right corner B, contact 2 the left corner A; at angle 0
-    both are closed, otherwise the higher one is open. At angle 0 with homogeneous mass
-    `cos(theta_12) = -(a^2 - 2) / (a^2 + 4)`, a = height / width.
-
-    Args:
-        width: L > 0 [m].
-        height: l > 0 [m].
-        mass: m > 0 [kg].
-        angle: theta [rad], counter-clockwise: > 0 lifts the right corner.
-        inertia: I about the centre [kg m^2]; None: homogeneous.
-
-    Returns:
-        `Scene` of 3 coordinates and 2 contacts, with tangents.
-
-    Raises:
-        ValueError: sizes, mass or inertia not positive, an angle that is not finite.
-
-    Source: Brogliato, Nonsmooth Mechanics (2016), (6.74), (6.75).
-
-    >>> import jimpact as ji
-    >>> scene = ji.rocking_block(width=1.0, height=2.0)
-    >>> round(float(ji.kinetic_angles(scene)[0, 1]), 6)
-    1.823477
-    """
-    block = Block(width, height, mass, inertia, corners="base")
-    return block.scene(block.touching(angle))

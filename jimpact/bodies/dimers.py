@@ -18,7 +18,6 @@ from jimpact.bodies.base import (
     projected,
     turned,
 )
-from jimpact.scene import Scene
 
 
 class Dimer(OnGround):
@@ -201,70 +200,3 @@ class SpatialDimer(Body):
         ends = np.stack([q[:3] + way, q[:3] - way])
         spheres = (x + float(self.planar.radius) * CIRCLE for x in projected(ends))
         return [projected(ends), projected(ends * [1, 1, 0]), *spheres]
-
-
-def dimer(
-    radius: Any, length: Any, sphere_mass: Any = 1.0, rod_mass: Any = 1.0, angle: Any = 0.0
-) -> Scene:
-    """Scene of a planar dimer on the ground; q = (x, y, theta).
-
-    Equation: see `Dimer`. With all masses equal and a = radius / length,
-    `alpha = (1 + 2 a)^2 / (16 a^2 / 5 + 1/3 + 2 (1 + 2 a)^2)`,
-    `cos(theta_12) = -(1/3 - alpha) / (1/3 + alpha)`; theta_12 is least at a = 5/24.
-
-    Args:
-        radius: R >= 0 of the spheres [m].
-        length: L >= 0 of the rod between their surfaces [m]; 0: the spheres touch (R > 0).
-        sphere_mass: of one sphere, > 0 [kg].
-        rod_mass: of the thin rod, >= 0 [kg].
-        angle: theta [rad]: > 0 lifts the right sphere, contact 1.
-
-    Returns:
-        `Scene` of 3 coordinates and 2 contacts, with tangents.
-
-    Raises:
-        ValueError: sizes or masses out of range, an angle that is not finite.
-
-    Source: Brogliato, Nonsmooth Mechanics (2016), Remark 6.11.
-
-    >>> import jimpact as ji
-    >>> round(float(ji.kinetic_angles(ji.dimer(radius=5 / 24, length=1.0))[0, 1]), 6)
-    1.424204
-    """
-    body = Dimer(radius, length, sphere_mass, rod_mass)
-    return body.scene(body.touching(angle))
-
-
-def dimer_3d(
-    radius: Any,
-    length: Any,
-    sphere_mass: Any = 1.0,
-    rod_mass: Any = 1.0,
-    angle: Any = 0.0,
-    yaw: Any = 0.0,
-) -> Scene:
-    """Scene of a dimer on a horizontal plane; velocities are the rates of q, see `SpatialDimer`.
-
-    Equation: q = (x, y, z, yaw, pitch, spin); tangents (6, 4), contact-major, along x and y.
-
-    Args:
-        radius: R > 0 of the spheres [m].
-        length: L >= 0 of the rod between their surfaces [m]; 0: the spheres touch.
-        sphere_mass: of one sphere, > 0 [kg].
-        rod_mass: of the thin rod, >= 0 [kg].
-        angle: pitch in (-pi/2, pi/2) [rad]: > 0 lifts sphere 1.
-        yaw: of the rod about the vertical [rad].
-
-    Returns:
-        `Scene` of 6 coordinates and 2 contacts, with two tangents each.
-
-    Raises:
-        ValueError: sizes or masses out of range, an upright rod.
-
-    >>> import jimpact as ji
-    >>> scene = ji.dimer_3d(radius=5 / 24, length=1.0, yaw=0.7)
-    >>> round(float(ji.kinetic_angles(scene)[0, 1]), 6)
-    1.424204
-    """
-    body = SpatialDimer(radius, length, sphere_mass, rod_mass)
-    return body.scene(body.touching(angle, yaw))

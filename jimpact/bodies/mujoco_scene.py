@@ -58,7 +58,8 @@ class MujocoScene(NamedTuple):
             first one to the second one. Then "limit of joint knee" of each limit that is reached.
 
     >>> import jimpact as ji
-    >>> world = ji.MujocoScene(ji.chain([1.0, 1.0]), [1.0, 0.0], None, ("left, right",))
+    >>> from jimpact.bodies.mujoco_scene import MujocoScene
+    >>> world = MujocoScene(ji.chain([1.0, 1.0]), [1.0, 0.0], None, ("left, right",))
     >>> ji.impact(ji.Newton(1.0), world.scene, world.velocity).velocity.tolist()
     [0.0, 1.0]
     """

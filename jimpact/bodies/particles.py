@@ -17,7 +17,6 @@ from jimpact.bodies.base import (
     positive,
     positives,
 )
-from jimpact.scene import Scene
 
 
 class Corner(Body):
@@ -130,6 +129,10 @@ class Column(Body):
         top_below = jnp.concatenate([jnp.zeros(1, q.dtype), (q + self.radii)[:-1]])
         return q - self.radii - top_below
 
+    def touching(self) -> jax.Array:
+        """Heights (n,) of balls that lie on each other and on the floor."""
+        return 2 * jnp.cumsum(self.radii) - self.radii
+
     @property
     def names(self) -> tuple[str, ...]:
         """Heights."""
@@ -140,26 +143,3 @@ class Column(Body):
         radii = np.asarray(self.radii)
         shown, lift = np.where(radii > 0, radii, point), np.where(radii > 0, 0.0, point)
         return [r * CIRCLE + (0, y + d) for r, y, d in zip(shown, q, lift, strict=True)]
-
-
-def corner(angle: Any, mass: Any = 1.0) -> Scene:
-    """Scene of a particle in a corner of two walls; q = (x, y). The kinetic angle is `angle`.
-
-    Args:
-        angle: between the walls, in (0, pi) [rad].
-        mass: > 0 [kg].
-
-    Returns:
-        `Scene` of 2 coordinates and 2 contacts, with tangents.
-
-    Raises:
-        ValueError: angle or mass out of range.
-
-    Source: Brogliato, Nonsmooth Mechanics (2016), (6.66).
-
-    >>> import jimpact as ji
-    >>> round(float(ji.kinetic_angles(ji.corner(angle=1.2))[0, 1]), 12)
-    1.2
-    """
-    system = Corner(angle, mass)
-    return system.scene(system.touching())

@@ -10,7 +10,6 @@ import numpy as np
 from jimpact._checks import as_float_array, check_shape, check_values
 from jimpact.bodies.base import CIRCLE, PLANAR, Body, numbered, positive, positives
 from jimpact.compiling import full_precision
-from jimpact.scene import Scene
 
 
 class PendulumCradle(Body):
@@ -60,6 +59,10 @@ class PendulumCradle(Body):
     def gravity(self, acceleration: Any) -> "PendulumPotential":
         """`V = g l sum m_i (1 - cos q_i)`."""
         return PendulumPotential(self.masses * self.length * acceleration)
+
+    def touching(self) -> jax.Array:
+        """Angles (n,) at rest, 0."""
+        return jnp.zeros_like(self.masses)
 
     def gap_function(self, q: jax.Array) -> jax.Array:
         """Distances between neighbouring balls."""
@@ -112,33 +115,3 @@ class PendulumPotential(eqx.Module):
     def __call__(self, q: jax.Array) -> jax.Array:
         """V () [J]."""
         return self.weight_length @ (1 - jnp.cos(q))
-
-
-def pendulum_cradle(
-    masses: Any, length: Any, radius: Any, gaps: Any = 0.0, angles: Any = 0.0
-) -> Scene:
-    """Scene of Newton's cradle, with the angles of its strings as coordinates.
-
-    Equation: see `PendulumCradle`. At rest its impacts are those of `chain(masses)` with v = l q'.
-
-    Args:
-        masses: (n,) > 0 [kg], n >= 2.
-        length: l > 0 of the strings, to the centres [m].
-        radius: R > 0 of the balls, scalar or (n,) [m].
-        gaps: >= 0 at rest, scalar or (n - 1,) [m].
-        angles: q of the strings [rad], scalar or (n,): to the right > 0.
-
-    Returns:
-        `Scene` of n angles and n - 1 contacts; velocities are angular ones [rad/s].
-
-    Raises:
-        ValueError: numbers out of range, wrong shapes, balls that overlap at these angles.
-
-    >>> import jimpact as ji
-    >>> scene = ji.pendulum_cradle([1.0, 2.0, 2.0], length=0.3, radius=0.01)
-    >>> ji.delassus_matrix(scene)[0].round(6).tolist()
-    [1.5, -0.5]
-    """
-    cradle = PendulumCradle(masses, length, radius, gaps)
-    q = as_float_array("angles", angles)
-    return cradle.scene(jnp.full(cradle.masses.shape[0], q) if q.ndim == 0 else q)

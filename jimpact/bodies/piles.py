@@ -2,6 +2,7 @@
 
 import abc
 import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -24,10 +25,11 @@ from jimpact.bodies.base import (
     ActivePairs,
     Body,
     LinearPotential,
+    as_planes,
+    floors_of,
     listed_pairs,
     numbered,
     over_blocks,
-    positives,
     wheel,
     with_block,
 )
@@ -56,43 +58,29 @@ _TOUCHING = 1e-9
 class Pile(Body):
     """Bodies between flat walls: d places and the turns of each, d = 2 or 3; here they are round.
 
-    A kind of pile gives `dimension` and `tangents_of`; if round, `inertia_factor`.
+    A kind of pile gives `dimension` and `tangents_of`.
     """
 
     masses: jax.Array
     radii: jax.Array
-    walls: jax.Array
+    turning: jax.Array  # (k,) moments of inertia
+    planes: jax.Array  # (w, d + 1) unit normal, distance
     room: int = eqx.field(static=True)
     crowd: int = eqx.field(static=True)  # see `near_pairs`; 0: every pair is looked at
 
     dimension = 0  # d
-    inertia_factor = 0.0  # moment of inertia over m R^2
 
-    def __init__(self, masses: Any, radii: Any, walls: Any = (), room: int | None = None):
-        self.radii = positives("radii", radii)
-        if not len(self.radii):
-            raise ValueError("Argument `radii` must hold one or more, but is empty.")
-        self.masses = positives("masses", masses, self.radii.shape[0])
-        self.walls = self._unit_walls(walls)
-        self.room = (
-            ROOM[self.dimension] * len(self.radii) if room is None else as_whole("room", room, 1)
-        )
+    def __init__(self, bodies: Sequence[Any], planes: Any = None, room: int | None = None):
+        self.masses = stacked([body.total_mass for body in bodies])
+        self.radii = stacked([body.rim for body in bodies])
+        self.turning = stacked([jnp.ravel(body.inertia)[0] for body in bodies])
+        self._have_planes(planes, room, ROOM[self.dimension])
+
+    def _have_planes(self, planes: Any, room: int | None, room_of_each: int) -> None:
+        """Set the planes, the room for contacts, and whether there is a grid."""
+        self.planes = as_planes(planes, self.dimension).astype(self.radii.dtype)
+        self.room = room_of_each * self.count if room is None else as_whole("room", room, 1)
         self.crowd = self._crowd()
-
-    def _unit_walls(self, walls: Any) -> jax.Array:
-        """Rows (w, d + 1) with unit normals."""
-        d = self.dimension
-        empty = len(walls) == 0
-        rows = as_float_array("walls", np.reshape(walls, (-1, d + 1)) if empty else walls)
-        if rows.ndim != 2 or rows.shape[1] != d + 1:
-            raise ValueError(
-                f"Argument `walls` must have shape (w, {d + 1}), but has {rows.shape}."
-            )
-        check_values("walls", rows)
-        length = jnp.sqrt(jnp.sum(rows[:, :d] ** 2, axis=1))
-        check_values("walls", length, low=0.0, open_low=True)
-        scale = jnp.stack([length] * d + [jnp.ones_like(length)], axis=1)
-        return (rows / scale).astype(self.radii.dtype)
 
     def _crowd(self) -> int:
         """How many bodies a row of cells may hold; 0 where looking at every pair is less work."""
@@ -116,9 +104,9 @@ class Pile(Body):
     @property
     def mass(self) -> jax.Array:
         """M, its diagonal (n,)."""
-        turning = self.inertia_factor * self.masses * self.radii**2
         d = self.dimension
-        return jnp.stack([self.masses] * d + [turning] * _turns(d), axis=1).reshape(-1)
+        each = [self.masses] * d + [self.turning] * _turns(d)
+        return jnp.stack(each, axis=1).reshape(-1)
 
     def at(self, centres: Any) -> jax.Array:
         """q (n,) with the bodies, not turned, at these centres (k, d) [m]."""
@@ -163,11 +151,11 @@ class Pile(Body):
         """Gaps (k, w) of each body with every wall."""
         d = self.dimension
         centres = self._of_bodies(q)[:, :d]
-        return centres @ self.walls[:, :d].T - self.walls[None, :, d] - self.radii[:, None]
+        return centres @ self.planes[:, :d].T - self.planes[None, :, d] - self.radii[:, None]
 
     def _at_walls(self) -> tuple[np.ndarray, np.ndarray]:
         """Bodies i and walls j of every contact with a wall; j counts walls after the bodies."""
-        walls = len(self.walls)
+        walls = len(self.planes)
         body, wall = np.divmod(np.arange(self.count * walls, dtype=np.int32), max(walls, 1))
         return body, self.count + wall
 
@@ -213,7 +201,7 @@ class Pile(Body):
         if pairs.overflows:
             raise ValueError(
                 f"Argument `q` must hold at most {self.room} contacts (the argument `room` of "
-                f"{type(self).__name__}), but holds more."
+                "`Bodies`), but holds more."
             )
         _, _, directions, scene = listed_pairs(pairs, self.mass)
         if not directions[:, 0].any(axis=(1, 2)).all():
@@ -228,7 +216,7 @@ class Pile(Body):
     @property
     def pair_count(self) -> int:
         """Every pair (i, j), in both orders, and every body with every wall."""
-        return self.count * (self.count + len(self.walls))
+        return self.count * (self.count + len(self.planes))
 
     def _candidates(self, q: jax.Array, margin: jax.Array) -> Candidates:
         """Pairs of bodies, all those with gaps up to `margin` among them."""
@@ -287,7 +275,7 @@ class Pile(Body):
         gaps = [self._pair_gaps(x, near.first, near.second) for x in (q, later)]
         closed = near.used & (jnp.minimum(*gaps) <= below)
         to_walls = jnp.minimum(self._wall_gaps(q), self._wall_gaps(later)).reshape(-1)
-        stride = self.count + len(self.walls)
+        stride = self.count + len(self.planes)
         body, wall = self._at_walls()
         number = jnp.concatenate([near.first * stride + near.second, body * stride + wall])
         return number, jnp.concatenate([closed, to_walls <= below]), near.overflows
@@ -330,7 +318,7 @@ class Pile(Body):
         self, q: jax.Array, number: jax.Array
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Bodies i and j (K,) of contacts of these numbers, j = `count` for walls; see `_along`."""
-        i, j = jnp.divmod(number, jnp.int32(self.count + len(self.walls)))
+        i, j = jnp.divmod(number, jnp.int32(self.count + len(self.planes)))
         return i, jnp.minimum(j, self.count), self._along(q, i, j)
 
     def _along(self, q: jax.Array, i: jax.Array, j: jax.Array) -> jax.Array:
@@ -348,9 +336,9 @@ class Pile(Body):
         way = at[i] - at[other]
         length = jnp.sqrt(jnp.sum(way**2, axis=1, keepdims=True))
         normal = way / jnp.where(length > 0, length, 1.0)
-        if len(self.walls) == 0:
+        if len(self.planes) == 0:
             return normal
-        of_wall = self.walls[jnp.maximum(wall, 0), :d]
+        of_wall = self.planes[jnp.maximum(wall, 0), :d]
         return jnp.where((wall >= 0)[:, None], of_wall, normal)
 
     def _directions(self, normal: jax.Array, first: jax.Array, second: jax.Array) -> jax.Array:
@@ -388,6 +376,11 @@ def _active_pairs(pile: Pile, q: jax.Array, below: jax.Array) -> tuple[ActivePai
     return pile.active_pairs(q, q, below), pile.least_gap(q)
 
 
+def stacked(numbers: Sequence[jax.Array]) -> jax.Array:
+    """Numbers (k,); on the host where they are known: JAX takes long to stack thousands."""
+    return jnp.stack(numbers) if is_traced(numbers) else jnp.asarray(np.array(numbers))
+
+
 def _turns(d: int) -> int:
     """Number of turns of a body in a plane (1) or in space (3)."""
     return d * (d - 1) // 2
@@ -423,7 +416,7 @@ class InPlane(Pile):
     @property
     def floors(self) -> list[tuple[float, float]]:
         """The walls."""
-        return [(float(np.arctan2(-x, y)), float(d)) for x, y, d in np.asarray(self.walls)]
+        return floors_of(self.planes)
 
 
 class Discs(InPlane):
@@ -431,23 +424,15 @@ class Discs(InPlane):
 
     Equation: `f = |c_i - c_j| - R_i - R_j`, and `f = n_w . c_i - d_w - R_i` at wall w; sliding
     `(v_i - v_j) . t - R_i omega_i - R_j omega_j`, t = n turned by a quarter counter-clockwise.
-    Inertia `m R^2 / 2`. As a `Scene` it has a contact for every pair, those of disc 1 first, and
+    As a `Scene` it has a contact for every pair, those of disc 1 first, and
     for each disc and wall, disc by disc. Motions of many discs are those of
     `simulate(method="time_stepping")`, which finds closed contacts by a grid and takes no others.
 
-    Args:
-        masses: > 0, scalar or (k,) [kg].
-        radii: > 0 (k,) [m].
-        walls: rows (n_x, n_y, d): the half plane `n . x >= d` is free; n is made a unit vector.
-        room: largest number of closed contacts at once in time stepping; None: 4 per disc.
-
     >>> import jimpact as ji
-    >>> discs = ji.Discs(1.0, [0.1, 0.1], walls=[[0.0, 1.0, 0.0]])
+    >>> discs = ji.Bodies([ji.Disc(0.1)] * 2, room=8)
     >>> [round(float(f), 6) for f in discs.gap_function(discs.at([[0.0, 0.1], [0.5, 0.1]]))]
     [0.3, 0.0, 0.0]
     """
-
-    inertia_factor = 0.5
 
     @full_precision
     def tangent_function(self, q: jax.Array) -> jax.Array:
@@ -458,7 +443,7 @@ class Discs(InPlane):
         rolled = self.radii * at[:, 2]
         both = self.radii[first] + self.radii[second]
         around = both * jnp.arctan2(way[:, 1], way[:, 0]) - rolled[first] - rolled[second]
-        slid = at[:, :2] @ jnp.stack([-self.walls[:, 1], self.walls[:, 0]]) - rolled[:, None]
+        slid = at[:, :2] @ jnp.stack([-self.planes[:, 1], self.planes[:, 0]]) - rolled[:, None]
         return jnp.concatenate([around, slid.reshape(-1)])
 
     def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
@@ -470,30 +455,22 @@ class Spheres(Pile):
     """Spheres in space between flat walls; q = (x, y, z) and three turns of each.
 
     Equation: `f = |c_i - c_j| - R_i - R_j`, and `f = n_w . c_i - d_w - R_i` at wall w; sliding
-    `v_i - v_j - (R_i omega_i + R_j omega_j) x n` along two tangents. Inertia `2 m R^2 / 5`. A
+    `v_i - v_j - (R_i omega_i + R_j omega_j) x n` along two tangents. A
     sphere looks the same from all sides, so no orientation is kept: turns are the integrals of the
     angular velocity omega (in the axes of space). As a `Scene` it has a contact for every pair,
     those of sphere 1 first, and for each sphere and wall; `simulate(method="time_stepping")` finds
     closed contacts by a grid and takes no others.
 
-    Args:
-        masses: > 0, scalar or (k,) [kg].
-        radii: > 0 (k,) [m].
-        walls: rows (n_x, n_y, n_z, d): the half space `n . x >= d` is free; n is made a unit
-            vector.
-        room: largest number of closed contacts at once in time stepping; None: 7 per sphere.
-
     Source: Ericson, Real-Time Collision Detection (2005), ch. 7.1 (the grid).
 
     >>> import jimpact as ji
-    >>> spheres = ji.Spheres(1.0, [0.1, 0.1], walls=[[0.0, 0.0, 1.0, 0.0]])
+    >>> spheres = ji.Bodies([ji.Sphere(0.1)] * 2, room=8)
     >>> q = spheres.at([[0.0, 0.0, 0.1], [0.0, 0.3, 0.5]])
     >>> [round(float(f), 6) for f in spheres.gap_function(q)]
     [0.3, 0.0, 0.4]
     """
 
     dimension = 3
-    inertia_factor = 0.4
 
     def tangents(self, q: jax.Array) -> jax.Array:
         """H_t (n, 2 m): two directions of sliding for each contact of the scene."""
@@ -526,7 +503,7 @@ class Spheres(Pile):
     def floors(self) -> list[tuple[float, float]]:
         """The walls that are seen edge-on from the side, along y."""
         return [
-            (float(np.arctan2(-x, z)), float(d)) for x, y, z, d in np.asarray(self.walls) if y == 0
+            (float(np.arctan2(-x, z)), float(d)) for x, y, z, d in np.asarray(self.planes) if y == 0
         ]
 
     def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:

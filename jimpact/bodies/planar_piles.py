@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_whole, check_concrete
+from jimpact._checks import check_concrete
 from jimpact.bodies.assemblies import (
     FacingSides,
     facing_now,
@@ -28,7 +28,7 @@ from jimpact.bodies.base import (
     with_block,
 )
 from jimpact.bodies.piles import InPlane, chosen_rows
-from jimpact.bodies.polygons import Cornered, Disc
+from jimpact.bodies.polygons import Cornered
 from jimpact.compiling import full_precision
 
 _SLOTS = 2  # contacts of a pair: at both ends of the sides that face each other
@@ -47,19 +47,10 @@ class PlanarPile(InPlane):
     of the corners. `simulate(method="time_stepping")` finds closed contacts by a grid and takes no
     others.
 
-    Args:
-        bodies: `Polygon`, `Block`, `Disc`.
-        walls: rows (n_x, n_y, d): the half plane `n . x >= d` is free; n is made a unit vector.
-        room: largest number of closed contacts at once in time stepping; None: 6 per body.
-
-    Raises:
-        ValueError: no bodies, walls that are not finite or have no normal. TypeError: other
-            bodies.
-
     Source: Ericson, Real-Time Collision Detection (2005), ch. 5 and 7.
 
     >>> import jimpact as ji
-    >>> pile = ji.PlanarPile([ji.Block(0.2, 0.1), ji.Disc(0.1)], walls=[[0.0, 1.0, 0.0]])
+    >>> pile = ji.Bodies([ji.Block(0.2, 0.1), ji.Disc(0.1)], room=8)
     >>> pile.touching([0.0, 0.05, 0.0, 0.0, 0.2, 0.0], below=1e-6).contacts
     3
     """
@@ -68,17 +59,8 @@ class PlanarPile(InPlane):
     corners: jax.Array
     rims: jax.Array  # (k,) of discs, 0 of polygons
     inner: jax.Array  # (k,) radius of a disc about the centre of mass within the body
-    turning: jax.Array  # (k,) moments of inertia
 
-    def __init__(self, bodies: Sequence[OnGround], walls: Any = (), room: int | None = None):
-        if not len(bodies):
-            raise ValueError("Argument `bodies` must hold one or more, but is empty.")
-        for body in bodies:
-            if not isinstance(body, Cornered | Disc):
-                raise TypeError(
-                    "Argument `bodies` must hold polygons, blocks and discs, but holds a "
-                    f"{type(body).__name__}."
-                )
+    def __init__(self, bodies: Sequence[OnGround], planes: Any = None, room: int | None = None):
         check_concrete("bodies", list(bodies))
         rings = [
             np.asarray(x.corners)[np.array(x.ring)] if isinstance(x, Cornered) else x.points
@@ -97,9 +79,7 @@ class PlanarPile(InPlane):
         self.inner = jnp.asarray(np.array(inner, self.corners.dtype))
         mass = np.stack([body.mass for body in bodies])
         self.masses, self.turning = jnp.asarray(mass[:, 0]), jnp.asarray(mass[:, 2])
-        self.walls = self._unit_walls(walls)
-        self.room = _ROOM * len(bodies) if room is None else as_whole("room", room, 1)
-        self.crowd = self._crowd()
+        self._have_planes(planes, room, _ROOM)
 
     @property
     def _least(self) -> jax.Array:
@@ -107,14 +87,9 @@ class PlanarPile(InPlane):
         return jnp.min(self.inner)
 
     @property
-    def mass(self) -> jax.Array:
-        """M, its diagonal (n,)."""
-        return jnp.stack([self.masses, self.masses, self.turning], axis=1).reshape(-1)
-
-    @property
     def _stride(self) -> int:
         """Partners of a body: the others, and each wall once for each corner."""
-        return self.count + len(self.walls) * self.corners.shape[1]
+        return self.count + len(self.planes) * self.corners.shape[1]
 
     @property
     def pair_count(self) -> int:
@@ -162,7 +137,7 @@ class PlanarPile(InPlane):
     def _wall_gaps(self, q: jax.Array) -> jax.Array:
         """Gaps (k, w, K) of all corners; infinite of those that only fill a row."""
         x = self._placed(q, np.arange(self.count))
-        n, offset = self.walls[:, :2], self.walls[:, 2]
+        n, offset = self.planes[:, :2], self.planes[:, 2]
         height = jnp.einsum("kcx,wx->kwc", x, n) - offset[None, :, None] - self.rims[:, None, None]
         again = jnp.all(self.corners[:, 1:] == self.corners[:, :-1], axis=2)
         again = jnp.pad(again, ((0, 0), (1, 0)))
@@ -257,13 +232,13 @@ class PlanarPile(InPlane):
         other, row = jnp.minimum(partner, self.count - 1), np.arange(len(number))
         _, points, normals = self._pairs(q, i, other)
         point, normal = points[row, slot], normals[row, slot]
-        if len(self.walls):
+        if len(self.planes):
             at_wall = partner >= self.count
             wall, corner = jnp.divmod(
                 jnp.maximum(partner - self.count, 0), jnp.int32(self.corners.shape[1])
             )
-            n, x = self.walls[wall, :2], self._placed(q, i)[row, corner]
-            on_wall = x - (jnp.sum(n * x, axis=1) - self.walls[wall, 2])[:, None] * n
+            n, x = self.planes[wall, :2], self._placed(q, i)[row, corner]
+            on_wall = x - (jnp.sum(n * x, axis=1) - self.planes[wall, 2])[:, None] * n
             point = jnp.where(at_wall[:, None], on_wall, point)
             normal = jnp.where(at_wall[:, None], n, normal)
         ways = jnp.stack([normal, jnp.stack([-normal[:, 1], normal[:, 0]], axis=1)], axis=1)

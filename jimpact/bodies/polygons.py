@@ -127,10 +127,11 @@ class Disc(OnGround):
     total_mass: jax.Array
     inertia: jax.Array
     middle: jax.Array  # (2,) from the centre of mass
+    is_round: bool = eqx.field(static=True)  # the same from all sides
 
     def __init__(self, radius: Any, mass: Any = 1.0, inertia: Any = None, centre: Any = None):
         self.radius, self.total_mass = positive("radius", radius), positive("mass", mass)
-        self.middle = jnp.zeros(2, self.radius.dtype)
+        self.middle, self.is_round = jnp.zeros(2, self.radius.dtype), centre is None
         if centre is not None:
             self.middle = -as_float_array("centre", centre)
             check_shape("centre", self.middle, (2,), "a point from the middle of the disc")

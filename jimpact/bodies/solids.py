@@ -313,6 +313,7 @@ class Sphere(Solid):
     """
 
     radius: jax.Array
+    is_round: bool = eqx.field(static=True)  # the same from all sides
 
     def __init__(
         self,
@@ -323,6 +324,7 @@ class Sphere(Solid):
         normal: Any = _LEVEL,
     ):
         self.radius = positive("radius", radius)
+        self.is_round = centre is None and np.ndim(0.0 if inertia is None else inertia) == 0
         if inertia is not None and np.ndim(inertia) == 0:
             inertia = jnp.stack([number("inertia", inertia)] * 3)
         self._weigh(mass, inertia, jnp.stack([0.4 * self.radius**2] * 3), centre, normal)

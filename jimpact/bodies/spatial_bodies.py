@@ -13,6 +13,7 @@ from jimpact.bodies.base import (
     Body,
     ContactPoints,
     LinearPotential,
+    as_planes,
     dot,
     lengths,
     moving,
@@ -41,8 +42,7 @@ class SpatialBodies(Body):
 
     Args:
         bodies: `Box`, `Sphere`; their own `normal` does not count.
-        planes: rows (n_x, n_y, n_z, d): the half space `n . x >= d` is free, n is made a unit
-            vector.
+        planes: as of `as_planes`.
         pairs: (i, j) of bodies, counted from 0, the fixed ones after the others, in contact with
             each other; None: all of which one moves.
         fixed: `Box`, `Sphere` that do not move, or only with the base: finite walls, tables.
@@ -57,7 +57,7 @@ class SpatialBodies(Body):
 
     >>> import jimpact as ji
     >>> wall = ji.Box([0.1, 2.0, 1.0])
-    >>> ball = ji.SpatialBodies([ji.Sphere(0.1)], fixed=[wall], places=[wall.at([0.55, 0.0, 0.5])])
+    >>> ball = ji.Bodies([ji.Sphere(0.1)], fixed=[wall], places=[wall.at([0.55, 0.0, 0.5])])
     >>> q = ball.at([[0.2, 0.0, 0.3]])
     >>> [round(float(f), 6) for f in ball.scene(q).gaps]  # over the ground, to the wall
     [0.2, 0.2]
@@ -75,7 +75,7 @@ class SpatialBodies(Body):
     def __init__(
         self,
         bodies: Sequence[Solid],
-        planes: Any = ((0.0, 0.0, 1.0, 0.0),),
+        planes: Any = None,
         pairs: Sequence[Any] | None = None,
         fixed: Sequence[Solid] = (),
         places: Any = (),
@@ -85,7 +85,7 @@ class SpatialBodies(Body):
             raise ValueError("Argument `bodies` must hold one or more, but is empty.")
         _check_solids("bodies", self.bodies)
         _check_solids("fixed", self.fixed)
-        self.planes = _planes(planes)
+        self.planes = as_planes(planes, 3)
         self.places = as_float_array("places", places).reshape(-1, 7)
         check_shape("places", self.places, (len(self.fixed), 7), "one for each of `fixed`")
         check_values("places", self.places)
@@ -301,15 +301,6 @@ def _check_solids(name: str, bodies: tuple[Solid, ...]) -> None:
             raise TypeError(
                 f"Argument `{name}` must hold boxes and spheres, but holds a {type(body).__name__}."
             )
-
-
-def _planes(planes: Any) -> jax.Array:
-    """Rows (k, 4) with unit normals."""
-    rows = as_float_array("planes", planes).reshape(-1, 4)
-    check_values("planes", rows)
-    length, n = lengths(rows[:, :3])
-    check_values("planes", length, low=0.0, open_low=True)
-    return jnp.concatenate([n, rows[:, 3:]], axis=1)
 
 
 def _pairs(every: tuple[Solid, ...], moving: int, pairs: Sequence[Any] | None) -> _SpatialPairs:

@@ -23,7 +23,7 @@ import jimpact as ji
 from jimpact.cli import options
 from jimpact.cli.program_cache import stored_programs
 from jimpact.cli.starting import as_csv
-from jimpact.cli.study import Study, read_study, without_none
+from jimpact.cli.study import Study, impact_study, without_none
 from jimpact.files.records import as_data, table
 from jimpact.files.study_file import is_motion
 from jimpact.law import with_parameter
@@ -34,6 +34,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure  # which takes long to import
 
     from jimpact.cli.study_motion import MotionStudy
+    from jimpact.fits.report import Fit
+    from jimpact.fits.selection import LawFits
+    from jimpact.motion.record import Motion
 
 DPI = 150  # of pictures that are pixels: readable on paper, a few hundred kB
 Table = tuple[Sequence[str], Sequence[Sequence[Any]]]  # names of columns, rows
@@ -112,7 +115,7 @@ def _write_picture(path: Path, picture: "Figure | Callable[[Path], Any]") -> Non
 
 def _impact_of(command: options.ShotCommand) -> tuple[Study, np.ndarray, np.ndarray | None]:
     """The study, in the scene of the shot where shots have their own, v-, and v+ if measured."""
-    study, shot = read_study(command.study), command.shot - 1
+    study, shot = impact_study(command.study), command.shot - 1
     if command.velocity:
         before = np.asarray(command.velocity, float)
         separates = np.asarray(ji.gap_velocity(study.scene, before)) >= 0
@@ -152,15 +155,15 @@ def fit(command: options.FitCommand, steps: Steps) -> CommandResult:
         "progress": steps.patience,
     }
     study: Study | MotionStudy
-    fits: dict[str, ji.Fit] = {}
+    fits: dict[str, Fit] = {}
     if is_motion(command.study):
-        from jimpact.cli.study_motion import read_motion_study
+        from jimpact.cli.study_motion import motion_study
 
-        study = read_motion_study(command.study, command.law)
+        study = motion_study(command.study, command.law)
         fits[RAW] = study.fit(**chosen, limit=command.limit)
         steps(_fit_in_words(RAW, fits[RAW]))
         return _fits_result(study.title, fits)
-    study = read_study(command.study, command.law)
+    study = impact_study(command.study, command.law)
     end = np.inf if command.limit is None else time.monotonic() + command.limit
     chosen |= {"method": command.method}
     for name, each in _fits_of(study, command.all_free, fits):
@@ -178,7 +181,7 @@ def fit(command: options.FitCommand, steps: Steps) -> CommandResult:
 
 
 def _fits_of(
-    study: Study, all_free: bool, fits: Mapping[str, "ji.Fit"]
+    study: Study, all_free: bool, fits: Mapping[str, "Fit"]
 ) -> Iterator[tuple[str, Study]]:
     """The studies to fit, by name: as it is; its momentum corrected where it must be; all free."""
     with_all_free = None
@@ -193,7 +196,7 @@ def _fits_of(
         yield ALL_FREE, with_all_free
 
 
-def _fits_result(title: str, fits: dict[str, "ji.Fit"]) -> CommandResult:
+def _fits_result(title: str, fits: dict[str, "Fit"]) -> CommandResult:
     """All fits as text, table and picture."""
     text = "\n".join([str(fits[RAW]), "", *_fits_table(fits), ""])
     heads = ["fit", "law", "parameter", "value", "standard_error", "rms_m_per_s", "rank"]
@@ -208,14 +211,14 @@ def _fits_result(title: str, fits: dict[str, "ji.Fit"]) -> CommandResult:
 
 def _fit_every_law(command: options.FitCommand, steps: Steps) -> CommandResult:
     """All laws on the study's data; the picture is that of the first one."""
-    study = read_study(command.study)
+    study = impact_study(command.study)
     fits = _laws_fitted(study, steps, starts=command.starts, seed=command.seed)
     best = fits.best
     picture = ji.plot.fit(best.fit, None, f"{study.title}: {best.name}")
     return CommandResult(study.title, fits, picture, fits.rows())
 
 
-def _laws_fitted(study: Study, steps: Steps, **chosen: int | None) -> "ji.LawFits":
+def _laws_fitted(study: Study, steps: Steps, **chosen: int | None) -> "LawFits":
     """Every law on the study's data, and whether e depends on the speed.
 
     `chosen`: starts and seed in the place of the study's.
@@ -225,7 +228,7 @@ def _laws_fitted(study: Study, steps: Steps, **chosen: int | None) -> "ji.LawFit
     searches = {key: x for key, x in study.options.items() if key in ("starts", "seed")}
     friction = [name for name in study.free if name in FRICTION_PARAMETERS]
 
-    def done(name: str, fit: "ji.Fit") -> None:
+    def done(name: str, fit: "Fit") -> None:
         """Count a law as a step."""
         steps(_fit_in_words(name, fit))
 
@@ -262,7 +265,7 @@ def _per_contact(study: Study) -> tuple[Study, Study | None]:
     return study, replace(study, free=dict.fromkeys(fields, True))
 
 
-def _fits_table(fits: dict[str, "ji.Fit"]) -> list[str]:
+def _fits_table(fits: dict[str, "Fit"]) -> list[str]:
     """A line for each parameter of each fit, and what the data determine with all of them free."""
     rows = []
     for name, fit in fits.items():
@@ -283,14 +286,14 @@ def _fits_table(fits: dict[str, "ji.Fit"]) -> list[str]:
     return lines
 
 
-def _fit_in_words(name: str, fit: "ji.Fit") -> str:
+def _fit_in_words(name: str, fit: "Fit") -> str:
     """The values of a fit in one line."""
     values = ", ".join(f"{x} {_value(fit, i)}" for i, x in enumerate(fit.names))
     unit = "" if fit.experiments is None else " m/s"
     return f"{name}: {values}, rms {fit.rms:.4g}{unit}"
 
 
-def _value(fit: "ji.Fit", i: int) -> str:
+def _value(fit: "Fit", i: int) -> str:
     """A fitted value with its standard error."""
     error = fit.standard_error[i]
     if not fit.determined[i]:
@@ -340,7 +343,7 @@ def compare(command: options.CompareCommand, steps: Steps) -> CommandResult:
 
 def montecarlo(command: options.MonteCarloCommand, steps: Steps) -> CommandResult:
     """Random gaps, velocities, parameters."""
-    study = read_study(command.study)
+    study = impact_study(command.study)
     result = ji.monte_carlo(**_sampling(study, command), progress=steps.patience)
     steps(f"{result.samples:,} samples")
     picture = ji.plot.monte_carlo(result, study.title)
@@ -487,9 +490,9 @@ def _advise_parameters(study: Study) -> dict[str, Any]:
 
 def simulate(command: options.SimulateCommand, steps: Steps) -> CommandResult:
     """A whole motion; one that does not reach its end is drawn and printed as far as it goes."""
-    from jimpact.cli.study_motion import read_motion_study
+    from jimpact.cli.study_motion import motion_study
 
-    study = read_motion_study(command.study)
+    study = motion_study(command.study)
     system, title = study.system, study.title
     motion = jax.block_until_ready(
         study.run(t_end=command.t_end, samples=command.samples, progress=steps.patience)
@@ -514,10 +517,10 @@ def simulate(command: options.SimulateCommand, steps: Steps) -> CommandResult:
     return CommandResult(title, motion, picture, table, more=more, failure=_failure(motion))
 
 
-def _failure(motion: "ji.Motion") -> str:
+def _failure(motion: "Motion") -> str:
     """Why a motion failed, '' if it did not."""
     try:
-        ji.raise_on_failed_motion(motion)
+        ji.raise_on_failure(motion)
     except RuntimeError as error:
         return str(error)
     return ""

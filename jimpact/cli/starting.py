@@ -74,8 +74,8 @@ TEMPLATES = {
         "[system]",
         "A whole motion",
         (
-            'study = ji.read_motion_study("study.toml")\nstudy.law',
-            "motion = study.run()\nji.raise_on_failed_motion(motion)\nprint(motion)",
+            'study = ji.read_study("study.toml")\nstudy.law',
+            "motion = study.run()\nji.raise_on_failure(motion)\nprint(motion)",
             "ji.plot.motion(motion, study.title, system=study.system)",
         ),
     ),
@@ -83,8 +83,7 @@ TEMPLATES = {
 _HEAD = """\
 # A study of your own: change the numbers, then run
 #     jimpact {kind} study.toml
-# Every key carries its unit. All keys: `help(jimpact.read_study)`, for a motion
-# `help(jimpact.read_motion_study)`.
+# Every key carries its unit. All keys: `help(jimpact.read_study)`.
 """
 DATA = "shots.csv"
 

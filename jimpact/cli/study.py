@@ -2,9 +2,8 @@
 
 import importlib.util
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -82,43 +81,8 @@ class Study:
         return of_shots(self.law, self.scene, self.experiments, *choice)
 
 
-def read_study(path: str | Path, law: str | None = None) -> Study:
-    """A study from its TOML file: scene, law, what is free, and the data, ready to be fitted.
-
-    Args:
-        path: path of the file or of its folder, or the name of a bundled study
-            (`three_balls.toml`).
-        law: name of another law in the place of the study's.
-
-    The tables of the file:
-
-    - `[scene]`: masses_kg, wall, gaps_m (a chain, see `chain`); or kind, the name of a body, with
-      its arguments (`width_m`, `mass_kg`, ...), q, its configuration at the impact, closed_below_m.
-    - `[law]`: name (`jimpact laws`), start values (a number for all contacts or a list with one
-      each), options, module (a file or module that registers the law, see `register`). A
-      `restitution_matrix` without its matrix starts from an admissible one.
-    - `[law.bounds]`: pairs, as `restitution = [0, 1]` or `"restitution[2]" = [0.5, 1]`.
-    - `[law.priors]`: means with standard deviations, as `restitution = [0.9, 0.02]`, see `fit`.
-    - `[fit]`: free (a list of names, or a table of masks), method, loss, starts, seed, max_steps,
-      profiles.
-    - `[data]`: file (relative to the study, see `read_experiments`), momentum_corrected; of shots
-      with scenes of their own near_m, contacts (only shots with that many). Without data a study
-      can be compared, not fitted.
-    - `[monte_carlo]`: velocity_m_per_s, gaps_m, law, samples, seed, chunk, bins; see
-      `monte_carlo`.
-
-    Returns:
-        A `Study`.
-
-    Raises:
-        FileNotFoundError: no such study or data file.
-        ValueError: the file is not TOML; a key is unknown or missing; scene, law or data refuse
-            a value.
-
-    >>> import jimpact as ji
-    >>> ji.read_study("three_balls.toml").title
-    'Three equal hard balls, one shot'
-    """
+def impact_study(path: str | Path, law: str | None = None) -> Study:
+    """The study of one impact, see `read_study`."""
 
     def build(tables: dict[str, Any], file: Path) -> Study:
         """The study of these tables."""
@@ -180,66 +144,18 @@ def _experiments(table: Mapping[str, Any], path: Path, place: Scene | Body) -> E
         if isinstance(place, Scene):
             experiments.scene_of(place, 0)  # raises where their sizes differ
     if "contacts" in table:
-        experiments = _with_contacts(experiments, table["contacts"])
+        experiments = experiments.with_contacts(table["contacts"])
     if table.get("momentum_corrected", False):
         return experiments.momentum_corrected(place if isinstance(place, Scene) else None)
     return experiments
 
 
-def _with_contacts(experiments: Experiments, contacts: int | Sequence[int]) -> Experiments:
-    """The shots on such numbers of contacts."""
-    chosen = np.isin(experiments.contacts, contacts)
-    if not chosen.any():
-        numbers = ", ".join(map(str, sorted(set(experiments.contacts))))
-        raise ValueError(f"`contacts` in [data] must be one of {numbers}, but is {contacts}.")
-    return experiments.only(chosen)
-
-
-def cube_impacts(
-    contacts: int | Sequence[int] | None = None, near: float = 2e-3, nearly_clean: bool = False
-) -> Experiments:
-    """400 measured impacts of a tossed acrylic cube on a board, each in the scene of its pose.
-
-    Velocities are those of the centre of mass (m/s, axes of the board) and the angular velocity
-    (rad/s, axes of the cube), before and after, with standard errors; a label is "toss:frame", the
-    frame being the last one before the impact. The cube is the `Box` of `tossed_cube.toml`.
-
-    Args:
-        contacts: only impacts on this number of corners (or several numbers); None: all.
-        near: corners up to so far above the lowest one touch, too (board and cube are flat to
-            1.4 mm) [m].
-        nearly_clean: True: also 84 impacts on two corners that are less clean (flights before and
-            after meet within .5 mm, not .3 mm). `docs/cube.md` compares laws on all of them.
-
-    Returns:
-        `Experiments` of up to 484 shots of 6 velocities, with sigma and scenes.
-
-    Source: ContactNets (Pfrommer, Halm and Posa, CoRL 2020), see `cube_NOTICE.txt` in `data`.
-
-    >>> import jimpact as ji
-    >>> two = ji.cube_impacts(contacts=2)
-    >>> two.pre.shape, two.scenes[0].contacts, two.units[5]
-    ((21, 6), 2, 'rad/s')
-    """
-    path = Path(str(files("jimpact") / "data" / "tossed_cube.toml"))
-
-    def read(tables: Mapping[str, Any], file: Path) -> Experiments:
-        """The shots of these tables."""
-        names = (tables["data"]["file"], *(("cube_nearly_clean.csv",) if nearly_clean else ()))
-        body = body_of("[scene]", tables["scene"], AT_KEYS)
-        parts = [_experiments({"file": name, "near_m": near}, file, body) for name in names]
-        return Experiments.join(parts) if nearly_clean else parts[0]
-
-    shots = from_file(path, "[scene]", read)
-    return shots if contacts is None else _with_contacts(shots, contacts)
-
-
 def body_of(where: str, table: Mapping[str, Any], others: tuple[str, ...] = ()) -> Body:
     """The body that a table of a study describes.
 
-    `kind` is the name of a body's class (`Block`, `Box`, `PlanarBodies`, ..., in any case); the
+    `kind` is the name of a body's class (`Block`, `Box`, `Bodies`, ..., in any case); the
     other keys are the arguments of that class, with their units behind them: `width_m`, `mass_kg`,
-    `inertia_kg_m2`, `angle_rad`. Bodies of `PlanarBodies` and `SpatialBodies` are tables of this
+    `inertia_kg_m2`, `angle_rad`. Bodies of `Bodies` are tables of this
     kind themselves.
     `others` are keys of the table that mean something else.
 

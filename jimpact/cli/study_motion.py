@@ -6,7 +6,14 @@ from pathlib import Path
 from typing import Any
 
 from jimpact.bodies.base import STANDARD_GRAVITY
-from jimpact.cli.study import body_of, import_module_of, with_exponent, without_none
+from jimpact.cli.study import (
+    Study,
+    body_of,
+    impact_study,
+    import_module_of,
+    with_exponent,
+    without_none,
+)
 from jimpact.files.shots_file import UNEVEN_STEPS, Positions, read_positions
 from jimpact.files.study_file import (
     BASE_KEYS,
@@ -16,6 +23,7 @@ from jimpact.files.study_file import (
     CheckedStudy,
     check_motion_tables,
     from_file,
+    is_motion,
 )
 from jimpact.fits.fitting import Fit
 from jimpact.fits.parameters import default_free
@@ -32,7 +40,7 @@ _DIRECTIONS = {1: ("vertical",), 2: ("horizontal", "vertical"), 3: ("x", "y", "v
 
 @dataclass(frozen=True)
 class MotionStudy:
-    """A study that `read_motion_study` read; `run` simulates it, `fit` fits it to its data.
+    """A study that `read_study` read; `run` simulates it, `fit` fits it to its data.
 
     Attributes:
         title: of pictures and reports.
@@ -80,37 +88,8 @@ class MotionStudy:
         return simulate(self.system, self.law, **(self.arguments | without_none(options)))
 
 
-def read_motion_study(path: str | Path, law: str | None = None) -> MotionStudy:
-    """The study of a motion from its TOML file: system, law, initial state, perhaps data.
-
-    Args:
-        path: path of the file or of its folder, or the name of a bundled study
-            (`cradle_motion.toml`).
-        law: name of another law in the place of the study's.
-
-    The tables of the file:
-
-    - `[system]`: kind, the name of a body, with its arguments (`width_m`, `mass_kg`, ...), and
-      gravity_m_per_s2, 0 for none.
-    - `[base]`: amplitude_m, frequency_hz, phase_rad, direction (vertical; in the plane also
-      horizontal, in space x or y).
-    - `[law]`, `[law.bounds]`: as in other studies, see `read_study`.
-    - `[motion]`: q0, v0, t_end_s and the options of `simulate`.
-    - `[data]`: file, a CSV file with columns t[s] in equal steps, q_1[m], q_2[rad], ... and perhaps
-      sigma_q_1[m], ...; `[fit]` (without method): what is free. With these it can be fitted.
-
-    Returns:
-        A `MotionStudy`.
-
-    Raises:
-        FileNotFoundError: no such study or data file.
-        ValueError: the file is not TOML; a key is unknown or missing; system or law refuse a
-            value.
-
-    >>> import jimpact as ji
-    >>> ji.read_motion_study("cradle_motion.toml").title
-    "Newton's cradle, three balls"
-    """
+def motion_study(path: str | Path, law: str | None = None) -> MotionStudy:
+    """The study of a motion, see `read_study`."""
 
     def build(tables: dict[str, Any], file: Path) -> MotionStudy:
         """The study of these tables."""
@@ -158,3 +137,53 @@ def _system(table: Mapping[str, Any], base: Mapping[str, Any] | None) -> System:
     motion = HarmonicBase(**{BASE_KEYS[key]: x for key, x in base.items() if key != "direction"})
     moved = directions[:, names.index(direction), None]
     return System(body, potential=weight, base=motion, base_directions=moved)
+
+
+def read_study(path: str | Path, law: str | None = None) -> Study | MotionStudy:
+    """A study from its TOML file: of one impact, or with a table [system] of a motion.
+
+    Args:
+        path: path of the file or of its folder, or the name of a bundled study
+            (`three_balls.toml`, `cradle_motion.toml`).
+        law: name of another law in the place of the study's.
+
+    The tables of a file on impacts:
+
+    - `[scene]`: masses_kg, wall, gaps_m (a chain, see `chain`); or kind, the name of a body, with
+      its arguments (`width_m`, `mass_kg`, ...), q, its configuration at the impact, closed_below_m.
+    - `[law]`: name (`jimpact laws`), start values (a number for all contacts or a list with one
+      each), options, module (a file or module that registers the law, see `register`). A
+      `restitution_matrix` without its matrix starts from an admissible one.
+    - `[law.bounds]`: pairs, as `restitution = [0, 1]` or `"restitution[2]" = [0.5, 1]`.
+    - `[law.priors]`: means with standard deviations, as `restitution = [0.9, 0.02]`, see `fit`.
+    - `[fit]`: free (a list of names, or a table of masks), method, loss, starts, seed, max_steps,
+      profiles.
+    - `[data]`: file (relative to the study, see `read_experiments`), momentum_corrected; of shots
+      with scenes of their own near_m, contacts (only shots with that many). Without data a study
+      can be compared, not fitted.
+    - `[monte_carlo]`: velocity_m_per_s, gaps_m, law, samples, seed, chunk, bins; see
+      `monte_carlo`.
+
+    On a motion, with [law], [law.bounds], [law.priors] and [fit] (without method) as above:
+
+    - `[system]`: kind, the name of a body, with its arguments (`width_m`, `mass_kg`, ...), and
+      gravity_m_per_s2, 0 for none.
+    - `[base]`: amplitude_m, frequency_hz, phase_rad, direction (vertical; in the plane also
+      horizontal, in space x or y).
+    - `[motion]`: q0, v0, t_end_s and the options of `simulate`.
+    - `[data]`: file, a CSV file with columns t[s] in equal steps, q_1[m], q_2[rad], ... and perhaps
+      sigma_q_1[m], ...
+
+    Returns:
+        A `Study`, or a `MotionStudy`.
+
+    Raises:
+        FileNotFoundError: no such study or data file.
+        ValueError: the file is not TOML; a key is unknown or missing; scene, system, law or data
+            refuse a value.
+
+    >>> import jimpact as ji
+    >>> ji.read_study("three_balls.toml").title, ji.read_study("cradle_motion.toml").title
+    ('Three equal hard balls, one shot', "Newton's cradle, three balls")
+    """
+    return motion_study(path, law) if is_motion(path) else impact_study(path, law)

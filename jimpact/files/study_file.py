@@ -76,7 +76,7 @@ MOTION_TABLES = {
 }
 # Units of the bodies' arguments, which a study writes behind their names. Words and directions have
 # no unit here, nor have lists of points [m] or of mixed units (`corners` of a Polygon, `planes`,
-# `walls`, `at`), which the classes document.
+# `at`), which the classes document.
 _UNITS = {
     **dict.fromkeys(("mass", "masses", "sphere_mass", "rod_mass"), "kg"),
     **dict.fromkeys(("disk_mass", "ball_masses"), "kg"),
@@ -214,7 +214,7 @@ def check_study(path: str | Path, law: str | None = None) -> tuple[CheckedStudy,
 
 
 def check_motion_study(path: str | Path, law: str | None = None) -> CheckedStudy:
-    """The study of a motion, all checked; see `read_motion_study`."""
+    """The study of a motion, all checked; see `read_study`."""
 
     def check(tables: dict[str, Any], file: Path) -> CheckedStudy:
         """Check the tables and the positions."""

@@ -220,6 +220,14 @@ class Experiments(eqx.Module):
         # what it adds to sigma is there already
         return eqx.tree_at(_RESOLUTION, copy, resolution, is_leaf=lambda x: x is None)
 
+    def with_contacts(self, contacts: int | Sequence[int]) -> "Experiments":
+        """The shots on such numbers of `contacts`."""
+        chosen = np.isin(self.contacts, contacts)
+        if not chosen.any():
+            numbers = ", ".join(map(str, sorted(set(self.contacts))))
+            raise ValueError(f"`contacts` in [data] must be one of {numbers}, but is {contacts}.")
+        return self.only(chosen)
+
     def only(self, which: Any) -> "Experiments":
         """Some of the shots: `which`, by indices (from 0) or a boolean for each.
 

@@ -430,7 +430,7 @@ class Fit(FitResult[AnyLaw]):
         return f"{sentence}."
 
     def save(self, path: str | Path) -> Path:
-        """Write the fit to a file (JSON) that `ji.load_fit` reads: problem, result, versions.
+        """Write the fit to a file (JSON) that `ji.load` reads: problem, result, versions.
 
         Args:
             path: the file; an existing file is replaced.
@@ -527,32 +527,9 @@ class Fit(FitResult[AnyLaw]):
         return "\n\n".join("\n".join(block) for block in report_blocks(self).values() if block)
 
 
-def load_fit(path: str | Path) -> Fit[Any]:
-    """The fit that `Fit.save` has written, with all that one can do with a fit.
-
-    The classes of laws and scenes are imported by name, so read only files that you trust.
-
-    Args:
-        path: the file.
-
-    Returns:
-        `Fit`.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: no saved fit, one of another format, a law that cannot be imported.
-
-    >>> import tempfile
-    >>> from pathlib import Path
-    >>> import jimpact as ji
-    >>> data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.3, 0.7], [0.6, 1.4]], sigma=0.02)
-    >>> result = ji.fit(ji.Newton(0.9), ji.chain([1.0, 1.0]), data)
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     again = ji.load_fit(result.save(Path(folder) / "fit.json"))
-    >>> again.verdict == result.verdict
-    True
-    """
-    return Fit(**_read_fit(Path(path)))
+def read_fit(path: Path) -> Fit[Any]:
+    """The fit that `Fit.save` wrote."""
+    return Fit(**_read_fit(path))
 
 
 # ---------------------------------------------------------------------------- as data

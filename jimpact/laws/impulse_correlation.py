@@ -1,12 +1,12 @@
 """Impulse correlation ratios: a contact beside a collision gets a constant share of its impulse."""
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_per_contact, check_values, is_traced
+from jimpact._checks import is_traced
 from jimpact.compiling import full_precision
 from jimpact.contact import Contact, delassus_matrix
 from jimpact.law import Impulses, Law, Values, option, parameter
@@ -71,7 +71,7 @@ class ImpulseCorrelation(Law):
         m = scene.contacts
         with jax.ensure_compile_time_eval():  # inside jit too, where all of these are known
             closed = np.asarray(scene.closed)
-            low, high = _interval(scene, self.restitution)
+            low, high = interval(scene, self.restitution)
         ratio = np.broadcast_to(np.asarray(self.ratio, float), (m, m))
         for i, j in zip(*np.nonzero(~np.isnan(low) & closed[:, None] & closed[None, :])):
             least, most = low[i, j] * (1 - ROUNDING), high[i, j] * (1 + ROUNDING)
@@ -96,41 +96,7 @@ class ImpulseCorrelation(Law):
         return Impulses(p, None, end.code)
 
 
-def correlation_interval(scene: Scene, restitution: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Ratios `r_j = dp_j / dp_i` that mechanics allows a contact j at rest beside contact i.
-
-    Equation: `r_j >= -W_ij / W_jj`, or contact j would approach; and contact i ends apart only
-    where `W_ii + 2 W_ij r + W_jj r^2 <= (1 + e_i^2) (W_ii + W_ij r)`, with
-    `W_ii + W_ij r > 0`. For three equal balls that hit at e = 1: 1/2 to 1, the whole arc of
-    outcomes that conserve energy.
-
-    Args:
-        scene: m contacts.
-        restitution: energetic coefficient e in [0, 1], scalar or (m,).
-
-    Returns:
-        Least and largest ratios, each (m, m): row i, column j; NaN where contact i does not press
-        contact j (`W_ij >= 0`), which then gets no impulse. Least above largest: there is none.
-
-    Raises:
-        ValueError: restitution out of range or of a wrong size.
-
-    Host function, not differentiable.
-
-    Source: own derivation, from `ImpulseCorrelation` of two contacts.
-
-    >>> import jimpact as ji
-    >>> low, high = ji.correlation_interval(ji.chain([1.0, 1.0, 1.0]), 0.9)
-    >>> round(float(low[0, 1]), 6), round(float(high[0, 1]), 6)
-    (0.5, 0.948753)
-    """
-    e = as_float_array("restitution", restitution)
-    check_values("restitution", e, low=0.0, high=1.0)
-    check_per_contact("restitution", e, scene.contacts)
-    return _interval(scene, e)
-
-
-def _interval(scene: Scene, restitution: jax.Array) -> tuple[np.ndarray, np.ndarray]:
+def interval(scene: Scene, restitution: jax.Array) -> tuple[np.ndarray, np.ndarray]:
     """Both ends (m, m) on the host; the upper one is a root of the quadratic inequality."""
     w = np.asarray(as_matrix(delassus_matrix(scene)), float)
     own, other = np.diag(w)[:, None], np.diag(w)[None, :]

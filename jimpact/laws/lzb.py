@@ -2,11 +2,9 @@
 
 from typing import Any, ClassVar
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_values
 from jimpact.compiling import full_precision
 from jimpact.contact import Contact
 from jimpact.derive import ADJOINTS
@@ -72,72 +70,6 @@ def check_friction(friction: Any, scene: Scene) -> None:
             f"Argument `scene` must have at most {MOST_WITH_FRICTION} contacts for impact dynamics "
             f"with friction, but has {scene.contacts}: algebraic laws such as Moreau take more."
         )
-
-
-def distributing_rule(energy: Any, stiffness: Any, exponent: Any) -> jax.Array:
-    """`Gamma_ji = dp_j / dp_i` (m, m), the ratio of impulse increments at two contacts.
-
-    Equation: `Gamma_ji = F_j / F_i`, `F_j = ((1 + eta_j) E_j)^(eta_j / (1 + eta_j))
-    k_j^(1 / (1 + eta_j))`.
-
-    Args:
-        energy: E_j >= 0 (m,) [J], potential energy of each contact.
-        stiffness: k_j > 0, scalar or (m,) [N / m^eta_j].
-        exponent: eta_j >= 1, scalar or (m,).
-
-    Returns:
-        Row j, column i: Gamma_ji; NaN or inf in columns with E_i = 0 (0/0 at the first touch:
-        why the law is integrated in time form, see `LZB`).
-
-    Raises:
-        ValueError: energy < 0, stiffness <= 0, exponent < 1.
-
-    Source: Liu, Zhao and Brogliato (2008); Brogliato (2016), (6.70).
-
-    >>> import jimpact as ji
-    >>> round(float(ji.distributing_rule([1.0, 0.3], [1.0, 2.0], 1.5)[1, 0]), 5)
-    0.64074
-    """
-    energy = as_float_array("energy", energy)
-    stiffness = as_float_array("stiffness", stiffness)
-    eta = as_float_array("exponent", exponent)
-    check_values("energy", energy, low=0.0)
-    check_values("stiffness", stiffness, low=0.0, open_low=True)
-    check_values("exponent", eta, low=1.0)
-    force = ((1 + eta) * energy) ** (eta / (1 + eta)) * stiffness ** (1 / (1 + eta))
-    return force[:, None] / force[None, :]
-
-
-def precompression_energy(force: Any, stiffness: Any, exponent: Any = 1.5) -> jax.Array:
-    """Energy stored in contacts that press on each other before an impact: `initial_energy`.
-
-    Equation: `U_0j = F_0j^((eta_j + 1) / eta_j) / ((eta_j + 1) k_j^(1 / eta_j))`, the integral of
-    `F = k x^eta` up to the force F_0.
-
-    Args:
-        force: F_0j >= 0, scalar or (m,) [N].
-        stiffness: k_j > 0, scalar or (m,) [N / m^eta_j].
-        exponent: eta_j >= 1, scalar or (m,).
-
-    Returns:
-        U_0 [J], of the common shape, for `LZB` and `Compliant`.
-
-    Raises:
-        ValueError: force < 0, stiffness <= 0, exponent < 1.
-
-    Source: Brogliato (2016), 6.3.1, with the exponent 1 / eta of `docs/equations.md`.
-
-    >>> import jimpact as ji
-    >>> round(float(ji.precompression_energy(2.0, stiffness=8.0, exponent=1.0)), 6)  # F^2 / (2 k)
-    0.25
-    """
-    force = as_float_array("force", force)
-    stiffness = as_float_array("stiffness", stiffness)
-    eta = as_float_array("exponent", exponent)
-    check_values("force", force, low=0.0)
-    check_values("stiffness", stiffness, low=0.0, open_low=True)
-    check_values("exponent", eta, low=1.0)
-    return force ** ((eta + 1) / eta) / ((eta + 1) * stiffness ** (1 / eta))
 
 
 class LZB(Law):

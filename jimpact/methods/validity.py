@@ -15,9 +15,9 @@ from jimpact.law import Law
 from jimpact.laws.binary import Binary
 from jimpact.laws.kinematic import Moreau
 from jimpact.laws.lzb import LZB
-from jimpact.methods.comparison import dispersion_index
 from jimpact.scene import Scene, as_velocity
 from jimpact.status import STATUS
+from jimpact.theory.dispersion import dispersion_index
 
 RATIOS = (1e-3, 1e3, 121)  # default ratios: from, to, how many
 

@@ -231,7 +231,7 @@ def check_pile(system: System, q: jax.Array, mu: jax.Array | None, method: str) 
     if mu is not None:
         raise ValueError(
             f"Argument `friction` must be 0 for the contacts of {name} by method={method!r}: use "
-            "method='time_stepping', or few bodies as `PlanarBodies` or `SpatialBodies`."
+            "method='time_stepping', or name the `pairs` of few `Bodies`."
         )
     m = contacts_of(system, q)
     if m > MANY:

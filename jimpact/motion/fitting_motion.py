@@ -108,7 +108,7 @@ def fit_motion(
         ValueError: shapes, unknown parameters, nothing measured.
 
     >>> import jimpact as ji
-    >>> ball = ji.ball_system()
+    >>> ball = ji.System(ji.Column([1.0]), gravity=True)
     >>> measured = ji.simulate(ball, ji.Newton(0.8), [1.0], [0.0], 1.5, samples=16).q
     >>> result = ji.fit_motion(ball, ji.Newton(0.7), measured, [1.0], [0.0], 1.5)
     >>> round(float(result.value[0]), 8)

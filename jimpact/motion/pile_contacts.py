@@ -31,7 +31,7 @@ class PileContacts(NamedTuple):
         scene: the contacts as a scene without friction, for `ji.plot.force_chains`.
 
     >>> import jimpact as ji
-    >>> ball = ji.Spheres(1.0, [0.1], walls=[[0.0, 0.0, 1.0, 0.0]])
+    >>> ball = ji.Bodies([ji.Sphere(0.1)], room=8)
     >>> system, v = ji.System(ball), [1.0, 0.0, -2.0, 0.0, 0.0, 0.0]
     >>> law = ji.Moreau(0.5, friction=0.05)
     >>> found = ji.pile_contacts(system, law, ball.at([[0.0, 0.0, 0.1]]), v, step=1e-9)
@@ -59,7 +59,7 @@ def pile_contacts(
     friction, on a packing of any size.
 
     Args:
-        system: of a body with many contacts (`Discs`, `Spheres`, `PlanarPile`).
+        system: of a body with many contacts (`Bodies`).
         law: `Moreau`.
         q: (n,), for example a sample of a motion.
         v: (n,) [m/s, rad/s].
@@ -77,8 +77,8 @@ def pile_contacts(
     Source: Brogliato, Nonsmooth Mechanics (2016), Remark 6.9.
 
     >>> import jimpact as ji
-    >>> discs = ji.Discs([1.0, 2.0], [0.1, 0.1], walls=[[0.0, 1.0, 0.0]])
-    >>> system = ji.System(discs, potential=ji.gravity(discs, 10.0))
+    >>> discs = ji.Bodies([ji.Disc(0.1, 1.0), ji.Disc(0.1, 2.0)], room=8)
+    >>> system = ji.System(discs, gravity=10.0)
     >>> q = discs.at([[0.0, 0.3], [0.0, 0.1]])
     >>> found = ji.pile_contacts(system, ji.Moreau(0.0), q, [0.0] * 6, step=1e-3)
     >>> found.bodies.tolist(), [round(float(p) / 1e-3, 3) for p in found.impulse]
@@ -88,7 +88,7 @@ def pile_contacts(
     check_kind("law", law, Law)
     if not is_pile(system):
         raise ValueError(
-            "Argument `system` must be of a body with many contacts (Discs, Spheres, PlanarPile), "
+            "Argument `system` must be of a body with many contacts (`Bodies`), "
             f"but is of {type(system.body).__name__}."
         )
     q, v = as_float_array("q", q), as_float_array("v", v)

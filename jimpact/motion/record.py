@@ -2,7 +2,6 @@
 
 import dataclasses
 import zipfile
-from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact.files.records import as_data, fields_as_data
-from jimpact.status import STATUS, Status, raise_for
+from jimpact.status import STATUS, Status
 
 EVENT_KINDS = ("none", "impact", "accumulation", "contact", "detachment", "friction", "paroxysm")
 _ROUNDING = 1e-12  # of the largest work: what is smaller is not printed
@@ -121,7 +120,7 @@ class Motion(eqx.Module):
         gaps: (S, m) [m].
         events: a table of all impacts, liftoffs, .., as `print(motion)` lists them.
         steps: () of the integrator.
-        status: () code, 0 = ok; see `raise_on_failed_motion`.
+        status: () code, 0 = ok; see `raise_on_failure`.
     """
 
     time: jax.Array  # (S,)
@@ -193,8 +192,16 @@ class Motion(eqx.Module):
         table = joined([events, later.events], known.sum() + later.events.time.shape[0])
         return dataclasses.replace(later, **samples, events=table, steps=self.steps + later.steps)
 
+    def explain_failure(self, row: Status, lanes: np.ndarray) -> str:
+        """Status of the law in the failed motions `lanes` with status `row`, for the message."""
+        if row.name != "law_failed":
+            return ""
+        codes = np.asarray(self.events.status).reshape(self.status.size, -1)[lanes]
+        names = [STATUS[code].name for code in np.unique(codes.max(axis=1)) if code]
+        return f": {', '.join(names)}" if names else ""
+
     def save(self, path: str | Path) -> Path:
-        """Write everything to `path`, which ends in .npz; `ji.load_motion` reads it."""
+        """Write everything to `path`, which ends in .npz; `ji.load` reads it."""
         path = Path(path)
         if path.suffix != ".npz":
             raise ValueError(f"Argument `path` must end in .npz, but is '{path}'.")
@@ -253,32 +260,11 @@ def _arrays(motion: Motion) -> dict[str, jax.Array]:
     return {name: x for name, x in vars(motion).items() if name != "events"} | rows
 
 
-def load_motion(path: str | Path) -> Motion:
-    """A motion, or a batch, from the file that `Motion.save` wrote.
-
-    Args:
-        path: of the file.
-
-    Returns:
-        The same `Motion`, to the last digit. System and law are not in the file.
-
-    Raises:
-        FileNotFoundError: no such file. ValueError: not a file of a motion, one of a later
-            version, or double precision while JAX is in single precision.
-
-    >>> import pathlib, tempfile, jimpact as ji
-    >>> ball, law = ji.ball_system(), ji.Newton(0.5)
-    >>> motion = ji.simulate(ball, law, [1.0], [0.0], 1.0, samples=21)
-    >>> path = motion.save(pathlib.Path(tempfile.mkdtemp()) / "ball.npz")
-    >>> loaded = ji.load_motion(path)
-    >>> later = ji.simulate(ball, law, **loaded.end, t_end=2.0, samples=21)
-    >>> both = loaded.then(later)
-    >>> len(both.time), [round(float(t), 4) for t in both.event_times()[:3]]
-    (41, [0.4516, 0.9032, 1.129])
-    """
+def read_motion(path: Path) -> Motion:
+    """The motion, or batch, that `Motion.save` wrote."""
     wrong = f"Argument `path` must be a file of `Motion.save`, but '{path}' "
     try:
-        with np.load(Path(path), allow_pickle=False) as file:
+        with np.load(path, allow_pickle=False) as file:
             arrays = dict(file)
     except (ValueError, zipfile.BadZipFile, EOFError) as error:
         raise ValueError(f"{wrong}cannot be read.") from error
@@ -315,34 +301,3 @@ def _batch_report(motion: Motion) -> str:
     codes, counts = np.unique(np.asarray(motion.status), return_counts=True)
     parts = ", ".join(f"{n} {STATUS[c].name}" for c, n in zip(codes, counts, strict=True))
     return f"{np.size(motion.status)} motions: {parts}"
-
-
-def _law_failures(motion: Motion, row: Status, lanes: np.ndarray) -> str:
-    """Status of the law in the failed motions `lanes`, for the message."""
-    if row.name != "law_failed":
-        return ""
-    codes = np.asarray(motion.events.status).reshape(motion.status.size, -1)[lanes]
-    names = [STATUS[code].name for code in np.unique(codes.max(axis=1)) if code]
-    return f": {', '.join(names)}" if names else ""
-
-
-def raise_on_failed_motion(motion: Motion) -> Motion:
-    """Raise a RuntimeError naming every failed motion (batched or not); else return it.
-
-    Args:
-        motion: what `simulate` returned, one or a batch.
-
-    Returns:
-        `motion` itself.
-
-    Raises:
-        RuntimeError: a status that is a failure; with the places in the batch.
-
-    >>> import jimpact as ji
-    >>> system = ji.ball_system()
-    >>> motion = ji.simulate(system, ji.Newton(0.5), [1.0], [0.0], 1.0, samples=21)
-    >>> ji.raise_on_failed_motion(motion) is motion
-    True
-    """
-    raise_for(motion.status, STATUS, "motions", partial(_law_failures, motion))
-    return motion

@@ -132,12 +132,13 @@ def simulate(
     Raises:
         NotImplementedError: derivatives of time stepping, which do not converge with the step.
         ValueError: shapes, t_end <= t_start, penetration, NaN in base motion or mass, on the
-            host; inside jit the status reports them (`raise_on_failed_motion`).
+            host; inside jit the status reports them (`raise_on_failure`).
 
     Source: Brogliato, Nonsmooth Mechanics (2016), Remark 6.9 for the time stepping.
 
     >>> import jimpact as ji
-    >>> motion = ji.simulate(ji.ball_system(), ji.Newton(0.8), [1.0], [0.0], 5.0, samples=21)
+    >>> ball = ji.System(ji.Column([1.0]), gravity=True)
+    >>> motion = ji.simulate(ball, ji.Newton(0.8), [1.0], [0.0], 5.0, samples=21)
     >>> [round(float(t), 6) for t in motion.event_times()[:3]]
     [0.451601, 1.174162, 1.752211]
     >>> [round(float(t), 6) for t in motion.events.accumulation_end[motion.events.count - 1 :][:1]]

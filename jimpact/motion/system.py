@@ -1,4 +1,4 @@
-"""Systems of mechanical motion: bodies under loads; the ready ones."""
+"""Systems of mechanical motion: bodies under loads."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,10 +9,6 @@ import jax.numpy as jnp
 
 from jimpact._checks import as_float_array, check_values, in_numbers
 from jimpact.bodies.base import STANDARD_GRAVITY, Body, GivenBody, LinearPotential, Potential
-from jimpact.bodies.blocks import Block
-from jimpact.bodies.dimers import Dimer
-from jimpact.bodies.particles import Column
-from jimpact.bodies.pendulums import PendulumCradle
 
 Base = Callable[[jax.Array], jax.Array]  # t () -> displacement y_b (d,) [m]
 
@@ -29,7 +25,9 @@ class System(eqx.Module):
         mass: M: (n,), (n, n), or a function q -> M(q); its Coriolis terms follow by
             differentiation of `T = v^T M(q) v / 2`.
         force: (q, v, t) -> generalized forces (n,); None: none.
-        potential: q -> V () [J], its forces are `-grad V`; None: 0 (see `gravity`).
+        potential: q -> V () [J], its forces are `-grad V`; None: 0.
+        gravity: True: the body has a weight; or its acceleration g [m/s^2]. For functions, see
+            `gravity`.
         tangent_function: q_r -> tangential displacements h (m,) [m] of the contacts (planar);
             their gradients are the tangents. None: no friction possible.
         base: t -> displacement y_b (d,) [m] of a moving base, written with jax.numpy.
@@ -40,15 +38,20 @@ class System(eqx.Module):
     JAX compiles again for each new lambda.
 
     Raises:
-        ValueError: a mass that is not positive definite, a base without its directions.
+        ValueError: a mass that is not positive definite, a base without its directions, a potential
+            besides gravity. TypeError: gravity of functions.
 
     >>> import jax.numpy as jnp, jimpact as ji
     >>> ball = ji.System(lambda q: q[1:] - 0.5, [2.0, 2.0], potential=ji.gravity([0.0, 2.0]))
     >>> float(ball.potential(jnp.array([0.0, 1.0])))
     19.6133
     >>> block = ji.Block(width=0.2, height=0.6)
-    >>> ji.System(block, potential=ji.gravity(block)).mass.shape
-    (3,)
+    >>> float(ji.System(block, gravity=10.0).potential(jnp.array([0.0, 2.0, 0.0])))
+    20.0
+    >>> ball = ji.System(ji.Column([1.0]), gravity=True)
+    >>> motion = ji.simulate(ball, ji.Newton(0.5), [1.0], [0.0], 1.0, samples=21)
+    >>> round(float(motion.events.time[0]), 6)
+    0.451601
     """
 
     body: Body
@@ -75,6 +78,7 @@ class System(eqx.Module):
         tangent_function: Callable[[jax.Array], jax.Array | None] | None = None,
         base: Base | None = None,
         base_directions: Any = None,
+        gravity: Any = False,
     ):
         for name, function in {"force": force, "potential": potential, "base": base}.items():
             if not (callable(function) or function is None):
@@ -88,6 +92,14 @@ class System(eqx.Module):
                 "Arguments `mass` and `tangent_function` must not be given with a body, which has "
                 "its own."
             )
+        if gravity is not False:
+            if potential is not None:
+                raise ValueError("Argument `potential` must not be given besides `gravity`.")
+            acceleration = as_float_array(
+                "gravity", STANDARD_GRAVITY if gravity is True else gravity
+            )
+            check_values("gravity", acceleration)
+            potential = self.body.gravity(acceleration)
         self.force, self.potential, self.base = force, potential, base
         if base is not None and base_directions is None:
             base_directions = self.body.base_directions
@@ -161,7 +173,7 @@ class HarmonicBase(eqx.Module):
         amplitude: A [m].
         frequency: f [Hz].
         phase: [rad].
-        direction: 'line' for systems that move along one (`ball_system`, `column_system`);
+        direction: 'line' for systems that move along one (`Column`);
             'vertical' or 'horizontal' for bodies in the plane.
 
     >>> import jimpact as ji
@@ -193,156 +205,3 @@ class HarmonicBase(eqx.Module):
             return y[None]
         pair = (0 * y, y) if self.direction == "vertical" else (y, 0 * y)
         return jnp.stack(pair)
-
-
-def _under_gravity(body: Body, acceleration: Any, base: Base | None = None) -> System:
-    """The system of a body in gravity [m/s^2]."""
-    return System(body, potential=gravity(body, acceleration), base=base)
-
-
-def column_system(
-    masses: Any,
-    radii: Any = 0.0,
-    acceleration: Any = STANDARD_GRAVITY,
-    base: Base | None = None,
-) -> System:
-    """Balls above one another on a floor, or a plate that moves vertically: `Column` in gravity.
-
-    Args:
-        masses: (n,) [kg].
-        radii: scalar or (n,) [m].
-        acceleration: of gravity [m/s^2].
-        base: t -> height of the plate () [m].
-
-    Returns:
-        `System` of n heights [m] and n contacts, the floor first.
-
-    Raises:
-        ValueError: masses not positive, radii negative.
-
-    >>> import jimpact as ji
-    >>> ji.column_system([1.0, 2.0], 0.1).mass.tolist()
-    [1.0, 2.0]
-    """
-    return _under_gravity(Column(masses, radii), acceleration, base)
-
-
-def ball_system(
-    mass: Any = 1.0,
-    acceleration: Any = STANDARD_GRAVITY,
-    base: Base | None = None,
-) -> System:
-    """A ball (a point at height q) above a floor or a vibrating plate: a `Column` of one.
-
-    Args:
-        mass: > 0 [kg].
-        acceleration: of gravity [m/s^2].
-        base: t -> height of the plate () [m]; None: it stands still.
-
-    Returns:
-        `System` of one coordinate, q (1,) [m], and one contact.
-
-    Raises:
-        ValueError: a mass that is not positive.
-
-    >>> import jimpact as ji
-    >>> motion = ji.simulate(ji.ball_system(), ji.Newton(0.5), [1.0], [0.0], 1.0, samples=21)
-    >>> round(float(motion.events.time[0]), 6)
-    0.451601
-    """
-    mass = jnp.atleast_1d(as_float_array("mass", mass))
-    check_values("mass", mass, low=0.0, open_low=True)
-    return column_system(mass, 0.0, acceleration, base)
-
-
-def cradle_system(
-    masses: Any,
-    length: Any = 0.1,
-    diameter: Any = 0.02,
-    gap: Any = 0.0,
-    acceleration: Any = STANDARD_GRAVITY,
-) -> System:
-    """Newton's cradle, a row of pendulums: `PendulumCradle` in gravity, q the angles.
-
-    Args:
-        masses: (n,) [kg], points for the kinetic energy.
-        length: l [m], from pivot to centre.
-        diameter: d [m].
-        gap: distance between hanging balls [m].
-        acceleration: of gravity [m/s^2].
-
-    Returns:
-        `System` of n angles [rad] and n - 1 contacts.
-
-    Raises:
-        ValueError: sizes or masses not positive, a negative gap.
-
-    >>> import jimpact as ji, jax.numpy as jnp
-    >>> float(ji.cradle_system([1.0, 1.0]).gap_function(jnp.zeros(2))[0])
-    0.0
-    """
-    diameter = as_float_array("diameter", diameter)
-    check_values("diameter", diameter, low=0.0, open_low=True)
-    return _under_gravity(PendulumCradle(masses, length, diameter / 2, gap), acceleration)
-
-
-def block_system(
-    width: Any,
-    height: Any,
-    mass: Any = 1.0,
-    acceleration: Any = STANDARD_GRAVITY,
-    base: Base | None = None,
-    corners: str = "all",
-) -> System:
-    """A homogeneous planar block on a plane: `Block` in gravity; q = (x, y, theta).
-
-    Args:
-        width: w [m].
-        height: h [m].
-        mass: [kg].
-        acceleration: of gravity [m/s^2].
-        base: t -> (x_b, y_b) [m], how the plane moves.
-        corners: 'all' four make contact; 'base': the lower two, as long as it does not overturn.
-
-    Returns:
-        `System` of 3 coordinates; 4 contacts, or 2.
-
-    Raises:
-        ValueError: sizes or mass not positive, unknown corners.
-
-    >>> import jimpact as ji, jax.numpy as jnp
-    >>> ji.block_system(1.0, 2.0).gap_function(jnp.array([0.0, 1.0, 0.0])).tolist()
-    [0.0, 0.0, 2.0, 2.0]
-    """
-    return _under_gravity(Block(width, height, mass, corners=corners), acceleration, base)
-
-
-def dimer_system(
-    radius: Any,
-    length: Any,
-    sphere_mass: Any = 1.0,
-    rod_mass: Any = 1.0,
-    acceleration: Any = STANDARD_GRAVITY,
-    base: Base | None = None,
-) -> System:
-    """A planar dimer above a plate: `Dimer` in gravity; q = (x, y, theta).
-
-    Args:
-        radius: R of the spheres [m].
-        length: L of the rod between their surfaces [m].
-        sphere_mass: of one sphere [kg].
-        rod_mass: of the rod [kg], 0 for a massless one.
-        acceleration: of gravity [m/s^2].
-        base: t -> (x_b, y_b) [m], how the plate moves.
-
-    Returns:
-        `System` of 3 coordinates and 2 contacts.
-
-    Raises:
-        ValueError: sizes or masses out of range.
-
-    >>> import jimpact as ji, jax.numpy as jnp
-    >>> ji.dimer_system(0.1, 1.0).gap_function(jnp.array([0.0, 0.1, 0.0])).tolist()
-    [0.0, 0.0]
-    """
-    return _under_gravity(Dimer(radius, length, sphere_mass, rod_mass), acceleration, base)

@@ -78,7 +78,7 @@ def animation(
         TypeError: a body without outlines; RuntimeError: an MP4 without ffmpeg.
 
     >>> import tempfile, pathlib, jimpact as ji
-    >>> ball = ji.ball_system()
+    >>> ball = ji.System(ji.Column([1.0]), gravity=True)
     >>> motion = ji.simulate(ball, ji.Newton(0.5), [1.0], [0.0], 1.0, samples=21)
     >>> place = pathlib.Path(tempfile.mkdtemp())
     >>> ji.plot.animation(ball, motion, place / "ball.gif", speed=0.5, frames_per_second=10).name

@@ -96,9 +96,10 @@ def contour(result: Contour, title: str = "") -> Figure:
 
     >>> import numpy as np
     >>> import jimpact as ji
+    >>> from jimpact.fits.profiles import Contour
     >>> x = np.linspace(0.4, 0.6, 5)
     >>> d = ((x - 0.5) / 0.03)[:, None] ** 2 + ((x - 0.5) / 0.02) ** 2
-    >>> region = ji.Contour(("e[1]", "e[2]"), x, x, d, 5.99, 0.95, (0.5, 0.5), (False, False))
+    >>> region = Contour(("e[1]", "e[2]"), x, x, d, 5.99, 0.95, (0.5, 0.5), (False, False))
     >>> ji.plot.contour(region).axes[0].get_xlabel()
     'e[1]'
     """

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from jimpact._checks import check_kind
 from jimpact.files.records import readable_unit
 from jimpact.laws.histories import History
-from jimpact.methods.comparison import Comparison, energy_dispersion, energy_ratio
+from jimpact.methods.comparison import Comparison
 from jimpact.plot.style import (
     COLOURS,
     GREY,
@@ -29,6 +29,7 @@ from jimpact.plot.style import (
     write,
 )
 from jimpact.theory.admissible import admissible_set
+from jimpact.theory.dispersion import energy_dispersion, energy_ratio
 
 _SAMPLES = 120  # points of a force-indentation loop
 _UPRIGHT = 8  # names that stand side by side, at most

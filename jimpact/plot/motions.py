@@ -60,7 +60,7 @@ def motion(
         bodies: the ones to show, counted from 0, of a system whose coordinates are numbered by
             body (x1, y1, ...).
         contacts: the ones whose gaps to show, counted from 0; None: those of `bodies`, if the
-            system says which these are (`PlanarBodies.between`).
+            system says which these are (`between` of `Bodies`).
 
     Returns:
         A matplotlib figure: `.savefig(path)` writes it.
@@ -69,7 +69,7 @@ def motion(
         ValueError: a batch of motions, or names of another number; no such body or contact.
 
     >>> import jimpact as ji
-    >>> ball = ji.ball_system()
+    >>> ball = ji.System(ji.Column([1.0]), gravity=True)
     >>> motion = ji.simulate(ball, ji.Newton(0.5), [1.0], [0.0], 1.0, samples=21)
     >>> [axes.get_ylabel() for axes in ji.plot.motion(motion, system=ball).axes]
     ['height [m]', "height' [m/s]", 'gaps [m]', 'energy [J]']
@@ -334,7 +334,7 @@ def phase_portrait(
         ValueError: a batch, no such coordinate, velocities that are not rates of q.
 
     >>> import jimpact as ji
-    >>> dimer = ji.dimer_system(0.1, 1.0)
+    >>> dimer = ji.System(ji.Dimer(0.1, 1.0), gravity=True)
     >>> motion = ji.simulate(dimer, ji.Newton(0.5), [0.0, 0.3, 0.1], [0.0] * 3, 0.3, samples=21)
     >>> ji.plot.phase_portrait(motion, system=dimer).axes[0].get_xlabel()
     'angle [rad]'

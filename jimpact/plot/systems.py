@@ -82,17 +82,14 @@ def force_chains(pile: Pile, q: Any, scene: Scene, impulse: Any, title: str = ""
             impulse per contact.
 
     >>> import jimpact as ji
-    >>> balls = ji.Spheres(1.0, [0.1, 0.1])
+    >>> balls = ji.Bodies([ji.Sphere(0.1)] * 2, (), room=8)
     >>> q = balls.at([[0.0, 0.0, 0.1], [0.0, 0.0, 0.3]])
     >>> figure = ji.plot.force_chains(balls, q, balls.touching(q), [1.0])
     >>> len(figure.axes[0].collections)
     1
     """
     if not isinstance(pile, Pile):
-        raise TypeError(
-            "Argument `pile` must be Discs, Spheres or a PlanarPile, but is a "
-            f"{type(pile).__name__}."
-        )
+        raise TypeError(f"Argument `pile` must be many `Bodies`, but is a {type(pile).__name__}.")
     check_kind("scene", scene, Scene)
     if scene.pairs is None or scene.size != pile.mass.shape[0]:
         raise TypeError("Argument `scene` must be `pile.touching(q)`.")
@@ -126,7 +123,7 @@ def force_chains(pile: Pile, q: Any, scene: Scene, impulse: Any, title: str = ""
 
 def _on_walls(pile: Pile, pairs: PairNormals, centres: np.ndarray) -> np.ndarray:
     """Where contacts (m, d) of bodies with walls are."""
-    d, walls = pile.dimension, np.asarray(pile.walls)
+    d, walls = pile.dimension, np.asarray(pile.planes)
     first, normal = pairs.neighbours.bodies[:, 0], np.asarray(pairs.directions)[:, 0]
     n = normal[:, :d]
     if not len(walls):

@@ -1,10 +1,16 @@
 """Public names of `ji.theory` and where they live."""
 
+from .accelerations import contact_problem as contact_problem, quasi_lagrange as quasi_lagrange
 from .admissible import AdmissibleSet as AdmissibleSet, admissible_set as admissible_set
 from .block_domains import RockingDomain as RockingDomain, rocking_domain as rocking_domain
 from .corners import (
     CornerOutcome as CornerOutcome,
     reentrant_corner as reentrant_corner,
+)
+from .dispersion import (
+    dispersion_index as dispersion_index,
+    energy_dispersion as energy_dispersion,
+    energy_ratio as energy_ratio,
 )
 from .friction import (
     FrictionBounds as FrictionBounds,
@@ -14,6 +20,12 @@ from .friction import (
     friction_energy_change as friction_energy_change,
     friction_impulses as friction_impulses,
     restitution_inclusion as restitution_inclusion,
+)
+from .gaps import crossover as crossover, gap_sensitivity as gap_sensitivity
+from .impulse_ratios import (
+    correlation_interval as correlation_interval,
+    distributing_rule as distributing_rule,
+    precompression_energy as precompression_energy,
 )
 from .linear_chain import (
     SeparationTimes as SeparationTimes,
@@ -26,6 +38,8 @@ from .quasi_velocities import (
     contact_power as contact_power,
     from_quasi_velocities as from_quasi_velocities,
     kinetic_energy_split as kinetic_energy_split,
+    normalized_delassus as normalized_delassus,
+    normalized_gap_velocity as normalized_gap_velocity,
     quasi_basis as quasi_basis,
     to_quasi_velocities as to_quasi_velocities,
 )

@@ -8,7 +8,11 @@ import jax.numpy as jnp
 
 from jimpact._checks import as_float_array, check_shape
 from jimpact.compiling import full_precision
-from jimpact.contact import kinetic_norm, normalized_delassus, normalized_gap_velocity
+from jimpact.contact import (
+    kinetic_norm,
+    normalized_delassus as normalized_delassus,
+    normalized_gap_velocity as normalized_gap_velocity,
+)
 from jimpact.quasi_space import quasi_basis as quasi_basis
 from jimpact.scene import Scene, as_velocity, gap_velocity, momentum, velocity_change
 from jimpact.solvers.tridiagonal import as_matrix

@@ -187,7 +187,7 @@ def dissipation_matrix(delassus: jax.Array, matrix: jax.Array) -> jax.Array:
     """`Q = G^-1 - E^T G^-1 E` (m, m): the law qn+ = -E qn- loses the energy qn-^T Q qn- / 2.
 
     Args:
-        delassus: G (m, m), see `ji.normalized_delassus`.
+        delassus: G (m, m), see `ji.theory.normalized_delassus`.
         matrix: E (m, m).
 
     Returns:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_axis, as_float_array, check_shape, check_values
-from jimpact.bodies.blocks import rocking_block
+from jimpact.bodies.blocks import Block
 from jimpact.compiling import precise_jit
 from jimpact.impacts import impact
 from jimpact.laws.lzb import LZB
@@ -249,7 +249,7 @@ def _impacts(a: jax.Array, mu: jax.Array, e: jax.Array, law: LZB) -> tuple[jax.A
 
     def one(a: jax.Array, mu: jax.Array, e: jax.Array) -> tuple[jax.Array, ...]:
         """One block of aspect a."""
-        scene = rocking_block(jnp.ones_like(a), a, jnp.ones_like(a))
+        scene = Block(jnp.ones_like(a), a, jnp.ones_like(a), corners="base").scene()
         before = jnp.stack([a / 2, jnp.full_like(a, -0.5), jnp.full_like(a, -1.0)])
         fields = (mu, e)
         now = eqx.tree_at(lambda x: (x.friction, x.restitution), law, fields)

@@ -43,11 +43,14 @@ def measure(row):
     jnp.linalg.solve(jnp.eye(2), jnp.ones(2)).block_until_ready()
     balls, v, e = ji.chain([1.0] * 3), jnp.array([1.0, 0.0, 0.0]), jnp.full(2, 0.9)
     more, faster = ji.chain([1.0] * 4), jnp.array([1.0, 0.0, 0.0, 0.0])
-    block = ji.rocking_block(1.0, 2.0)
+    block = ji.Block(1.0, 2.0, corners="base").scene()
     shots = ji.Experiments(pre=[[1.0, 0, 0]], post=[[-0.0605, 0.1049, 0.9978]])
     if row == "another number of balls":
         ji.impact(ji.LZB(0.9), balls, v)
-    ball, rocks = ji.ball_system(), ji.block_system(0.2, 0.6, corners="base")
+    ball, rocks = (
+        ji.System(ji.Column([1.0]), gravity=True),
+        ji.System(ji.Block(0.2, 0.6, corners="base"), gravity=True),
+    )
     matrix = ji.RestitutionMatrix(ji.theory.rocking_matrix(0.85))
     tilted = [0.0, 0.1 * math.sin(0.15) + 0.3 * math.cos(0.15), 0.15]
     run = diffrax_event.dopri8()

@@ -29,7 +29,7 @@ def inputs(batch):
 
 def laws():
     """name -> (v, mu) -> impact."""
-    block = ji.rocking_block(width=1.0, height=1.5)
+    block = ji.Block(1.0, 1.5, corners="base").scene()
     rod = ji.Scene(block.mass, block.normals[:, :1], tangents=block.tangents[:, :1])
     runs = {}
     for name, scene in (("block", block), ("rod", rod)):

@@ -21,7 +21,7 @@ AIMS = {"ball": 26.0, "block": 100.0}
 
 def ball(e):
     """Dropped from 1 m, to rest."""
-    start = (ji.ball_system(), ji.Newton(e), [1.0], [0.0], 9.0)
+    start = (ji.System(ji.Column([1.0]), gravity=True), ji.Newton(e), [1.0], [0.0], 9.0)
     return ji.simulate(*start, samples=11, max_events=200)
 
 
@@ -29,7 +29,7 @@ def block(e):
     """Released tilted, rocks to rest."""
     law = ji.RestitutionMatrix(ji.theory.rocking_matrix(e))
     q0 = [0.0, 0.1 * np.sin(0.15) + 0.3 * np.cos(0.15), 0.15]
-    start = (ji.block_system(0.2, 0.6, corners="base"), law, q0, [0.0] * 3, 4.0)
+    start = (ji.System(ji.Block(0.2, 0.6, corners="base"), gravity=True), law, q0, [0.0] * 3, 4.0)
     return ji.simulate(*start, friction=5.0, samples=11, max_events=200)
 
 
@@ -43,7 +43,7 @@ def main():
         runs[name, "batch"] = lambda f=many: f(e).events.count
         runs[name, "one"] = lambda f=single: f(one).events.count
         runs[name, "gradient"] = lambda f=slope: f(one)
-        ji.raise_on_failed_motion(many(e))
+        ji.raise_on_failure(many(e))
         events[name, "batch"] = int(many(e).events.count.sum())
         events[name, "one"] = events[name, "gradient"] = int(single(one).events.count)
     timings = alternating(runs, repeats)

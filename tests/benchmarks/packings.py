@@ -117,7 +117,7 @@ def impact_of(name, count):
         "compliant": ji.Compliant(force, method="implicit", rtol=COARSE),
     }[name]
     at, radii = packing(count)
-    spheres = ji.Spheres(1.0, radii)
+    spheres = ji.Bodies([ji.Sphere(r) for r in radii], ())
     scene = spheres.touching(spheres.at(at))
     v = np.zeros(6 * count)
     v[-4] = -1.0
@@ -150,12 +150,14 @@ def steps_of(dimensions, count, steps=100, step=1e-3, mixed=False):
     import jimpact as ji
 
     at = grid(count, dimensions)
-    kind, floor = (ji.Spheres, [0, 0, 1.0, -0.5]) if dimensions == 3 else (ji.Discs, [0, 1.0, -0.5])
-    body = kind(1.0, 0.5 * np.ones(count), walls=[floor])
-    if mixed:
-        shapes = [ji.Disc(0.5), ji.Block(np.sqrt(0.5), np.sqrt(0.5))]
-        body = ji.PlanarPile([shapes[i % 2] for i in range(count)], walls=[floor])
-    system = ji.System(body, potential=body.gravity(9.81))
+    kind, floor = (ji.Sphere, [0, 0, 1.0, -0.5]) if dimensions == 3 else (ji.Disc, [0, 1.0, -0.5])
+    shapes = [ji.Disc(0.5), ji.Block(np.sqrt(0.5), np.sqrt(0.5))] if mixed else [kind(0.5)]
+    body = ji.Bodies(
+        [shapes[i % len(shapes)] for i in range(count)],
+        [floor],
+        room=(4, 7)[dimensions - 2] * count,
+    )
+    system = ji.System(body, gravity=9.81)
     law, start = ji.Moreau(0.3, friction=0.5), body.at(at[:, :3] if dimensions == 3 else at[:, ::2])
 
     def run():

@@ -74,7 +74,7 @@ def scene_of(name):
     import jimpact as ji
 
     if name == "plane, 2 contacts":
-        return ji.rocking_block(width=1.0, height=2.0), np.array([1.0, -1.0, 0.1])
+        return ji.Block(1.0, 2.0, corners="base").scene(), np.array([1.0, -1.0, 0.1])
     mass, normals, tangents, velocity = spatial_scenes.NAMED[name]()
     return ji.Scene(mass, normals, tangents=tangents), velocity
 
@@ -183,7 +183,7 @@ def draw_of(kind, count):
         return spatial_scenes.random_boxes(kind, count)
     import jimpact as ji
 
-    shots = ji.cube_impacts(CUBES[kind])
+    shots = ji.data.cube_impacts(CUBES[kind])
     each = [i for i in range(len(shots.pre)) for _ in spatial_scenes.CUBE_MU]
     mu = np.tile(spatial_scenes.CUBE_MU, len(shots.pre))[:count]
     each = each[:count]

@@ -85,7 +85,7 @@ def as_parts(value):
 ARC = "ji.theory.admissible_set(three, hit).conserving_arc(2)"
 SECTIONS = {
     "6.1 Multiple impacts": [
-        Row("Def. 6.1", "balls on the ground: number of contacts", "ji.column([1.0] * 5).contacts",
+        Row("Def. 6.1", "balls on the ground: number of contacts", "ji.chain([1.0] * 5, wall='right').contacts",
             "N - 1 for N balls, l >= 0", 5, "N contacts, an N-impact; l >= 1"),
         Row("6.1.1", "stiffness of two steel beads [N/m^1.5]",
             "ji.hertz_stiffness(21.6e10, 0.276, 4e-3)", "6.9716e9 of E = 210 GPa", 6.97089e9,
@@ -105,7 +105,7 @@ SECTIONS = {
         Row(
             "6.1.1",
             "largest force at the wall, 2 beads [N]; one: 51.65",
-            "ji.history(ji.LZB([0.96, 0.92], [6.9716e9, 9.858e9]), ji.column([2.05e-3] * 2),"
+            "ji.history(ji.LZB([0.96, 0.92], [6.9716e9, 9.858e9]), ji.chain([2.05e-3] * 2, wall='right'),"
             " [(2 * 9.80665 * 3.1e-3) ** 0.5] * 2).maximum_force[-1]",
             "almost independent of N",
             LARGEST,
@@ -113,7 +113,7 @@ SECTIONS = {
             allowed=2e-4,
         ),
         Row("6.1.1", "how long one bead presses [us]",
-            "ji.history(ji.LZB(0.92, [9.858e9]), ji.column([2.05e-3]),"
+            "ji.history(ji.LZB(0.92, [9.858e9]), ji.chain([2.05e-3], wall='right'),"
             " [(2 * 9.80665 * 3.1e-3) ** 0.5]).duration * 1e6",
             "less than 32", 1e6 * PRESSES, "34.6 for N = 1, 225.5 for 8, 316 for 12 at 5.1 mm",
             slow=True, allowed=1e-6),
@@ -230,7 +230,7 @@ SECTIONS = {
         Row(
             "(6.24)-(6.27)",
             "quasi-normal forces of a resting block, kinetic angle pi/2, g = 10",
-            "ji.quasi_lagrange(ji.block_system(1.0, 2.0**0.5, acceleration=10.0, corners='base'),"
+            "ji.theory.quasi_lagrange(ji.System(ji.Block(1.0, 2.0**0.5, corners='base'), gravity=10.0),"
             " [0.0, 0.5**0.5, 0.0], [0.0, 0.0, 0.0]).normal",
             "(6.26)",
             [50**0.5, 50**0.5],
@@ -239,7 +239,7 @@ SECTIONS = {
         Row(
             "(6.28)-(6.30)",
             "forces of the contact LCP on a resting block of 1 kg",
-            "ji.contact_problem(ji.block_system(1.0, 2.0, acceleration=10.0, corners='base'),"
+            "ji.theory.contact_problem(ji.System(ji.Block(1.0, 2.0, corners='base'), gravity=10.0),"
             " [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]).forces()",
             "(6.74)",
             [5.0, 5.0],
@@ -305,9 +305,9 @@ SECTIONS = {
             [-0.2545012501, 0.3549067060, 0.8995945440],
             "indentation rate -grad f^T v; compression ends at its zero"),
         Row("(6.68)", "distributing rule, E2/E1 = .3, k2/k1 = 2",
-            "ji.distributing_rule([1.0, 0.3], [1.0, 2.0], 1.5)[1, 0]", "(6.68)", 0.6407442995),
+            "ji.theory.distributing_rule([1.0, 0.3], [1.0, 2.0], 1.5)[1, 0]", "(6.68)", 0.6407442995),
         Row("6.3.1", "E0 of F0 = .328634, k = 2, eta = 1.5",
-            "ji.precompression_energy(0.328633534503099668, 2.0, 1.5)", "exponent 1/(eta + 1) of k",
+            "ji.theory.precompression_energy(0.328633534503099668, 2.0, 1.5)", "exponent 1/(eta + 1) of k",
             0.0394360241403719602, "exponent 1/eta"),
         Figure("6.6"),
         Row("(6.74)", "gaps of the block, q = (0, 1.5, 0)",
@@ -323,7 +323,7 @@ SECTIONS = {
             "pi/2, pi/4", [np.pi / 2, np.pi / 3], "pi/3 for the flat one"),
         Figure("6.8a"),
         Row("Rem. 6.11", "dimer: L = infinity, L = 0, and R/L = 5/24 [rad]",
-            "[ji.kinetic_angles(ji.dimer(r, length))[0, 1] for r, length in"
+            "[ji.kinetic_angles(ji.Dimer(r, length).scene())[0, 1] for r, length in"
             " ((1e-9, 1.0), (1.0, 0.0), (5.0, 24.0))]",
             "1.445, 1.536, between", [1.4454684956, 1.5363067308, 1.4242044517],
             "not monotone: least at 5/24", slow=True),
@@ -334,10 +334,10 @@ SECTIONS = {
         Row("6.3.2.2", "rocking matrix, e = .7", "ji.theory.rocking_matrix(0.7)",
             "[[0, -e, 0], [-e, 0, 0], [0, 0, e]]", [0, 0.7, 0, 0.7, 0, 0, 0, 0, -0.7],
             "the signs are those of v+ = +E v-"),
-        Row("6.3.3", "C_KE at A and B", "[ji.energy_dispersion(three, v) for v in " + ARC + "]",
+        Row("6.3.3", "C_KE at A and B", "[ji.theory.energy_dispersion(three, v) for v in " + ARC + "]",
             "Moreau least", [2**0.5, 2**0.5 / 3]),
         Row("6.3.3", "C_KE of LZB, k2/k1 = 1, eta = 1, 1.5, 2, 3",
-            "[ji.energy_dispersion(three, ji.impact(ji.LZB(1.0, [1.0, 1.0], eta), three, hit)"
+            "[ji.theory.energy_dispersion(three, ji.impact(ji.LZB(1.0, [1.0, 1.0], eta), three, hit)"
             ".velocity) for eta in (1.0, 1.5, 2.0, 3.0)]",
             "Fig. 6.9", [1.33036, 1.39115, 1.40788, 1.41375], allowed=5e-6, slow=True),
         Figure("5.5"),

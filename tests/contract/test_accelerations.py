@@ -8,19 +8,19 @@ import jimpact as ji
 
 WIDE, HIGH, MASS, G = 1.0, 0.6, 2.0, 10.0
 INERTIA = MASS * (WIDE**2 + HIGH**2) / 12
-BLOCK = ji.block_system(WIDE, HIGH, MASS, G, corners="base")
+BLOCK = ji.System(ji.Block(WIDE, HIGH, MASS, corners="base"), gravity=G)
 Q, V = np.array([0.2, 0.5, 0.3]), np.array([0.4, -0.2, 1.7])
 
 
 def test_contact_problem_of_a_block():
     """D and B as printed for the rocking block (g's sign: gravity lets gaps close)."""
-    problem = ji.contact_problem(BLOCK, Q, V)
+    problem = ji.theory.contact_problem(BLOCK, Q, V)
     sin, cos = np.sin(Q[2]), np.cos(Q[2])
     arms = np.array([HIGH * sin + WIDE * cos, HIGH * sin - WIDE * cos]) / 2
     np.testing.assert_allclose(problem.delassus, 1 / MASS + np.outer(arms, arms) / INERTIA)
     turning = V[2] ** 2 / 2 * np.array([HIGH * cos - WIDE * sin, HIGH * cos + WIDE * sin])
     np.testing.assert_allclose(problem.free, -G + turning, rtol=1e-12)
-    flat = ji.contact_problem(BLOCK, [0.0, HIGH / 2, 0.0], [0.0, 0.0, 0.0])
+    flat = ji.theory.contact_problem(BLOCK, [0.0, HIGH / 2, 0.0], [0.0, 0.0, 0.0])
     np.testing.assert_allclose(flat.forces(), MASS * G / 2)
     alone = flat.forces([True, False])
     np.testing.assert_allclose(alone, [G / float(flat.delassus[0, 0]), 0.0])
@@ -38,7 +38,7 @@ def quasi(q, v):
 @pytest.mark.parametrize("force", [(0.0, 0.0), (3.0, 7.0)])
 def test_quasi_lagrange_equations_of_a_block(force):
     """d/dt (qn, qt) by differences along the motion with these contact forces."""
-    terms = ji.quasi_lagrange(BLOCK, Q, V)
+    terms = ji.theory.quasi_lagrange(BLOCK, Q, V)
     sin, cos = np.sin(Q[2]), np.cos(Q[2])
     arms = np.array([HIGH * sin + WIDE * cos, HIGH * sin - WIDE * cos]) / 2
     a = np.array([0.0, -G + sum(force) / MASS, arms @ force / INERTIA])
@@ -58,7 +58,7 @@ def test_force_of_a_bilateral_constraint():
     angle, speed, push = 0.7, 1.3, 4.0
     q = 2.0 * np.array([np.sin(angle), -np.cos(angle)])
     v = speed * np.array([np.cos(angle), np.sin(angle)])
-    terms = ji.quasi_lagrange(body, q, v, constraints=lambda q: jnp.array([q @ q - 4.0]) / 2)
+    terms = ji.theory.quasi_lagrange(body, q, v, constraints=lambda q: jnp.array([q @ q - 4.0]) / 2)
     assert terms.bilateral == 1
     free = MASS * (G * q[1] - speed**2) / 4
     np.testing.assert_allclose(terms.bilateral_forces(), [free], rtol=1e-12)
@@ -68,11 +68,13 @@ def test_force_of_a_bilateral_constraint():
 
 
 def test_what_is_refused():
-    base = ji.block_system(1.0, 2.0, base=ji.HarmonicBase(0.1, 1.0, direction="vertical"))
+    base = ji.System(
+        ji.Block(1.0, 2.0), gravity=True, base=ji.HarmonicBase(0.1, 1.0, direction="vertical")
+    )
     with pytest.raises(ValueError, match="`system` must not have a moving base"):
-        ji.quasi_lagrange(base, [0.0, 1.0, 0.0], [0.0, 0.0, 0.0])
+        ji.theory.quasi_lagrange(base, [0.0, 1.0, 0.0], [0.0, 0.0, 0.0])
     with pytest.raises(ValueError, match="`velocity`"):
-        ji.contact_problem(BLOCK, Q, [0.0, np.nan, 0.0])
+        ji.theory.contact_problem(BLOCK, Q, [0.0, np.nan, 0.0])
 
 
 @pytest.mark.release
@@ -85,7 +87,7 @@ def test_accelerations_of_a_motion():
     k = 25
     closed = np.abs(BLOCK.gap_function(jnp.asarray(q[k]))) < 1e-9
     assert closed.sum() == 1
-    problem = ji.contact_problem(BLOCK, q[k], v[k])
+    problem = ji.theory.contact_problem(BLOCK, q[k], v[k])
     force = problem.forces(closed)
     assert float(force.max()) > 1
     push = np.asarray(BLOCK.body.normals(jnp.asarray(q[k]))) @ np.asarray(force)

@@ -85,7 +85,7 @@ def test_arc_of_unequal_balls_ends_where_a_contact_stays_closed():
 def test_arc_cut_by_impulse_free_contact():
     """Slender block, G_12 = 1/4, qn- = (0, -1): ends pbar = (0, 2) and pbar = (0.8, 0.8)."""
     scene = rigid(5 / 12, 0.5, -0.5)
-    g = np.asarray(ji.normalized_delassus(scene))
+    g = np.asarray(ji.theory.normalized_delassus(scene))
     close(g[0, 1], 0.25)
     norm = np.sqrt(np.diag(parts(scene)[2]))
     mass, normals, _ = parts(scene)

@@ -5,6 +5,7 @@ import itertools
 import jax
 import jax.numpy as jnp
 import numpy as np
+import piles
 import pytest
 from scipy.spatial.transform import Rotation
 
@@ -124,7 +125,7 @@ def heap():
     bodies += [ji.Disc(0.25, inertia=0.1, centre=[0.05, 0.02])]
     pairs = [((1, 0), (0, 2)), (3, 4), (3, 2), (0, 4)]
     planes = [0.0, 0.3, (np.pi / 2, -3.0)]
-    body = ji.PlanarBodies(bodies, planes, pairs)
+    body = ji.Bodies(bodies, planes, pairs)
     rng = np.random.default_rng(3)
     q = rng.uniform(-1.5, 1.5, (400, 15))
     q[:, :3] = 0
@@ -185,7 +186,7 @@ def test_forces_act_at_the_contacts(heap):
 
 def test_a_block_on_a_slope():
     angle = 0.3
-    slope = ji.PlanarBodies([ji.Block(0.2, 0.1, mass=2.0)], [(angle, 0.4)])
+    slope = ji.Bodies([ji.Block(0.2, 0.1, mass=2.0)], [(angle, 0.4)])
     q = slope.touching(along=0.7)
     along, up = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
     np.testing.assert_allclose(q[:2], 0.7 * along + 0.45 * up, atol=1e-15)
@@ -201,7 +202,7 @@ def test_a_block_on_a_slope():
 def test_facing_sides_are_chosen_and_may_part():
     """A block hangs over; its contact moves to the edge below; beside it nothing is known."""
     q = np.array([0.0, 0.5, 0.0, 0.3, 1.5, 0.0])
-    stack = ji.PlanarBodies([ji.Block(1.0, 1.0)] * 2, [0.0], [(0, 1)], at=q)
+    stack = ji.Bodies([ji.Block(1.0, 1.0)] * 2, [0.0], [(0, 1)], at=q)
     assert stack.pairs.sides == (((0, 2), (1, 0)),)  # the side above lies on the one below
     scene = stack.scene(q)
     np.testing.assert_allclose(scene.gaps[-2:], 0, atol=1e-15)
@@ -249,7 +250,7 @@ def polygons():
         ji.Polygon([[0, 0], [1.0, 0.1], [0.2, 0.8]]),
         ji.Polygon(np.stack([0.5 * np.cos(around), 0.4 * np.sin(around)], axis=1)),
     ]
-    bodies = ji.PlanarBodies(shapes, planes=(), pairs=[(0, 1), (2, 3), (2, 0)])
+    bodies = ji.Bodies(shapes, planes=(), pairs=[(0, 1), (2, 3), (2, 0)])
 
     def seen(q):
         return bodies.gap_function(q), bodies.valid(q)
@@ -325,10 +326,10 @@ def test_contacts_of_odd_polygons_keep_their_places(polygons):
 @pytest.mark.slow
 def test_a_contact_keeps_its_place_where_sides_change():
     """A block turns about the edge of a table; beyond 45 degrees its base faces the table's side."""
-    table = ji.PlanarBodies([ji.Block(0.4, 0.2), ji.Block(2.0, 1.0)], planes=())
+    table = ji.Bodies([ji.Block(0.4, 0.2), ji.Block(2.0, 1.0)], planes=())
     for first in ((0, 1), (1, 0)):
         bodies = [table.bodies[i] for i in first]
-        pair = ji.PlanarBodies(bodies, planes=())
+        pair = ji.Bodies(bodies, planes=())
         places = []
         for turn in (-0.1, -0.7, -0.9, -1.5):  # its base, 0.05 m left of the middle, is at the edge
             c, s = np.cos(turn), np.sin(turn)
@@ -460,7 +461,7 @@ def test_other_ranges():
 def test_every_body_can_be_drawn():
     """Outlines are curves in the plane; those of space in projection, z points up."""
     at = np.array([0.0, 0.25, 0.0, 0.5, 1.0, 0.3])
-    heap = ji.PlanarBodies([ji.Block(1.0, 0.5), ji.Disc(0.2)], [0.0, (1.57, -3.0)])
+    heap = ji.Bodies([ji.Block(1.0, 0.5), ji.Disc(0.2)], [0.0, (1.57, -3.0)])
     drawn = {
         1: (ji.Polygon([[0, 0], [1, 0], [0, 1]]), np.zeros(3)),
         2: (heap, at),
@@ -471,7 +472,7 @@ def test_every_body_can_be_drawn():
         curves = body.outlines(q, 0.01)
         assert len(curves) == count
         assert all(curve.ndim == 2 and curve.shape[1] == 2 for curve in curves)
-    assert heap.floors == [[0.0, 0.0], [1.57, -3.0]]
+    np.testing.assert_allclose(heap.floors, [[0.0, 0.0], [1.57, -3.0]], rtol=1e-15)
     box = ji.Box([0.2, 0.2, 0.2])
     edges, shadow = box.outlines(np.array([0, 0, 1.0, 1, 0, 0, 0]), 0.01)
     lengths = np.linalg.norm(np.diff(edges, axis=0), axis=1)
@@ -483,7 +484,7 @@ def test_every_body_can_be_drawn():
 
 def test_bodies_without_contacts_and_gaps_of_another_shape_are_refused():
     with pytest.raises(ValueError, match=r"m >= 1 contacts of Discs, but it returns \(0,\)"):
-        ji.Discs(1.0, [0.1]).scene([0.0, 0.0, 0.0])
+        piles.discs(1.0, [0.1]).scene([0.0, 0.0, 0.0])
     with pytest.raises(ValueError, match=r"`gap_function` must return shape \(m,\).*\(1, 1\)"):
         ji.scene_from_gaps(lambda q: q[None], [1.0], [0.5])
 

@@ -311,19 +311,19 @@ def test_bilateral_chain_and_newby():
 
 
 def test_distributing_rule():
-    rule = ji.distributing_rule([0.2, 0.3], [1.0, 2.0], [1.0, 1.5])
+    rule = ji.theory.distributing_rule([0.2, 0.3], [1.0, 2.0], [1.0, 1.5])
     np.testing.assert_allclose(rule[1, 0], 1.7555724651363151, rtol=1e-14)
     np.testing.assert_allclose(rule * rule.T, 1.0, rtol=1e-14)
-    rule = ji.distributing_rule([1.0, 0.3], [1.0, 2.0], 1.5)
+    rule = ji.theory.distributing_rule([1.0, 0.3], [1.0, 2.0], 1.5)
     np.testing.assert_allclose(rule[1, 0], 0.640744299507361192, rtol=1e-14)
 
 
 def test_precompression_energy():
     """`k x^(eta + 1) / (eta + 1)` at the x of the force; the chapter's number."""
-    energy = ji.precompression_energy(0.328633534503099668, 2.0, 1.5)
+    energy = ji.theory.precompression_energy(0.328633534503099668, 2.0, 1.5)
     np.testing.assert_allclose(energy, 0.0394360241403719602, rtol=1e-14)
     x, k, eta = np.array([0.1, 2.0]), np.array([3.0, 0.7]), np.array([1.0, 3.0])
-    energy = ji.precompression_energy(k * x**eta, k, eta)
+    energy = ji.theory.precompression_energy(k * x**eta, k, eta)
     np.testing.assert_allclose(energy, k * x ** (eta + 1) / (eta + 1), rtol=1e-14)
 
 
@@ -495,7 +495,7 @@ def test_symmetric_discontinuity_is_a_smooth_crossover():
     """Balls (m/4, m, m/4) at (1, 0, -1): both orders, both at once, and how wide it is."""
     offset = jnp.linspace(-4, 4, 41)
     scene, v = ji.chain(jnp.array([0.25, 1.0, 0.25])), jnp.array([1.0, 0.0, -1.0])
-    found = ji.crossover(scene, ji.Compliant(ji.Hertz(1.0)), v, offset)
+    found = ji.theory.crossover(scene, ji.Compliant(ji.Hertz(1.0)), v, offset)
     w = np.asarray(found.velocity)
     assert (np.asarray(found.status) == 0).all()
     np.testing.assert_allclose(w[0], (-3 / 5, -4 / 25, 31 / 25), atol=1e-7)
@@ -512,7 +512,7 @@ def test_offsets_of_gaps_are_in_units_of_the_larger_indentation():
     """The lighter pair indents less: `delta_c^2.5 = m v^2 / k`, m = 2 m1 m2 / (m1 + m2)."""
     masses, v, offset = [0.25, 1.0, 4.0], jnp.array([1.0, 0.0, -1.0]), jnp.linspace(-4, 4, 41)
     scene, law = ji.chain(jnp.array(masses)), ji.Compliant(ji.Hertz(1.0))
-    outcome = ji.crossover(scene, law, v, offset)
+    outcome = ji.theory.crossover(scene, law, v, offset)
     larger = (2 * 1.0 * 4.0 / 5.0) ** 0.4
     gaps = larger * (2.0 + 0.5 * offset[:, None] * jnp.array([[1.0, -1.0]]))
     direct = jax.vmap(lambda g: ji.impact(law, ji.chain(jnp.array(masses), gaps=g), v))(gaps)

@@ -7,7 +7,7 @@ import pytest
 from programs import kinetic_norm
 
 import jimpact as ji
-from jimpact import kinetic_energy, normalized_delassus, velocity_change
+from jimpact import kinetic_energy, velocity_change
 from jimpact.theory import (
     audit_matrix,
     carnot_energy_loss,
@@ -17,6 +17,7 @@ from jimpact.theory import (
     friction_energy_change,
     friction_impulses,
     from_quasi_velocities,
+    normalized_delassus,
     quasi_basis,
     to_quasi_velocities,
 )
@@ -175,7 +176,7 @@ def test_audit_agrees_with_sampled_velocities():
         after = v + velocity_change(scene, pbar / kinetic_norm(scene))
         change = kinetic_energy(scene, after) - kinetic_energy(scene, v)
         close(change, -0.5 * found.energetic.margin, 1e-9 * (1 + abs(found.energetic.margin)))
-        close(ji.normalized_gap_velocity(scene, v), found.worst_normal_velocity, 1e-10)
+        close(ji.theory.normalized_gap_velocity(scene, v), found.worst_normal_velocity, 1e-10)
         assert (found.energetic.answer == "no") == (change > 1e-7)
         seen[found.energetic.answer] += 1
         seen["fine" if found.kinematic.holds and found.kinetic.holds else "sign"] += 1
@@ -234,7 +235,7 @@ def test_open_contacts_are_left_out():
     assert found.admissible
     close(found.energetic.margin, alone.energetic.margin)
     close(found.worst_normal_velocity[:2], alone.worst_normal_velocity)
-    gamma = np.asarray(ji.normalized_gap_velocity(scene, found.worst_velocity))
+    gamma = np.asarray(ji.theory.normalized_gap_velocity(scene, found.worst_velocity))
     close(gamma, found.worst_normal_velocity)
 
 
@@ -419,7 +420,7 @@ def test_friction_bounds_hold_on_random_scenes():
 def normal_columns(scene):
     """n_q^T H_t."""
     pushed = jax.vmap(lambda t: velocity_change(scene, jnp.zeros(2), t))(jnp.eye(2))
-    return jax.vmap(lambda v: ji.normalized_gap_velocity(scene, v))(pushed).T
+    return jax.vmap(lambda v: ji.theory.normalized_gap_velocity(scene, v))(pushed).T
 
 
 @pytest.mark.parametrize(

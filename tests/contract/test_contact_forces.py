@@ -21,7 +21,7 @@ def bounces(stiffness):
 
 def dropped(force, end=1.0, **options):
     options = {"samples": 11, "max_events": 20} | options
-    given = (ji.ball_system(), ji.Compliant(force), [HEIGHT], [0.0])
+    given = (ji.System(ji.Column([1.0]), gravity=True), ji.Compliant(force), [HEIGHT], [0.0])
     return ji.simulate(*given, end, method="contact_forces", **options)
 
 
@@ -70,7 +70,7 @@ def test_a_body_may_rest_on_its_springs():
     """Two springs carry the weight m g: nothing moves, and what is disturbed oscillates."""
     block = ji.Block(width=0.2, height=0.4, mass=2.0)
     sunk = 2.0 * G / 2 / 1e4
-    given = (ji.System(block, potential=ji.gravity(block)), ji.Compliant(ji.LinearSpring(1e4)))
+    given = (ji.System(block, gravity=True), ji.Compliant(ji.LinearSpring(1e4)))
     options = {"samples": 3, "method": "contact_forces", "max_events": 8}
 
     def run(height):
@@ -133,7 +133,7 @@ def test_derivatives_of_friction_on_a_slope():
 def test_a_ball_in_space_slides_and_rolls():
     """Slip at 1.25 m/s ends at 2 u / (7 mu g), in rolling at 5/7 of it; a bounce gives mu p."""
     ball, stiffness, mu = ji.Sphere(0.1), 1e3, 0.2
-    system, law = ji.System(ball, potential=ji.gravity(ball)), ji.LinearSpring(stiffness)
+    system, law = ji.System(ball, gravity=True), ji.LinearSpring(stiffness)
     law = ji.Compliant(law, friction=mu)
     options = {"samples": 3, "max_events": 8, "method": "contact_forces"}
     at, along = [0.0, 0.0, 0.1 - G / stiffness, 1.0, 0.0, 0.0, 0.0], np.array([0.75, 1.0])
@@ -156,9 +156,14 @@ def test_a_block_comes_to_rest_with_friction():
     law = ji.Compliant(ji.KelvinVoigt(1e5, 100.0), friction=0.6)
     options = {"samples": 11, "max_events": 1000, "method": "contact_forces"}
     motion = ji.simulate(
-        ji.block_system(0.2, 0.3), law, [0, 0.4, 0.3], [1.0, 0, 2.0], 3.0, **options
+        ji.System(ji.Block(0.2, 0.3), gravity=True),
+        law,
+        [0, 0.4, 0.3],
+        [1.0, 0, 2.0],
+        3.0,
+        **options,
     )
-    ji.raise_on_failed_motion(motion)
+    ji.raise_on_failure(motion)
     np.testing.assert_allclose(motion.velocity[-1], 0, atol=1e-12)
     assert float(motion.q[-1, 1]) == pytest.approx(0.1 - G / 2e5, abs=1e-9)
     np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-9)
@@ -168,19 +173,19 @@ def test_a_block_comes_to_rest_with_friction():
 def test_a_box_strikes_on_its_corners_with_friction():
     """In space: no energy is gained, and friction takes what the ledger says."""
     box = ji.Box([0.2, 0.3, 0.1])
-    system = ji.System(box, potential=ji.gravity(box))
+    system = ji.System(box, gravity=True)
     law = ji.Compliant(ji.Bistiffness(1e7, 1.5, 0.5), friction=0.4)
     at = [0, 0, 0.3, 0.9, 0.1, 0.3, 0.09**0.5]
     options = {"samples": 5, "max_events": 400, "method": "contact_forces"}
     motion = ji.simulate(system, law, at, [1.0, 0, 0, 1.0, 2.0, 3.0], 0.6, **options)
-    ji.raise_on_failed_motion(motion)
+    ji.raise_on_failure(motion)
     assert int(motion.events.count) > 10
     assert float(jnp.max(jnp.diff(motion.energy))) < 1e-9
     np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-9)
 
 
 def test_what_contact_forces_need():
-    ball = (ji.ball_system(), ji.Newton(0.5), [1.0], [0.0], 1.0)
+    ball = (ji.System(ji.Column([1.0]), gravity=True), ji.Newton(0.5), [1.0], [0.0], 1.0)
     with pytest.raises(TypeError, match="`law` must use gaps and have a `contact_force`"):
         ji.simulate(*ball, method="contact_forces")
 
@@ -188,7 +193,7 @@ def test_what_contact_forces_need():
 def test_a_body_under_loads_is_a_system():
     """The ready systems are bodies under gravity; functions make a body, too."""
     block = ji.Block(width=0.2, height=0.6, mass=2.0)
-    system, q = ji.block_system(0.2, 0.6, 2.0), jnp.array([0.1, 0.7, 0.3])
+    system, q = ji.System(ji.Block(0.2, 0.6, 2.0), gravity=True), jnp.array([0.1, 0.7, 0.3])
     given = ji.System(block.gap_function, block.mass, tangent_function=block.tangent_function)
     for body in (system.body, given.body):
         scene = body.scene(q)
@@ -197,5 +202,7 @@ def test_a_body_under_loads_is_a_system():
     assert float(system.potential(q)) == pytest.approx(2.0 * G * 0.7)
     with pytest.raises(ValueError, match="must not be given with a body"):
         ji.System(block, block.mass)
-    with pytest.raises(TypeError, match="DiskBalls has no vertical"):
-        ji.gravity(ji.DiskBalls(1.0, 0.1, 1.0, [1.0]))
+    with pytest.raises(TypeError, match="GivenBody has no vertical"):
+        ji.System(block.gap_function, block.mass, gravity=True)
+    with pytest.raises(ValueError, match="`potential`"):
+        ji.System(block, potential=ji.gravity(block), gravity=True)

@@ -12,7 +12,7 @@ import pytest
 
 import jimpact as ji
 
-MODULES = {"": ji, "plot.": ji.plot, "theory.": ji.theory}
+MODULES = {"": ji, "plot.": ji.plot, "theory.": ji.theory, "data.": ji.data}
 PUBLIC = {
     prefix + name: getattr(module, name)
     for prefix, module in MODULES.items()

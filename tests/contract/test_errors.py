@@ -56,9 +56,9 @@ LAWS = [
     (lambda: ji.LinearSpring("hard"), r"`stiffness`"),
     (lambda: ji.UserForce(3.0), r"`function`"),
     (lambda: ji.UserForce(lambda x, rate, p: x, "hard"), r"`parameters`"),
-    (lambda: ji.distributing_rule([-1.0, 1.0], 1.0, 1.5), r"`energy`"),
-    (lambda: ji.precompression_energy(-1.0, 1.0), r"`force`"),
-    (lambda: ji.precompression_energy(1.0, 0.0), r"`stiffness`"),
+    (lambda: ji.theory.distributing_rule([-1.0, 1.0], 1.0, 1.5), r"`energy`"),
+    (lambda: ji.theory.precompression_energy(-1.0, 1.0), r"`force`"),
+    (lambda: ji.theory.precompression_energy(1.0, 0.0), r"`stiffness`"),
 ]
 SCENES = [
     (lambda: ji.chain([1.0, -1.0]), r"`masses` must lie in \(0, inf\).*-1 at index 1"),
@@ -85,12 +85,12 @@ SCENES = [
     ),
     (lambda: ji.gap_velocity(BALLS, [1.0, 0.0]), r"`velocity` must have shape \(3,\)"),
     (lambda: ji.velocity_change(BALLS, [1.0]), r"`impulse` must have shape \(2,\)"),
-    (lambda: ji.rocking_block(-1.0, 1.0), r"`width`"),
-    (lambda: ji.rocking_block(1.0, 0.0), r"`height`"),
-    (lambda: ji.rocking_block(1.0, 1.0, mass=np.nan), r"`mass`"),
-    (lambda: ji.rocking_block(1.0, 1.0, inertia=-0.1), r"`inertia`"),
-    (lambda: ji.rocking_block(1.0, 1.0, angle=np.inf), r"`angle`"),
-    (lambda: ji.rocking_block([1.0, 2.0], 1.0), r"`width`.*one number"),
+    (lambda: ji.Block(-1.0, 1.0, corners="base").scene(), r"`width`"),
+    (lambda: ji.Block(1.0, 0.0, corners="base").scene(), r"`height`"),
+    (lambda: ji.Block(1.0, 1.0, np.nan, corners="base").scene(), r"`mass`"),
+    (lambda: ji.Block(1.0, 1.0, inertia=-0.1, corners="base").scene(), r"`inertia`"),
+    (lambda: ji.Block(1.0, 1.0).touching(np.inf), r"`angle`"),
+    (lambda: ji.Block([1.0, 2.0], 1.0, corners="base").scene(), r"`width`.*one number"),
     (lambda: ji.Block(1.0, 1.0, corners="three"), r"`corners` must be one of all, base"),
     (lambda: ji.Polygon([[0, 0], [1, 0]]), r"`corners` must have shape \(k, 2\)"),
     (lambda: ji.Polygon([[0, 0], [1, 0], [0.1, 0.1], [0, 1]]), r"convex polygon.*corner 2"),
@@ -102,18 +102,18 @@ SCENES = [
     (lambda: ji.Polygon(TRIANGLE, inertia=1.0, centre=[1, 1]), r"`centre` must lie inside"),
     (lambda: ji.Disc(0.0), r"`radius`"),
     (lambda: ji.Disc(1.0, inertia=1.0, centre=[1.0, 0.1]), r"`centre`"),
-    (lambda: ji.PlanarBodies([ji.Column([1.0])]), r"`bodies` must hold planar bodies"),
-    (lambda: ji.PlanarBodies([ji.Disc(1.0)], []), r"must give a contact"),
-    (lambda: ji.PlanarBodies([ji.Disc(1.0)], [np.nan]), r"`planes`"),
-    (lambda: ji.PlanarBodies([ji.Disc(1.0)], pairs=[(0, 1)]), r"bodies 0 to 0"),
-    (lambda: ji.PlanarBodies([ji.Disc(1.0)] * 2, pairs=[(1, 1)]), r"different bodies"),
+    (lambda: ji.Bodies([ji.Column([1.0])]), r"`bodies` must hold planar bodies"),
+    (lambda: ji.Bodies([ji.Disc(1.0)], []), r"must give a contact"),
+    (lambda: ji.Bodies([ji.Disc(1.0)], [np.nan]), r"`planes`"),
+    (lambda: ji.Bodies([ji.Disc(1.0)], pairs=[(0, 1)]), r"bodies 0 to 0"),
+    (lambda: ji.Bodies([ji.Disc(1.0)] * 2, pairs=[(1, 1)]), r"different bodies"),
     (
-        lambda: ji.PlanarBodies([ji.Disc(1.0), ji.Dimer(0.1, 1.0)], pairs=[(0, 1)]),
+        lambda: ji.Bodies([ji.Disc(1.0), ji.Dimer(0.1, 1.0)], pairs=[(0, 1)]),
         r"body 1 is a Dimer",
     ),
-    (lambda: ji.PlanarBodies([ji.Block(1, 1)] * 2, at=[0.0] * 3), r"`at` must have shape \(6,\)"),
+    (lambda: ji.Bodies([ji.Block(1, 1)] * 2, at=[0.0] * 3), r"`at` must have shape \(6,\)"),
     (
-        lambda: ji.PlanarBodies([ji.Block(1, 1)] * 2, pairs=[((0, 4), (1, 0))]),
+        lambda: ji.Bodies([ji.Block(1, 1)] * 2, pairs=[((0, 4), (1, 0))]),
         r"sides 0 to 3 of body 0",
     ),
     (lambda: ji.Box([1.0, 1.0, 0.0]), r"`sizes`"),
@@ -129,24 +129,20 @@ SCENES = [
     (lambda: ji.Sphere(-1.0), r"`radius`"),
     (lambda: ji.Sphere(1.0).touching([1.0, 1.0, 0, 0]), r"`quaternion` must have length 1"),
     (lambda: ji.Sphere(1.0).scene([0, 0, 1.0, 1, 0, 0]), r"`q` must have shape \(7,\)"),
-    (lambda: ji.dimer(-0.1, 1.0), r"`radius`"),
-    (lambda: ji.dimer(0.1, -1.0), r"`length`"),
-    (lambda: ji.dimer(0.0, 0.0), r"`length`"),
-    (lambda: ji.dimer(0.1, 1.0, rod_mass=-1.0), r"`rod_mass`"),
-    (lambda: ji.dimer_3d(0.0, 1.0), r"`radius`"),
-    (lambda: ji.dimer_3d(0.1, 1.0, angle=1.6), r"`angle`"),
-    (lambda: ji.corner(np.pi), r"`angle`"),
-    (lambda: ji.corner(-0.1), r"`angle`"),
-    (lambda: ji.disk_balls([0.0], disk_mass=0.0), r"`disk_mass`"),
-    (lambda: ji.Discs(1.0, []), "`radii` must hold one or more"),
-    (lambda: ji.disk_balls([0.0, 1.0], [1.0, 1.0, 1.0]), r"`ball_masses`.*shape"),
-    (lambda: ji.disk_balls(0.0), r"`angles`"),
-    (lambda: ji.disk_balls([0.0], gaps=[-1.0]), r"`gaps`"),
-    (lambda: ji.pendulum_cradle([1.0], 1.0, 0.1), r"two balls"),
-    (lambda: ji.pendulum_cradle([1.0, 1.0], -1.0, 0.1), r"`length`"),
-    (lambda: ji.pendulum_cradle([1.0, 1.0], 1.0, [0.1] * 3), r"`radius`"),
-    (lambda: ji.pendulum_cradle([1.0, 1.0], 1.0, 0.1, [0.1, 0.1]), r"`gaps`"),
-    (lambda: ji.pendulum_cradle([1.0, 1.0], 1.0, 0.1, angles=[0.0] * 3), r"`q`"),
+    (lambda: ji.Dimer(-0.1, 1.0).scene(), r"`radius`"),
+    (lambda: ji.Dimer(0.1, -1.0).scene(), r"`length`"),
+    (lambda: ji.Dimer(0.0, 0.0).scene(), r"`length`"),
+    (lambda: ji.Dimer(0.1, 1.0, rod_mass=-1.0).scene(), r"`rod_mass`"),
+    (lambda: ji.SpatialDimer(0.0, 1.0).scene(), r"`radius`"),
+    (lambda: ji.SpatialDimer(0.1, 1.0).touching(1.6), r"`angle`"),
+    (lambda: ji.Corner(np.pi).scene(), r"`angle`"),
+    (lambda: ji.Corner(-0.1).scene(), r"`angle`"),
+    (lambda: ji.Bodies([]), "`bodies` must hold one or more"),
+    (lambda: ji.PendulumCradle([1.0], 1.0, 0.1).scene(), r"two balls"),
+    (lambda: ji.PendulumCradle([1.0, 1.0], -1.0, 0.1).scene(), r"`length`"),
+    (lambda: ji.PendulumCradle([1.0, 1.0], 1.0, [0.1] * 3).scene(), r"`radius`"),
+    (lambda: ji.PendulumCradle([1.0, 1.0], 1.0, 0.1, [0.1, 0.1]).scene(), r"`gaps`"),
+    (lambda: ji.PendulumCradle([1.0, 1.0], 1.0, 0.1).scene([0.0] * 3), r"`q`"),
 ]
 MANY = ji.Scene(np.ones(402), np.eye(402)[:, ::2], tangents=np.eye(402)[:, 1::2])
 WELDED = ji.Scene([1.0] * 3, [[-1.0], [1.0], [0.0]], constraints=[[0.0], [-1.0], [1.0]])
@@ -207,7 +203,9 @@ CALLS = [
     (lambda: ji.history(ji.LZB(0.9), BALLS, V, samples=1), r"`samples`"),
     (lambda: ji.fit(ji.LZB(0.9), BALLS, [V, V]), r"`experiments` must be of type Experiments"),
     (
-        lambda: ji.simulate(ji.Newton(0.5), ji.ball_system(), [1.0], [0.0], 1.0),
+        lambda: ji.simulate(
+            ji.Newton(0.5), ji.System(ji.Column([1.0]), gravity=True), [1.0], [0.0], 1.0
+        ),
         r"`system` must be of type System",
     ),
     (lambda: ji.calibrate(ji.KelvinVoigt(1.0, 0.0), 0.01, 1.0, 1.0), r"`restitution`"),
@@ -219,8 +217,11 @@ CALLS = [
     (lambda: ji.hertz_stiffness(1.0, 0.3, 1.0, radius2=0.0), r"`radius2"),
     (lambda: ji.gap_scale(PAIR, ji.Newton(1.0), [1.0, 0.0]), r"`law`"),
     (lambda: ji.gap_scale(PAIR, ji.LZB(1.0), [1.0]), r"`velocity`"),
-    (lambda: ji.crossover(PAIR, ji.Compliant(ji.Hertz(1.0)), [1.0, 0.0], [0.0]), r"two contacts"),
-    (lambda: ji.crossover(BALLS, ji.Compliant(ji.Hertz(1.0)), V, [[0.0]]), r"`offset`"),
+    (
+        lambda: ji.theory.crossover(PAIR, ji.Compliant(ji.Hertz(1.0)), [1.0, 0.0], [0.0]),
+        r"two contacts",
+    ),
+    (lambda: ji.theory.crossover(BALLS, ji.Compliant(ji.Hertz(1.0)), V, [[0.0]]), r"`offset`"),
     (lambda: ji.theory.rocking_dispersion(0.0), r"`aspect`"),
     (lambda: ji.theory.rocking_dispersion([[1.0]]), r"`aspect`.*one axis"),
     (lambda: ji.theory.rocking_dispersion(1.0, friction=-0.1), r"`friction`"),
@@ -257,7 +258,9 @@ MOTIONS = [
 SYSTEMS = [
     (
         lambda: ji.simulate(
-            ji.ball_system(base=lambda t: jnp.where(t < 0.5, 0.0, jnp.nan)),
+            ji.System(
+                ji.Column([1.0]), gravity=True, base=lambda t: jnp.where(t < 0.5, 0.0, jnp.nan)
+            ),
             ji.Newton(0.5),
             [1.0],
             [0.0],
@@ -270,29 +273,53 @@ SYSTEMS = [
     (lambda: ji.System(None, [1.0]), "`gap_function` must be a function"),
     (
         lambda: ji.simulate(
-            ji.block_system(1.0, 1.0), ji.Moreau(0.5), [0, 1, 0], [0] * 3, 1.0, friction=-0.1
+            ji.System(ji.Block(1.0, 1.0), gravity=True),
+            ji.Moreau(0.5),
+            [0, 1, 0],
+            [0] * 3,
+            1.0,
+            friction=-0.1,
         ),
         "`friction` must lie in",
     ),
     (
-        lambda: ji.fit_motion(ji.ball_system(), ji.Newton(0.7), [1.0, 2.0], [1.0], [0.0], 1.0),
+        lambda: ji.fit_motion(
+            ji.System(ji.Column([1.0]), gravity=True), ji.Newton(0.7), [1.0, 2.0], [1.0], [0.0], 1.0
+        ),
         r"`measured` must have shape \(S, 1\)",
     ),
     (
-        lambda: ji.fit_motion(ji.ball_system(), ji.Newton(0.7), [[1.0]], [[1.0]], [[0.0]], 1.0),
+        lambda: ji.fit_motion(
+            ji.System(ji.Column([1.0]), gravity=True),
+            ji.Newton(0.7),
+            [[1.0]],
+            [[1.0]],
+            [[0.0]],
+            1.0,
+        ),
         r"`measured` must have shape \(1, S, 1\)",
     ),
     (
-        lambda: ji.fit_motion(ji.ball_system(), ji.Newton(0.7), [[1.0]], [[1.0]], [0.0], 1.0),
+        lambda: ji.fit_motion(
+            ji.System(ji.Column([1.0]), gravity=True), ji.Newton(0.7), [[1.0]], [[1.0]], [0.0], 1.0
+        ),
         r"`v0` must have shape \(n,\), or \(K, n\)",
     ),
     (
-        lambda: ji.fit_motion(ji.ball_system(), ji.Newton(0.7), [[np.nan]], [1.0], [0.0], 1.0),
+        lambda: ji.fit_motion(
+            ji.System(ji.Column([1.0]), gravity=True), ji.Newton(0.7), [[np.nan]], [1.0], [0.0], 1.0
+        ),
         "at least one value",
     ),
     (
         lambda: ji.fit_motion(
-            ji.ball_system(), ji.Newton(0.7), [[1.0]], [1.0], [0.0], 1.0, "stiffness"
+            ji.System(ji.Column([1.0]), gravity=True),
+            ji.Newton(0.7),
+            [[1.0]],
+            [1.0],
+            [0.0],
+            1.0,
+            "stiffness",
         ),
         "must name parameters of Newton",
     ),
@@ -331,7 +358,7 @@ def test_what_the_host_refuses_has_a_status_inside_jit():
 def test_bad_motions(change, message):
     arguments = {"q0": [1.0], "v0": [0.0], "t_end": 1.0} | change
     with pytest.raises(ValueError, match=message):
-        ji.simulate(ji.ball_system(), ji.Newton(0.5), **arguments)
+        ji.simulate(ji.System(ji.Column([1.0]), gravity=True), ji.Newton(0.5), **arguments)
 
 
 def test_python_numpy_and_jax_inputs_agree():

@@ -248,7 +248,7 @@ def test_readings_in_steps_have_the_error_of_their_rounding():
 
 
 def test_the_cube():
-    data = ji.cube_impacts()
+    data = ji.data.cube_impacts()
     assert read_study("tossed_cube.toml").experiments.shots == data.only(data.contacts == 1).shots
     assert [int((data.contacts == m).sum()) for m in (1, 2, 4)] == [377, 21, 2]
     assert data.units == ("m/s",) * 3 + ("rad/s",) * 3
@@ -258,21 +258,21 @@ def test_the_cube():
     with pytest.raises(
         ValueError, match=r"`contacts` in \[data\] must be one of 1, 2, 4, but is 3"
     ):
-        ji.cube_impacts(3)
+        ji.data.cube_impacts(3)
 
 
 @pytest.mark.slow
 def test_nearly_clean_impacts_of_the_cube():
     """Two corners: the clean impacts and 84 more, none twice."""
-    two = ji.cube_impacts(2, nearly_clean=True)
+    two = ji.data.cube_impacts(2, nearly_clean=True)
     assert len(set(two.shots)) == len(two.shots) == 105
-    assert two.shots[:21] == ji.cube_impacts(2).shots
+    assert two.shots[:21] == ji.data.cube_impacts(2).shots
 
 
 @pytest.mark.slow
 def test_measured_drops():
     """Geometry in closed form: an ellipse's contact is where its outline is lowest."""
-    ellipse, square = ji.ellipse_impacts(), ji.square_impacts()
+    ellipse, square = ji.data.ellipse_impacts(), ji.data.square_impacts()
     turn = np.linspace(0, 2 * np.pi, 100_001)
     angle = (
         -1.514224
@@ -286,7 +286,7 @@ def test_measured_drops():
     np.testing.assert_allclose(scene.normals[2, 0], 1.110112e-3, atol=2e-4)
     assert ellipse.pre.shape == (1378, 3)
     assert [int((square.contacts == m).sum()) for m in (1, 2)] == [250, 15]
-    numbers, time, q = ji.square_drops()
+    numbers, time, q = ji.data.square_drops()
     assert q.shape == (len(numbers), len(time), 3) == (100, 200, 3)
     np.testing.assert_allclose(np.median(q[:, -1, 1]), 0.03, atol=2e-4)  # at rest, half of a side
     fourth = q[list(numbers).index(6)]  # impact 6:12.6 lies between frames 12 and 13

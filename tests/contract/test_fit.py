@@ -573,7 +573,7 @@ def test_a_saved_fit_is_the_same_fit(tmp_path, options):
     data = ji.Experiments(SHOTS, post, 0.02, shots="abcd", **options)
     found = ji.fit(ji.Newton(0.9), PAIR, data, priors={"restitution": (0.6, 0.1)})
     path = found.save(tmp_path / "fit.json")
-    again = ji.load_fit(path)
+    again = ji.load(path)
     assert (str(again), again.to_dict()) == (str(found), found.to_dict())
     for a, b in zip(*(jax.tree.leaves(x.problem) for x in (found, again))):
         np.testing.assert_allclose(a, b, rtol=1e-12)
@@ -592,11 +592,11 @@ def test_a_saved_fit_is_the_same_fit(tmp_path, options):
     ):  # fmt: skip
         path.write_text(json.dumps(record | change))
         with pytest.raises(ValueError, match=message):
-            ji.load_fit(path)
+            ji.load(path)
     for text, message in (("[1]", "has no `format`"), ("e = 0.9", "a saved fit .JSON., but")):
         path.write_text(text)
         with pytest.raises(ValueError, match=message):
-            ji.load_fit(path)
+            ji.load(path)
 
 
 def test_a_prior_weighs_like_one_more_measured_value():

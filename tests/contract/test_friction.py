@@ -134,7 +134,11 @@ def test_disk_in_closed_form(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("v", [(0.1, -1.0, 0.3), (0.5, -1.0, -1.0), (-0.4, -1.0, 0.0)])
 def test_binary_is_newton_at_one_contact_after_another(v):
-    block, e, rubs = ji.rocking_block(1.0, 2.0), 0.5, dict(friction=0.2, tangential_restitution=0.1)
+    block, e, rubs = (
+        ji.Block(1.0, 2.0, corners="base").scene(),
+        0.5,
+        dict(friction=0.2, tangential_restitution=0.1),
+    )
     out = ji.impact(ji.Binary(e, **rubs), block, v)
     normals, tangents, after = np.asarray(block.normals), np.asarray(block.tangents), np.array(v)
     for _ in range(20):
@@ -294,7 +298,7 @@ def test_particle_of_example_6_2():
 
 # ------------------------------------------------------------------------- coupled contacts
 
-FLAT = ji.rocking_block(width=1.5, height=1.0, mass=2.0)
+FLAT = ji.Block(1.5, 1.0, 2.0, corners="base").scene()
 
 
 def of_scene(scene, count):
@@ -334,7 +338,7 @@ def test_given_slip_agrees_with_the_law():
 @pytest.mark.parametrize("name", ["moreau", "lzb"])
 def test_uneven_load_is_shared_as_friction_allows(name):
     """Corner A takes nothing, so that B alone holds the block: rolling over to B is Housner's."""
-    scene, rate = ji.rocking_block(width=1.0, height=3.0), -1.0
+    scene, rate = ji.Block(1.0, 3.0, corners="base").scene(), -1.0
     v = rate * np.array([[-1.5, 0.5, 1.0]])
     out, _ = run(name, *of_scene(scene, 1), v, np.zeros(1), np.full(1, 5.0))
     off = 1e-13 if name == "moreau" else 1e-6
@@ -498,7 +502,7 @@ def test_lzb_in_the_plane():
 
 def test_lzb_of_a_flat_block():
     """Both corners stick: W_tt is singular."""
-    block = [x[0] for x in of_scene(ji.rocking_block(1.0, 2.0), 1)]
+    block = [x[0] for x in of_scene(ji.Block(1.0, 2.0, corners="base").scene(), 1)]
     rows = [
         ([1.0, -1.0, 0.0], 0.8, 0.3),
         ([0.1, -1.0, 0.2], 0.8, 0.6),
@@ -519,7 +523,7 @@ def test_a_flat_block_at_a_fine_tolerance():
     """How the corners share what they hold is known to 1e-8 only: no step need be short for it."""
     e, mu = np.array([0.71, 0.58, 0.98, 0.47]), np.array([0.81, 0.83, 0.71, 0.42])
     v = np.array([[0.10, -0.54, 0.36], [0.41, -1.04, -0.13], [-0.31, -1.46, 1.96], [-0.2, -1, 0.9]])
-    block = ji.rocking_block(1.0, 2.0)
+    block = ji.Block(1.0, 2.0, corners="base").scene()
 
     def fine(e, mu, v):
         return ji.impact(ji.LZB(e, friction=mu, rtol=1e-12, max_steps=3000), block, v)
@@ -638,7 +642,7 @@ def count(jaxpr):
 
 
 def test_frictionless_scenes_pay_nothing():
-    block = ji.rocking_block(1.0, 2.0)
+    block = ji.Block(1.0, 2.0, corners="base").scene()
     bare = ji.Scene(block.mass, block.normals, gaps=block.gaps)
 
     def operations(scene, **given):
@@ -761,7 +765,7 @@ def test_slopes_where_a_real_cube_comes_to_stick():
 @pytest.mark.release
 def test_history_of_contacts_with_friction():
     """It starts and ends as the impact does, in the cone and against the slip meanwhile."""
-    law, scene = ji.LZB(0.8, friction=0.3), ji.rocking_block(width=1.0, height=2.0)
+    law, scene = ji.LZB(0.8, friction=0.3), ji.Block(1.0, 2.0, corners="base").scene()
     v = np.array([1.0, -1.0, 0.0])
     out, h = ji.impact(law, scene, v), ji.history(law, scene, v, samples=50)
     assert h.slip.shape == h.tangential_force.shape == (50, 2)

@@ -164,7 +164,7 @@ def test_planar_scenes_in_space_have_the_same_outcome(scenes):
 @pytest.mark.slow
 def test_a_disc_rolls_into_a_standing_block():
     """Two corners of the block stand, the disc rolls: four contacts, of which one is new."""
-    bodies = ji.PlanarBodies([ji.Block(0.1, 0.4), ji.Disc(0.1)])
+    bodies = ji.Bodies([ji.Block(0.1, 0.4), ji.Disc(0.1)])
     scene = bodies.scene([0.0, 0.2, 0.0, -0.15, 0.1, 0.0])
     v = np.array([0.0, 0.0, 0.0, 1.0, 0.0, -10.0])
     expected = [0.3789, 0.102526, 2.05052, 0.583952, 0.08321, -8.33581]  # by sweeps

@@ -250,7 +250,7 @@ def test_friction_of_one_contact():
 
 def test_friction_of_a_block_on_two_corners():
     """Impulses in Coulomb's cones, admissible ends; without friction the tree of no friction."""
-    block, v = ji.rocking_block(1.0, 2.0), [0.4, -1.0, 0.6]
+    block, v = ji.Block(1.0, 2.0, corners="base").scene(), [0.4, -1.0, 0.6]
     without = han_gilmore(block, v, 0.6)
     assert as_set(han_gilmore(block, v, 0.6, 0.0)) == as_set(without)
     found = han_gilmore(block, v, 0.6, [0.3, 0.5])
@@ -275,4 +275,4 @@ def test_bad_coefficients():
     with pytest.raises(ValueError, match="`scene` must have one tangent a contact"):
         han_gilmore(balls, [1.0, 0, 0], 0.5, 0.1)
     with pytest.raises(ValueError, match="`friction`"):
-        han_gilmore(ji.rocking_block(1.0, 2.0), [0.0, -1, 0], 0.5, -0.1)
+        han_gilmore(ji.Block(1.0, 2.0, corners="base").scene(), [0.0, -1, 0], 0.5, -0.1)

@@ -9,6 +9,7 @@ import warnings
 import jax
 import jax.numpy as jnp
 import numpy as np
+import piles
 import pytest
 
 import jimpact as ji
@@ -144,7 +145,7 @@ def test_a_status_of_a_motion_is_a_row_of_the_one_table():
 
 def test_discs_keep_their_angular_momentum():
     """Levers are those of the points in contact, also where discs overlap."""
-    discs = ji.Discs([1.0, 1.5], [0.1, 0.1])
+    discs = piles.discs([1.0, 1.5], [0.1, 0.1])
     q = discs.at([[0.0, 0.0], [0.19, 0.045]])
     v = np.array([1.0, 0.2, 3.0, -1.0, 0.0, -2.0])
     motion = ji.simulate(
@@ -169,8 +170,8 @@ def test_flat_boxes_in_an_assembly_bounce_as_they_do_alone():
     expected = t1 + 2 * t1 * np.cumsum(e ** np.arange(1, 8))
     for width in (0.3, 0.5, 0.74, 0.8, 1.0, 1.2):
         for height in (0.3, 0.73):
-            body = ji.PlanarBodies([ji.Block(width, height)])
-            system = ji.System(body, potential=ji.gravity(body))
+            body = ji.Bodies([ji.Block(width, height)])
+            system = ji.System(body, gravity=True)
             start = [0, 1 + height / 2, 0]
             motion = ji.simulate(system, ji.LZB(e, 1.0), start, [0.0, 0, 0], 10.0, samples=3)
             assert status_of(motion) == "ok"
@@ -193,7 +194,7 @@ def test_a_block_on_springs_passes_the_flat_position():
         block = ji.Block(w, h, m)
         law = ji.Compliant(ji.LinearSpring(k), friction=mu)
         return ji.simulate(
-            ji.System(block, potential=ji.gravity(block)), law, q, v, 0.35,
+            ji.System(block, gravity=True), law, q, v, 0.35,
             method="contact_forces", samples=2, max_events=100,
         ).status  # fmt: skip
 
@@ -206,11 +207,11 @@ def test_a_block_on_springs_passes_the_flat_position():
 @fault(ENGINE)
 def test_a_domino_reaches_the_next_one():
     height, width, gap = 0.048, 0.0075, 0.0185
-    bodies = ji.PlanarBodies([ji.Block(width, height, mass=0.01)] * 2, pairs=[(0, 1)])
+    bodies = ji.Bodies([ji.Block(width, height, mass=0.01)] * 2, pairs=[(0, 1)])
     q = np.array([0.0, height / 2, 0.0, width + gap, height / 2, 0.0])
     v = np.array([2 * height, 2 * width, -4.0, 0.0, 0.0, 0.0])
     motion = ji.simulate(
-        ji.System(bodies, potential=ji.gravity(bodies)), ji.Moreau(0.0, friction=0.2), q, v, 0.12,
+        ji.System(bodies, gravity=True), ji.Moreau(0.0, friction=0.2), q, v, 0.12,
         samples=24, max_events=200, max_steps=2000,
     )  # fmt: skip
     assert status_of(motion) == "ok"

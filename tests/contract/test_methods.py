@@ -706,11 +706,11 @@ def test_compare_gives_every_law_its_outcome():
 
 def test_dispersion_index_and_energy_ratio():
     for v, index in (([0, 0, 1.0], 0.0), ([-1 / 3, 2 / 3, 2 / 3], 2 / 3), ([1, -1, 1.0], 1.0)):
-        assert float(ji.dispersion_index(BALLS, v)) == pytest.approx(index, abs=1e-14)
+        assert float(ji.theory.dispersion_index(BALLS, v)) == pytest.approx(index, abs=1e-14)
     heavy = ji.chain([4.0, 1.0])
-    assert float(ji.energy_dispersion(heavy, [1.0, 0.0])) == pytest.approx(1.0)
-    assert float(ji.dispersion_index(heavy, [1.0, -2.0])) == pytest.approx(1.0)
-    assert float(ji.energy_ratio(heavy, [1.0, 0.0], [0.5, 0.0])) == pytest.approx(0.25)
+    assert float(ji.theory.energy_dispersion(heavy, [1.0, 0.0])) == pytest.approx(1.0)
+    assert float(ji.theory.dispersion_index(heavy, [1.0, -2.0])) == pytest.approx(1.0)
+    assert float(ji.theory.energy_ratio(heavy, [1.0, 0.0], [0.5, 0.0])) == pytest.approx(0.25)
 
 
 @pytest.mark.parametrize(
@@ -728,14 +728,14 @@ def test_dispersion_index_and_energy_ratio():
 )
 def test_energy_kept_and_its_dispersion(after, kept, spread):
     """Of three equal balls, k2/k1 = 1; outcomes are closed forms, or held in test_values."""
-    assert float(ji.energy_ratio(BALLS, STRIKE, after)) == pytest.approx(kept, abs=6e-6)
-    assert float(ji.energy_dispersion(BALLS, after)) == pytest.approx(spread, abs=6e-6)
+    assert float(ji.theory.energy_ratio(BALLS, STRIKE, after)) == pytest.approx(kept, abs=6e-6)
+    assert float(ji.theory.energy_dispersion(BALLS, after)) == pytest.approx(spread, abs=6e-6)
 
 
 def test_dispersion_falls_along_the_arc():
     """From A to B, where Moreau's law has the least."""
     arc = ji.theory.admissible_set(BALLS, STRIKE).conserving_arc(13)
-    spread = [float(ji.energy_dispersion(BALLS, v)) for v in arc]
+    spread = [float(ji.theory.energy_dispersion(BALLS, v)) for v in arc]
     assert (np.diff(spread) < 0).all()
     np.testing.assert_allclose([spread[0], spread[-1]], [2**0.5, 2**0.5 / 3], rtol=1e-12)
 

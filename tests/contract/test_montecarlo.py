@@ -19,11 +19,11 @@ from jimpact import (
     Uniform,
     chain,
     gap_scale,
-    gap_sensitivity,
     impact,
     monte_carlo,
     read_samples,
 )
+from jimpact.theory import gap_sensitivity
 
 BALLS = chain([0.25, 1.0, 0.25])
 

@@ -10,7 +10,7 @@ import jimpact as ji
 BRICK = ji.Box([0.1, 0.06, 0.04], mass=0.5)
 
 
-SYSTEM, LAW = ji.System(BRICK, potential=ji.gravity(BRICK)), ji.Moreau(0.3, friction=0.4)
+SYSTEM, LAW = ji.System(BRICK, gravity=True), ji.Moreau(0.3, friction=0.4)
 
 
 def thrown(q0, v0, duration, **options):
@@ -67,7 +67,7 @@ def test_a_thrown_brick_comes_to_rest_on_a_face():
 @pytest.mark.release
 def test_a_coin_with_corners_is_thrown_and_comes_to_rest():
     coin = ji.Coin(0.05, 0.01, mass=0.1, corners=6)
-    system = ji.System(coin, potential=ji.gravity(coin))
+    system = ji.System(coin, gravity=True)
     q0 = coin.at([0.0, 0.0, 0.2], [0.8, 0.6, 0.0, 0.0])
     v0, law = [0.3, 0.1, 0.0, 5.0, 3.0, 20.0], ji.Moreau(0.0, friction=0.3)
     motion = ji.simulate(system, law, q0, v0, 1.5, samples=31)

@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import piles
 import pytest
 from programs import CODE
 from scipy.integrate import solve_ivp
@@ -77,7 +78,7 @@ def test_pulses_overturn_the_blocks_that_housner_says():
             amplitude = strength * G * width / height
             base = Pulse(jnp.asarray(amplitude), jnp.asarray(frequency))
             motion = ji.simulate(
-                ji.block_system(width, height, base=base), ji.Moreau(0.0, friction=1.0),
+                ji.System(ji.Block(width, height), gravity=True, base=base), ji.Moreau(0.0, friction=1.0),
                 [0.0, height / 2, 0.0], [0.0] * 3, 6.0,
                 samples=2, method="time_stepping", step=2e-3,
             )  # fmt: skip
@@ -140,7 +141,7 @@ def test_a_superball_leaves_with_its_slip_reversed():
     disc, e_t = ji.Disc(0.5), 0.6
     law = ji.Moreau(0.8, friction=50.0, tangential_restitution=e_t)
     motion = ji.simulate(
-        ji.System(disc, potential=disc.gravity(G)), law, [0.0, 0.5, 0.0], [1.0, -5.0, 3.0], 0.02,
+        ji.System(disc, gravity=G), law, [0.0, 0.5, 0.0], [1.0, -5.0, 3.0], 0.02,
         samples=2, method="time_stepping", step=1e-3,
     )  # fmt: skip
     x, _, spin = motion.velocity[-1]
@@ -152,7 +153,7 @@ def test_a_superball_leaves_with_its_slip_reversed():
 def test_a_spinning_brick_comes_to_rest_on_a_face():
     brick = ji.Box([0.1, 0.06, 0.04], mass=0.5)
     motion = ji.simulate(
-        ji.System(brick, potential=ji.gravity(brick)), ji.Moreau(0.3, friction=0.4),
+        ji.System(brick, gravity=True), ji.Moreau(0.3, friction=0.4),
         brick.at([0.0, 0.0, 0.3], [0.8, 0.6, 0.0, 0.0]), [0.5, 0.2, 0.0, 3.0, 12.0, 5.0], 2.0,
         samples=21, method="time_stepping", step=1e-3,
     )  # fmt: skip
@@ -202,13 +203,16 @@ def test_a_motion_says_how_its_law_fails():
         lambda m: (m.status, m.events.status), motion, (jnp.int32(CODE["law_failed"]), codes)
     )
     with pytest.raises(RuntimeError, match=r"law_failed: .*: negative_impulse"):
-        ji.raise_on_failed_motion(failed)
+        ji.raise_on_failure(failed)
 
 
 def test_friction_below_0_is_reported():
     run = jax.jit(
         lambda mu: stepped(
-            ji.block_system(0.2, 0.4), ji.Moreau(0.0, friction=mu), [0.0, 0.2, 0.0], [1.0, 0.0, 0.0]
+            ji.System(ji.Block(0.2, 0.4), gravity=True),
+            ji.Moreau(0.0, friction=mu),
+            [0.0, 0.2, 0.0],
+            [1.0, 0.0, 0.0],
         )
     )
     assert status(run(-0.3)) == "law_failed"
@@ -253,7 +257,7 @@ def test_a_tossed_block_never_gains_energy():
     @jax.vmap
     def toss(q, v, e, mu, e_t):
         return ji.simulate(
-            ji.block_system(0.2, 0.4), ji.Moreau(e, friction=mu, tangential_restitution=e_t),
+            ji.System(ji.Block(0.2, 0.4), gravity=True), ji.Moreau(e, friction=mu, tangential_restitution=e_t),
             q, v, 0.6, samples=601, method="time_stepping", step=1e-3,
         )  # fmt: skip
 
@@ -274,7 +278,7 @@ def test_a_tossed_block_never_gains_energy():
     ],
 )
 def test_coefficients_that_do_not_fit_are_named(law, named):
-    pile = ji.Discs(1.0, [0.1, 0.1], walls=[[0.0, 1.0, 0.0]])
+    pile = piles.discs(1.0, [0.1, 0.1], planes=[[0.0, 1.0, 0.0]])
     for body, q0 in ((pile, pile.at([[0.0, 0.1], [0.5, 0.1]])), (ji.Block(0.2, 0.4), [0, 0.2, 0])):
         with pytest.raises(ValueError, match=named):
             stepped(ji.System(body), law, q0, np.zeros(len(q0)))
@@ -330,7 +334,7 @@ def test_functions_of_a_system_compute_in_the_precision_of_the_start(given, opti
 
 
 def test_a_disc_without_walls_is_refused():
-    disc = ji.Discs(1.0, [0.1])
+    disc = piles.discs(1.0, [0.1])
     with pytest.raises(ValueError, match="each of m >= 1 contacts"):
         stepped(ji.System(disc), ji.Moreau(0.5), disc.at([[0.0, 1.0]]), np.zeros(3))
 
@@ -363,7 +367,7 @@ LINE = (1.0, -1.0)
 PLANE = (1.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # of two; the third flies away much faster
 
 
-DISCS = ji.PlanarBodies([ji.Disc(0.1)] * 3, planes=[], pairs=[(0, 1), (2, 0)])
+DISCS = ji.Bodies([ji.Disc(0.1)] * 3, planes=[], pairs=[(0, 1), (2, 0)])
 
 
 @pytest.mark.slow
@@ -398,16 +402,22 @@ def test_bodies_that_pass_each_other_in_a_step_are_reported(body, way, speed, ex
 def test_steps_too_many_to_count_are_refused():
     with pytest.raises(ValueError, match="`step` must give at most"):
         ji.simulate(
-            ji.ball_system(), ji.Moreau(0.5), [1.0], [0.0], 1.0, method="time_stepping", step=1e-300
+            ji.System(ji.Column([1.0]), gravity=True),
+            ji.Moreau(0.5),
+            [1.0],
+            [0.0],
+            1.0,
+            method="time_stepping",
+            step=1e-300,
         )
 
 
 def slid_off(**options):
     """A block slides over the right end of a heavy table, 2 m wide, and falls to the ground."""
-    bodies = ji.PlanarBodies(
+    bodies = ji.Bodies(
         [ji.Block(2.0, 1.0, mass=1e6), ji.Block(0.4, 0.2)], planes=[0.0], pairs=[(1, 0)]
     )
-    system = ji.System(bodies, potential=ji.gravity(bodies))
+    system = ji.System(bodies, gravity=True)
     law, start = ji.Moreau(0.3, friction=0.2), [0.0, 0.5, 0.0, 0.7, 1.1, 0.0]
     return ji.simulate(system, law, start, [0.0, 0.0, 0.0, 1.5, 0.0, 0.0], 2.0, **options)
 
@@ -420,7 +430,7 @@ TOPPLES = (1.5 - np.sqrt(1.5**2 - 2 * 0.2 * G * 0.28)) / (0.2 * G)
 @pytest.mark.release
 def test_a_block_slides_off_a_table():
     motion = slid_off(samples=201, method="time_stepping", step=1e-3)
-    ji.raise_on_failed_motion(motion)
+    ji.raise_on_failure(motion)
     time, (x, y, angle) = np.asarray(motion.time), np.asarray(motion.q)[:, 3:].T
     slides = time < TOPPLES - 0.005
     np.testing.assert_allclose(angle[slides], 0, atol=1e-6)
@@ -433,7 +443,7 @@ def test_a_block_slides_off_a_table():
 
 @pytest.mark.release
 def test_a_block_topples_off_a_table_at_its_moment():
-    motion = ji.raise_on_failed_motion(slid_off(samples=41))
+    motion = ji.raise_on_failure(slid_off(samples=41))
     assert float(motion.event_times("detachment")[0]) == pytest.approx(TOPPLES, abs=1e-7)
     np.testing.assert_allclose(motion.q[-1, 4:], [0.1, 0.0], atol=1e-9)
     assert float(np.nanmin(motion.gaps)) > -1e-9

@@ -27,7 +27,7 @@ def ended(motion):
 @pytest.mark.release
 def test_cradle_over_fifty_swings():
     """Repeatable, energy monotone, the ledger closes, and in the end all swing in phase."""
-    system = ji.cradle_system([0.1] * 3, length=0.1, diameter=0.02)
+    system = ji.System(ji.PendulumCradle([0.1] * 3, 0.1, 0.01), gravity=True)
     period = 2 * np.pi * np.sqrt(0.1 / G)
     law = ji.LZB(0.95, exponent=1.5)
 
@@ -61,7 +61,7 @@ def test_free_rocking_to_rest():
     """Each impact keeps e of the angular velocity; swings last as Housner's quadrature says."""
     e = float(ji.theory.housner_restitution(3.0))
     motion = ji.simulate(
-        ji.block_system(0.2, 0.6, corners="base"),
+        ji.System(ji.Block(0.2, 0.6, corners="base"), gravity=True),
         ji.RestitutionMatrix(ji.theory.rocking_matrix(e)),
         upright(0.15),
         [0.0] * 3,
@@ -98,7 +98,7 @@ def test_free_rocking_to_rest():
 def test_a_corner_hops_while_the_other_is_the_pivot():
     """Short hops of one corner, in the steps in which the other strikes: none is missed."""
     motion = ji.simulate(
-        ji.block_system(0.2, 0.6),
+        ji.System(ji.Block(0.2, 0.6), gravity=True),
         ji.LZB(0.3, friction=0.8),
         upright(0.15),
         [0.0] * 3,
@@ -123,7 +123,12 @@ def test_three_touching_beads_come_to_rest():
 
     def drop(slow):
         return ji.simulate(
-            ji.column_system([0.1] * 3, 0.01), ji.LZB(0.9), beads, [0.0] * 3, 2.0, slow=slow
+            ji.System(ji.Column([0.1] * 3, 0.01), gravity=True),
+            ji.LZB(0.9),
+            beads,
+            [0.0] * 3,
+            2.0,
+            slow=slow,
         )
 
     motion, fine = drop(1e-6), drop(1e-10)
@@ -140,7 +145,7 @@ def test_three_touching_beads_come_to_rest():
 @pytest.mark.release
 def test_open_contacts_take_no_part_in_an_impact():
     """Not by a law either that resolves the collisions to come (it knows no gravity meanwhile)."""
-    beads, start = ji.column_system([0.1] * 3), [0.1, 0.101, 0.102]
+    beads, start = ji.System(ji.Column([0.1] * 3), gravity=True), [0.1, 0.101, 0.102]
     motion = ji.simulate(beads, ji.Binary(0.9), start, [0.0] * 3, 0.5, samples=2)
     count = int(motion.events.count)
     assert count > 10
@@ -151,7 +156,12 @@ def test_open_contacts_take_no_part_in_an_impact():
 @pytest.mark.release
 def test_an_overturned_block_lies_on_its_side():
     motion = ji.simulate(
-        ji.block_system(0.2, 0.6), ji.LZB(0.3), upright(0.5), [0.0] * 3, 3.0, samples=31
+        ji.System(ji.Block(0.2, 0.6), gravity=True),
+        ji.LZB(0.3),
+        upright(0.5),
+        [0.0] * 3,
+        3.0,
+        samples=31,
     )
     assert ended(motion) == ["ok"]
     np.testing.assert_allclose(motion.q[-1], [0, 0.1, np.pi / 2], atol=1e-12)
@@ -163,8 +173,8 @@ def test_an_overturned_block_lies_on_its_side():
 @pytest.mark.release
 def test_a_body_on_a_tilted_plane_slides():
     """By its tangents alone, no displacements: s'' = g (sin a - mu cos a)."""
-    slope = ji.PlanarBodies([ji.Block(0.2, 0.1)], planes=[0.3])
-    system = ji.System(slope, potential=ji.gravity(slope))
+    slope = ji.Bodies([ji.Block(0.2, 0.1)], planes=[0.3])
+    system = ji.System(slope, gravity=True)
     rest = [0.0] * 3
     motion = ji.simulate(
         system, ji.Moreau(0.0), slope.touching(), rest, 1.0, samples=11, friction=0.25
@@ -186,7 +196,7 @@ def test_overturning_on_a_harmonic_base():
         start = base(jnp.zeros(()))[0]
         q0 = jnp.stack([start, jnp.full((), 0.3), jnp.zeros(())])
         return ji.simulate(
-            ji.block_system(0.2, 0.6, base=base, corners="base"),
+            ji.System(ji.Block(0.2, 0.6, corners="base"), gravity=True, base=base),
             law,
             q0,
             jnp.zeros(3),
@@ -211,7 +221,7 @@ def test_basketball_and_tennis_ball(law):
     e, v = 0.9, np.sqrt(2 * G)
 
     def rebound(light, gap):
-        system = ji.column_system(jnp.stack([0.6, light]), [0.12, 0.033])
+        system = ji.System(ji.Column(jnp.stack([0.6, light]), [0.12, 0.033]), gravity=True)
         q0 = jnp.stack([jnp.full((), 1.12), 1.12 + 0.12 + 0.033 + gap])
         motion = ji.simulate(system, law, q0, jnp.zeros(2), 0.6, samples=13)
         return motion.events.velocity_after[:2], motion.status
@@ -225,19 +235,19 @@ def test_basketball_and_tennis_ball(law):
     np.testing.assert_allclose(after[1:, 1, 1], binary[1:], rtol=1e-9)
     np.testing.assert_allclose(after[3, 1, 1], ((1 + e) ** 2 - 1) * v, rtol=1e-4)
     # without one they are one impact
-    together = ji.impact(law, ji.column([0.06, 0.6]), [v, v]).velocity
+    together = ji.impact(law, ji.chain([0.06, 0.6], wall="right"), [v, v]).velocity
     np.testing.assert_allclose(after[0, 0], -together[::-1], rtol=1e-7)
 
 
 def collides(x):
-    system = ji.cradle_system([0.1] * 3, length=0.1, diameter=0.02)
+    system = ji.System(ji.PendulumCradle([0.1] * 3, 0.1, 0.01), gravity=True)
     start = jnp.stack([-x[1], 0 * x[1], 0 * x[1]])
     law = ji.LZB(x[0], rtol=1e-11)  # differences see the tolerance of the law, too
     return system, law, start, jnp.zeros(3).at[0].set(x[2]), 0.6, None
 
 
 def shaken(x):
-    system = ji.ball_system(base=ji.HarmonicBase(x[0], x[1]))
+    system = ji.System(ji.Column([1.0]), gravity=True, base=ji.HarmonicBase(x[0], x[1]))
     return system, ji.Newton(x[2]), [0.2], [0.0], 1.0, None
 
 
@@ -276,7 +286,7 @@ def test_derivatives_of_a_motion_against_differences(given, at, events, step, al
 @pytest.mark.release
 def test_fit_through_a_simulated_motion():
     """Restitutions and stiffness ratio of a cradle, from angles with (simulated) noise."""
-    system = ji.cradle_system([0.1] * 3, length=0.15, diameter=0.025)
+    system = ji.System(ji.PendulumCradle([0.1] * 3, 0.15, 0.0125), gravity=True)
     true = ji.LZB([0.95, 0.9], stiffness=[1.0, 2.0], exponent=1.5)
     start = ([-0.5, 0, 0], [0.0] * 3, 2.0)
     seen = np.asarray(ji.simulate(system, true, *start, samples=81).q)
@@ -297,7 +307,10 @@ def test_fit_through_a_simulated_motion():
 @pytest.mark.release
 def test_friction_is_fitted_through_a_motion():
     """A dimer that is thrown; positions with (simulated) noise."""
-    dimer, start = ji.dimer_system(0.01, 0.04), ([0.0, 0.1, 0.2], [0.5, 0.0, 0.0], 0.25)
+    dimer, start = (
+        ji.System(ji.Dimer(0.01, 0.04), gravity=True),
+        ([0.0, 0.1, 0.2], [0.5, 0.0, 0.0], 0.25),
+    )
     seen = np.asarray(ji.simulate(dimer, ji.Moreau(0.8, friction=0.2), *start, samples=41).q)
     noisy = seen + 1e-4 * np.random.default_rng(0).normal(size=seen.shape)
     free = ("restitution", "friction")
@@ -311,7 +324,7 @@ def test_friction_is_fitted_through_a_motion():
 @pytest.mark.release
 def test_a_motion_that_sees_nothing():
     before = ji.fit_motion(
-        ji.ball_system(), ji.Newton(0.7), [[1.0], [0.9]], [1.0], [0.0], 0.1,
+        ji.System(ji.Column([1.0]), gravity=True), ji.Newton(0.7), [[1.0], [0.9]], [1.0], [0.0], 0.1,
         bounds={"restitution": (0.1, 0.9)},
     )  # fmt: skip
     assert before.rank == 0

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import jimpact as ji
-from jimpact import read_motion_study
+from jimpact import read_study
 
 MOTION = """
 [system]
@@ -27,12 +27,12 @@ file = "heights.csv"
 
 @pytest.mark.release
 def test_a_study_of_a_motion_is_fitted(tmp_path):
-    ball = ji.ball_system()
+    ball = ji.System(ji.Column([1.0]), gravity=True)
     q = np.asarray(ji.simulate(ball, ji.Newton(0.8), [1.0], [0.0], 1.5, samples=16).q)[:, 0]
     lines = [f"{100 * i},{100 * x:.8f}" for i, x in enumerate(q)]
     (tmp_path / "heights.csv").write_text("t[ms],q_1[cm]\n" + "\n".join(lines) + "\n")
     (tmp_path / "study.toml").write_text(MOTION)
-    found = read_motion_study(tmp_path / "study.toml").fit()
+    found = read_study(tmp_path / "study.toml").fit()
     np.testing.assert_allclose(found.value, [0.8], atol=1e-6)
     assert "Fit of Newton to 16 measured values" in str(found)
     ji.plot.fit(found)
@@ -49,4 +49,4 @@ def test_motions_that_cannot_be_read(tmp_path):
     ):
         (tmp_path / "heights.csv").write_text(text)
         with pytest.raises(ValueError, match=message):
-            read_motion_study(tmp_path / "study.toml")
+            read_study(tmp_path / "study.toml")

@@ -74,8 +74,8 @@ def test_the_interval_ends_where_a_contact_stays_closed():
         masses, e = rng.uniform(0.3, 3, 3), rng.uniform(0.2, 1)
         w = np.array([[1 / masses[0] + 1 / masses[1], -1 / masses[1]],
                       [-1 / masses[1], 1 / masses[1] + 1 / masses[2]]])  # fmt: skip
-        low, high = (x[0, 1] for x in ji.correlation_interval(ji.chain(masses), e))
-        assert np.isnan(ji.correlation_interval(ji.chain(masses), e)[0][0, 0])
+        low, high = (x[0, 1] for x in ji.theory.correlation_interval(ji.chain(masses), e))
+        assert np.isnan(ji.theory.correlation_interval(ji.chain(masses), e)[0][0, 0])
         for r, closed in ((low, 1), (high, 0)):
             d = np.array([1.0, r])
             a = w @ d
@@ -85,7 +85,7 @@ def test_the_interval_ends_where_a_contact_stays_closed():
             assert abs(gamma[closed]) < 1e-9
             assert gamma[1 - closed] > -1e-9
     with pytest.raises(ValueError, match="`restitution`"):
-        ji.correlation_interval(ji.chain([1.0] * 3), 1.1)
+        ji.theory.correlation_interval(ji.chain([1.0] * 3), 1.1)
 
 
 def test_ratios_are_checked_inside_jit():

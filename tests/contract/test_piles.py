@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import piles
 import pytest
 
 import jimpact as ji
@@ -19,7 +20,7 @@ def packing():
             centres.append(c)
             radii.append(r)
     walls = [[2.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 3.0, 4.0, 0.0]]
-    spheres = ji.Spheres(1.0 + rng.random(480), radii, walls=walls)
+    spheres = piles.spheres(1.0 + rng.random(480), radii, planes=walls)
     q = spheres.at(centres)
     later = q + 0.02 * rng.standard_normal(q.shape)
     return spheres, q, later
@@ -37,7 +38,7 @@ def test_closed_contacts_are_those_with_small_gaps(packing):
     assert 0 < spheres.crowd < 60  # by the grid
     pairs = contacts(spheres, q, later)
     closed = np.asarray(pairs.closed)
-    k, walls = spheres.count, len(spheres.walls)
+    k, walls = spheres.count, len(spheres.planes)
     i, j = np.triu_indices(k, 1)
     numbers = np.concatenate(
         [i * (k + walls) + j, (np.arange(k)[:, None] * (k + walls) + k + np.arange(walls)).ravel()]
@@ -50,7 +51,7 @@ def test_closed_contacts_are_those_with_small_gaps(packing):
 
 
 def test_pairs_that_meet_within_a_step_may_be_two_cells_apart():
-    discs = ji.Discs(1.0, [0.5] * 80)
+    discs = piles.discs(1.0, [0.5] * 80)
     assert discs.crowd > 0
     q = discs.at([[1.4 * i, 0.0] for i in range(80)])
     later = q + discs.at([[0.2 * (-1) ** i, 0.0] for i in range(80)])
@@ -78,7 +79,7 @@ def test_directions_are_velocities_of_the_points_that_touch(packing):
             half = 0.5 * (np.linalg.norm(at[a] - at[b]) - radii[a] - radii[b])
             np.testing.assert_allclose(n, (at[a] - at[b]) / np.linalg.norm(at[a] - at[b]))
         else:
-            wall = np.asarray(spheres.walls)[number % (spheres.count + 3) - spheres.count]
+            wall = np.asarray(spheres.planes)[number % (spheres.count + 3) - spheres.count]
             np.testing.assert_array_equal(n, wall[:3])
         point = v[a, :3] - (radii[a] + half) * np.cross(v[a, 3:], n)
         point -= v[b, :3] + (radii[b] + half) * np.cross(v[b, 3:], n)
@@ -91,7 +92,7 @@ def test_directions_are_velocities_of_the_points_that_touch(packing):
 
 def test_spheres_are_a_body_like_others():
     """Gradients of gaps and tangents are those of the closed contacts; mass by 2 m R^2 / 5."""
-    spheres = ji.Spheres([1.0, 2.0], [0.1, 0.2], walls=[[0.0, 0.0, 1.0, 0.0]])
+    spheres = piles.spheres([1.0, 2.0], [0.1, 0.2], planes=[[0.0, 0.0, 1.0, 0.0]])
     np.testing.assert_allclose(spheres.mass, [1] * 3 + [0.004] * 3 + [2] * 3 + [0.032] * 3)
     q = spheres.at([[0.0, 0.0, 0.1], [0.0, np.sqrt(0.08), 0.2]])
     gradients, tangents, pairs = jax.jit(
@@ -112,17 +113,17 @@ def test_spheres_are_a_body_like_others():
 
 
 def test_walls_that_do_not_fit_are_named():
-    with pytest.raises(ValueError, match=r"`walls` must have shape \(w, 4\)"):
-        ji.Spheres(1.0, [0.1], walls=[[0.0, 1.0, 0.0]])
+    with pytest.raises(ValueError, match=r"`planes` must have shape \(4,\)"):
+        piles.spheres(1.0, [0.1], planes=[[0.0, 1.0, 0.0]])
     with pytest.raises(ValueError, match=r"`centres` must have shape \(1, 3\)"):
-        ji.Spheres(1.0, [0.1]).at([[0.0, 1.0]])
+        piles.spheres(1.0, [0.1]).at([[0.0, 1.0]])
 
 
 @pytest.mark.slow
 def test_a_sphere_slides_and_then_rolls():
     """It ends at 5/7 of its speed, whatever the friction, at the time 2 v / (7 mu g)."""
-    spheres = ji.Spheres(2.0, [0.1, 0.1], walls=[[0.0, 0.0, 1.0, 0.0]])
-    system = ji.System(spheres, potential=ji.gravity(spheres))
+    spheres = piles.spheres(2.0, [0.1, 0.1], planes=[[0.0, 0.0, 1.0, 0.0]])
+    system = ji.System(spheres, gravity=True)
     start = spheres.at([[0.0, 0.0, 0.1], [0.0, 5.0, 0.1]])
     v0 = np.zeros(12)
     v0[[0, 7]] = 1.0, 2.0  # along x, and twice as fast along y
@@ -153,14 +154,14 @@ def test_spheres_fall_into_a_box_and_come_to_rest():
         [0, 1.0, 0, 0],
         [0, -1.0, 0, -0.08],
     ]
-    spheres = ji.Spheres(4e6 * radii**3, radii, walls=walls)
-    system = ji.System(spheres, potential=ji.gravity(spheres))
+    spheres = piles.spheres(4e6 * radii**3, radii, planes=walls)
+    system = ji.System(spheres, gravity=True)
     v0 = np.pad(0.1 * rng.standard_normal((27, 3)), ((0, 0), (0, 3))).reshape(-1)
     motion = ji.simulate(
         system, ji.Moreau(0.3, friction=0.5), spheres.at(0.014 + 0.024 * grid), v0, 1.5,
         samples=16, method="time_stepping", step=1e-3,
     )  # fmt: skip
-    ji.raise_on_failed_motion(motion)
+    ji.raise_on_failure(motion)
     speed = np.abs(np.asarray(motion.velocity[-1]).reshape(-1, 6)[:, :3])
     assert np.median(speed) < 1e-6
     assert speed.max() < 2e-2  # a last sphere may roll
@@ -181,9 +182,9 @@ def test_a_mixed_pile_has_the_contacts_of_planar_bodies():
         ji.Disc(0.1),
         ji.Polygon(pentagon.T),
     ]
-    pile = ji.PlanarPile(bodies, walls=[[0.0, 2.0, 0.0], [1.0, 0.0, 0.5]])
+    pile = ji.Bodies(bodies, [[0.0, 2.0, 0.0], [1.0, 0.0, 0.5]], room=6 * len(bodies))
     pairs = list(zip(*np.triu_indices(5, 1)))
-    every = ji.PlanarBodies(bodies, planes=[0.0, (-np.pi / 2, 0.5)], pairs=pairs)
+    every = ji.Bodies(bodies, planes=[0.0, (-np.pi / 2, 0.5)], pairs=pairs)
     np.testing.assert_array_equal(pile.mass, every.mass)
     x, y = [0.0, 0.4, 0.1, -0.3, 0.6], [0.2, 0.3, 0.6, 0.5, 0.75]
     q = np.stack([x, y, np.random.default_rng(0).random(5)], axis=1).reshape(-1)
@@ -209,7 +210,7 @@ def test_a_mixed_pile_finds_its_contacts_by_the_grid():
     """Those of all pairs that are near, now or later, and the least gap of all."""
     rng = np.random.default_rng(3)
     bodies = [ji.Block(1.0, 1.0), ji.Disc(0.5)] * 60
-    pile = ji.PlanarPile(bodies, walls=[[0.0, 1.0, -0.8]])
+    pile = ji.Bodies(bodies, [[0.0, 1.0, -0.8]], room=6 * len(bodies))
     cells = np.stack(np.meshgrid(np.arange(12), np.arange(10)), axis=-1).reshape(-1, 2)
     q = np.array(pile.at([1.4, 1.1] * cells)).reshape(-1, 3)
     q[:, 2] = rng.choice([0.0, np.pi / 2, 0.02], 120)
@@ -235,14 +236,12 @@ def test_a_mixed_pile_finds_its_contacts_by_the_grid():
 
 
 def test_bad_mixed_piles_are_named():
-    with pytest.raises(
-        TypeError, match=r"`bodies` must hold polygons, blocks and discs, .* a Dimer"
-    ):
-        ji.PlanarPile([ji.Dimer(0.1, 0.5)])
+    with pytest.raises(TypeError, match=r"`bodies` must be discs, polygons or spheres, not Dimer"):
+        ji.Bodies([ji.Dimer(0.1, 0.5)], room=9)
     with pytest.raises(ValueError, match="`bodies` must hold one or more"):
-        ji.PlanarPile([])
-    with pytest.raises(ValueError, match=r"`walls` must have shape \(w, 3\)"):
-        ji.PlanarPile([ji.Disc(0.1)], walls=[0.0])
+        ji.Bodies([], room=9)
+    with pytest.raises(ValueError, match=r"`planes`"):
+        ji.Bodies([ji.Disc(0.1)], [[0.0, 0.0, 1.0]], room=9)
 
 
 @pytest.mark.release
@@ -253,12 +252,14 @@ def test_a_mixed_pile_comes_to_rest_and_goes_on():
         ji.Disc(0.06),
         ji.Polygon([[0, 0], [0.2, 0], [0.1, 0.1]]),
     ]
-    pile = ji.PlanarPile(bodies * 2, walls=[[0, 1.0, 0], [1.0, 0, -0.25], [-1.0, 0, -0.25]])
-    system, law = ji.System(pile, potential=ji.gravity(pile, 10.0)), ji.Moreau(0.0, friction=0.5)
+    pile = ji.Bodies(
+        bodies * 2, room=12 * len(bodies), planes=[[0, 1.0, 0], [1.0, 0, -0.25], [-1.0, 0, -0.25]]
+    )
+    system, law = ji.System(pile, gravity=10.0), ji.Moreau(0.0, friction=0.5)
     places = [[-0.1, 0.06], [0.13, 0.07], [0.0, 0.2], [-0.1, 0.32], [0.13, 0.3], [0.0, 0.45]]
     options = dict(samples=5, method="time_stepping", step=1e-3)
     motion = ji.simulate(system, law, pile.at(places), np.zeros(18), 1.5, **options)
-    ji.raise_on_failed_motion(motion)
+    ji.raise_on_failure(motion)
     assert motion.kinetic_energy[-1] < 1e-9
     np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-10)
     assert -2e-3 < float(motion.gaps.min()) < -1e-9  # steps leave overlaps, with which it goes on
@@ -278,7 +279,9 @@ def struck():
     """
     h = np.sqrt(3)
     places = [[0, 0, 1.0], [h, 1.0, 1.0], [h, -1.0, 1.0], *([9.0 * i, 0, 1.0] for i in range(1, 6))]
-    spheres = ji.Spheres([1.0, 1.0, 1.0, 2.0] + 4 * [1.0], [1.0] * 8, walls=[[0.0, 0.0, 2.0, 0.0]])
+    spheres = piles.spheres(
+        [1.0, 1.0, 1.0, 2.0] + 4 * [1.0], [1.0] * 8, planes=[[0.0, 0.0, 2.0, 0.0]]
+    )
     v = np.zeros(48)
     v[[0, 20]] = 1.0, -3.0
     return spheres, spheres.at(places), v
@@ -341,14 +344,16 @@ def test_a_step_of_a_packing_is_an_impact(struck):
     np.testing.assert_allclose(rough.tangential[falls], [-0.9, 0, 0], atol=1e-5)
     np.testing.assert_allclose(rough.velocity[[18, 20]], [9 - 0.45, 1.5], atol=1e-5)
     with pytest.raises(ValueError, match=r"must be of a body with many contacts .* of Column"):
-        ji.pile_contacts(ji.ball_system(), ji.Moreau(0.5), [0.0], [-1.0], step=1e-3)
+        ji.pile_contacts(
+            ji.System(ji.Column([1.0]), gravity=True), ji.Moreau(0.5), [0.0], [-1.0], step=1e-3
+        )
     with pytest.raises(ValueError, match="must lead to a contact within the step"):
         ji.pile_contacts(system, ji.Moreau(0.5, friction=0.1), 9 * q, 0 * v, step=1e-9)
 
 
 def test_bad_packings_are_named(struck):
     spheres, q, _ = struck
-    row = ji.Spheres(1.0, [0.1] * 3, room=1)
+    row = piles.spheres(1.0, [0.1] * 3, room=1)
     with pytest.raises(ValueError, match="at most 1 contacts"):
         row.touching(row.at([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.4, 0.0, 0.0]]))
     with pytest.warns(UserWarning, match=r"`q` holds bodies that overlap by 0\.05 m"):
@@ -374,9 +379,9 @@ def test_dynamics_of_a_packing_are_those_of_the_dense_scene(struck, method):
 
 
 def test_piles_by_events_are_refused_with_friction():
-    pile = ji.PlanarPile([ji.Disc(0.1)] * 2)
+    pile = ji.Bodies([ji.Disc(0.1)] * 2, (), room=12)
     at = pile.at([[0.0, 0.0], [0.3, 0.0]])
     law = ji.Compliant(ji.Hertz(1e6), friction=0.1)
     for method in ("events", "contact_forces"):
-        with pytest.raises(ValueError, match="`friction` must be 0 for the contacts of PlanarPile"):
+        with pytest.raises(ValueError, match="`friction` must be 0 for the contacts of Discs"):
             ji.simulate(ji.System(pile), law, at, np.zeros(6), 1.0, method=method)

@@ -105,7 +105,7 @@ MOTIONS = {
 def test_motions(method):
     law, options = MOTIONS[method]
     block = ji.Block(0.3, 0.4, 1.3)
-    system = ji.System(block, potential=ji.gravity(block))
+    system = ji.System(block, gravity=True)
 
     def end(e, v):
         motion = ji.simulate(
@@ -129,7 +129,7 @@ def test_what_surrounds_an_impact():
             ji.momentum(BODY, v),
             ji.velocity_change(BODY, out.impulse),
             ji.delassus_matrix(BODY),
-            ji.normalized_gap_velocity(BODY, v),
+            ji.theory.normalized_gap_velocity(BODY, v),
             ji.history(ji.LZB(0.6, 1.0), BODY, v).force,
             ji.theory.to_quasi_velocities(BODY, v),
         )

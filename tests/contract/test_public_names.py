@@ -8,10 +8,12 @@ import pytest
 import jimpact as ji
 
 PUBLIC = {
-    "jimpact": {*ji.__all__, "plot", "theory"},
+    "jimpact": {*ji.__all__, "data", "plot", "theory"},
     "jimpact.plot": set(ji.plot.__all__),
     "jimpact.theory": set(ji.theory.__all__),
+    "jimpact.data": set(ji.data.__all__),
 }
+MOST = 100  # names at the top
 FILES = sorted(Path(__file__).parent.glob("*.py"))
 
 
@@ -22,6 +24,10 @@ def imported(tree):
             yield from ((node.module, alias.name) for alias in node.names)
         elif isinstance(node, ast.Import):
             yield from ((alias.name, None) for alias in node.names)
+
+
+def test_the_top_is_read_in_one_look():
+    assert len(ji.__all__) <= MOST
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)

@@ -117,7 +117,7 @@ def test_identities_of_random_scenes(constraints):
     if constraints:
         np.testing.assert_allclose(tangent.T @ np.asarray(scene.constraints), 0, atol=1e-12)
     qn, qt = to_quasi(scene, v)
-    np.testing.assert_allclose(qn, ji.normalized_gap_velocity(scene, v), atol=1e-13)
+    np.testing.assert_allclose(qn, ji.theory.normalized_gap_velocity(scene, v), atol=1e-13)
     np.testing.assert_allclose(qn, normal.T @ mass @ v, atol=1e-12)
     np.testing.assert_allclose(from_quasi(scene, qn, qt), v, atol=1e-12)
     parts = split(scene, v)

@@ -7,10 +7,11 @@ import pytest
 from programs import CODE, kinetic_norm
 
 import jimpact as ji
-from jimpact import RestitutionMatrix, normalized_delassus
+from jimpact import RestitutionMatrix
 from jimpact.theory import (
     from_quasi_velocities,
     housner_restitution,
+    normalized_delassus,
     rocking_matrix,
     rocking_ratios,
     to_quasi_velocities,
@@ -239,7 +240,7 @@ def test_derivatives_in_the_entries(scene):
     """v+ is affine in E: dv+/dE_ij = -M^-1 N diag(1/|grad f|) G^-1 e_i qn_j."""
     n, m = scene.size, scene.contacts
     v = velocity_of(scene, [-1.0, -0.3], jnp.ones(to_quasi(scene, jnp.zeros(n))[1].size))
-    norm, qn = kinetic_norm(scene), np.asarray(ji.normalized_gap_velocity(scene, v))
+    norm, qn = kinetic_norm(scene), np.asarray(ji.theory.normalized_gap_velocity(scene, v))
     g = normalized_delassus(scene)
     g = np.asarray(g if isinstance(g, jax.Array) else g.as_matrix())
     push = np.stack(

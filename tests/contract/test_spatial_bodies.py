@@ -28,7 +28,7 @@ def quaternion(turn):
 def sphere_and_box(gap, point, normal):
     """A sphere over this point of a turned box, and q."""
     box = ji.Box(2 * HALF, mass=BOX, rounding=ROUNDING)
-    ball = ji.SpatialBodies([ji.Sphere(RADIUS, mass=SPHERE), box], planes=())
+    ball = ji.Bodies([ji.Sphere(RADIUS, mass=SPHERE), box], planes=())
     away = np.asarray(point) + (ROUNDING + RADIUS + gap) * np.asarray(normal)
     places = [MIDDLE + TURN.apply(away), MIDDLE]
     return ball, ball.at(places, [quaternion(TURN.inv()), quaternion(TURN)])
@@ -39,7 +39,7 @@ def places():
     """Gaps and directions of a ball off its middle and a box over two planes and at a wall."""
     wall = ji.Box([0.1, 4.0, 2.0])
     moment = [0.004, 0.004, 0.004]
-    bodies = ji.SpatialBodies(
+    bodies = ji.Bodies(
         [ji.Sphere(RADIUS, inertia=moment, centre=[0.02, 0.01, -0.03]),
          ji.Sphere(0.2), ji.Box(2 * HALF, mass=BOX, rounding=ROUNDING)],
         planes=[(0.0, 0.0, 2.0, -1.0), (0.6, 0.0, 0.8, -9.0)],
@@ -154,15 +154,15 @@ def test_a_sphere_strikes_a_face_an_edge_and_a_corner():
 def test_a_sphere_falls_over_the_edge_of_a_finite_wall_in_steps():
     """Beside the wall it passes; on its top it bounces to e^2 of its height."""
     wall = ji.Box([0.1, 2.0, 1.0])
-    bodies = ji.SpatialBodies(
+    bodies = ji.Bodies(
         [ji.Sphere(RADIUS), ji.Sphere(RADIUS)], fixed=[wall], places=[wall.at([0.0, 0.0, 0.5])]
     )
-    system = ji.System(bodies, potential=ji.gravity(bodies, 10.0))
+    system = ji.System(bodies, gravity=10.0)
     q = bodies.at([[0.0, 0.5, 1.3], [0.0, 1.101, 1.3]])
     motion = ji.simulate(
         system, ji.Newton(0.5), q, np.zeros(12), 0.3, samples=4, method="time_stepping", step=1e-3
     )
-    ji.raise_on_failed_motion(motion)
+    ji.raise_on_failure(motion)
     rebound = 0.5 * np.sqrt(2 * 10 * 0.2)
     assert motion.velocity[-1, 2] == pytest.approx(rebound - 10 * (0.3 - 0.2), abs=0.02)
     assert motion.q[-1, 9] == pytest.approx(1.3 - 0.5 * 10 * 0.3**2, abs=2e-3)
@@ -171,27 +171,31 @@ def test_a_sphere_falls_over_the_edge_of_a_finite_wall_in_steps():
 @pytest.mark.parametrize(
     ("call", "error", "words"),
     [
-        (lambda: ji.SpatialBodies([ji.Disc(1.0)]), TypeError, r"`bodies` .* holds a Disc\.$"),
-        (lambda: ji.PlanarBodies([ji.Sphere(1.0)]), TypeError, r"a Sphere; .* `SpatialBodies`\.$"),
+        (lambda: ji.Bodies([ji.Sphere(1.0), ji.Disc(1.0)]), TypeError, r"holds a Disc\.$"),
+        (lambda: ji.Bodies([ji.Disc(1.0), ji.Sphere(1.0)]), TypeError, r"holds a Sphere\.$"),
+        (lambda: ji.Bodies([ji.Disc(1.0)], pairs=[], room=9), ValueError, "`room`"),
+        (lambda: ji.Bodies([ji.Dimer(0.1, 1.0)], room=9), TypeError, "not Dimer"),
+        (lambda: ji.Bodies([ji.Disc(1.0)], fixed=[ji.Disc(1.0)]), ValueError, "`fixed`"),
+        (lambda: ji.Bodies([ji.Sphere(1.0)], at=[0.0] * 7), ValueError, "`at`"),
         (
-            lambda: ji.SpatialBodies([ji.Box([1, 1, 1])] * 2),
+            lambda: ji.Bodies([ji.Box([1, 1, 1])] * 2),
             ValueError,
             r"the pair \(0, 1\): two boxes have no gap function\. .* `jimpact\.from_mujoco`",
         ),
-        (lambda: ji.SpatialBodies([ji.Sphere(1.0)], pairs=[(0, 1)]), ValueError, r"`pairs`"),
-        (lambda: ji.SpatialBodies([ji.Sphere(1.0)], planes=()), ValueError, r"must give a contact"),
+        (lambda: ji.Bodies([ji.Sphere(1.0)], pairs=[(0, 1)]), ValueError, r"`pairs`"),
+        (lambda: ji.Bodies([ji.Sphere(1.0)], planes=()), ValueError, r"must give a contact"),
         (
-            lambda: ji.SpatialBodies([ji.Sphere(1.0)], planes=[[0, 0, 0, 1]]),
+            lambda: ji.Bodies([ji.Sphere(1.0)], planes=[[0, 0, 0, 1]]),
             ValueError,
             r"`planes`",
         ),
-        (lambda: ji.SpatialBodies([], planes=()), ValueError, r"`bodies`"),
+        (lambda: ji.Bodies([], planes=()), ValueError, r"`bodies`"),
         (
-            lambda: ji.SpatialBodies([ji.Sphere(1.0)], fixed=[ji.Box([1, 1, 1])]),
+            lambda: ji.Bodies([ji.Sphere(1.0)], fixed=[ji.Box([1, 1, 1])]),
             ValueError,
             r"`places` must have shape \(1, 7\)",
         ),
-        (lambda: ji.SpatialBodies([ji.Sphere(1.0)]).at([0, 0, 1]), ValueError, r"`positions`"),
+        (lambda: ji.Bodies([ji.Sphere(1.0)]).at([0, 0, 1]), ValueError, r"`positions`"),
     ],
 )
 def test_bad_input(call, error, words):

@@ -131,4 +131,11 @@ def test_nothing_approaches_and_bad_input():
     assert bool(out.ended)
     np.testing.assert_allclose(out.velocity, -LANDING, atol=1e-12)
     with pytest.raises(ValueError, match="`until_apart` must be False"):
-        ji.simulate(ji.ball_system(), ji.Newton(0.8), [1.0], [0.0], 1.0, until_apart=True)
+        ji.simulate(
+            ji.System(ji.Column([1.0]), gravity=True),
+            ji.Newton(0.8),
+            [1.0],
+            [0.0],
+            1.0,
+            until_apart=True,
+        )

@@ -17,7 +17,7 @@ import jimpact as ji
 
 ROOT = Path(__file__).parents[2]
 SCRIPT = Path(__file__).parents[1] / "typed_script.py"
-PACKAGES = (ji, ji.plot, ji.theory)
+PACKAGES = (ji, ji.plot, ji.theory, ji.data)
 
 
 def names_in_stub(package):
@@ -58,7 +58,7 @@ def test_a_name_stands_in_one_name_space_only():
 @pytest.mark.parametrize("package", PACKAGES, ids=lambda p: p.__name__)
 def test_no_module_is_named_like_a_public_name(package):
     modules = {module.name for module in pkgutil.iter_modules(package.__path__)}
-    assert not modules & set(package.__all__) - {"plot", "theory"}
+    assert not modules & set(package.__all__) - {"data", "plot", "theory"}
 
 
 def test_the_registry_holds_our_laws_at_first_use():
@@ -97,7 +97,8 @@ def test_pyright_sees_names_signatures_and_fields(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("space", "package"), [("ji", ji), ("ji.plot", ji.plot), ("ji.theory", ji.theory)]
+    ("space", "package"),
+    [("ji", ji), ("ji.plot", ji.plot), ("ji.theory", ji.theory), ("ji.data", ji.data)],
 )
 def test_editors_complete_all_names(space, package):
     script = jedi.Script(f"import jimpact as ji\n{space}.", project=jedi.Project(ROOT))

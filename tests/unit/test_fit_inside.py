@@ -9,6 +9,7 @@ from scipy import optimize
 import jimpact as ji
 from jimpact.files.records import with_error
 from jimpact.fits.parameters import LawInScene, bounds_of, free_parameters, tied
+from jimpact.fits.report import Fit
 from jimpact.fits.solve import Damping
 
 
@@ -42,7 +43,7 @@ def test_functions_cannot_be_saved(tmp_path):
         (ji.FitProblem.from_shots(ji.Newton([0.5, 0.5]), BALLS, THREE, ties={"restitution[2]": two_thirds}), "must have no ties"),
     ):  # fmt: skip
         with pytest.raises(ValueError, match=message):
-            ji.Fit.save(Saved(problem), tmp_path / "fit.json")
+            Fit.save(Saved(problem), tmp_path / "fit.json")
 
 
 class Saved:

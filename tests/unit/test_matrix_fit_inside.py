@@ -9,8 +9,9 @@ from programs import as_matrix
 from scipy.optimize import minimize
 
 import jimpact as ji
-from jimpact import RestitutionMatrix, fit, normalized_delassus
+from jimpact import RestitutionMatrix, fit
 from jimpact.fits.matrices import admissible_start
+from jimpact.theory import normalized_delassus
 from jimpact.theory.restitution_matrices import margin
 
 least_margin = jax.jit(margin)

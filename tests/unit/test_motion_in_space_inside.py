@@ -171,7 +171,7 @@ def test_derivatives_of_a_sphere_that_begins_to_roll():
 BRICK = ji.Box([0.1, 0.06, 0.04], mass=0.5)
 
 
-SYSTEM, LAW = ji.System(BRICK, potential=ji.gravity(BRICK)), ji.Moreau(0.3, friction=0.4)
+SYSTEM, LAW = ji.System(BRICK, gravity=True), ji.Moreau(0.3, friction=0.4)
 
 
 def thrown(q0, v0, duration, **options):
@@ -191,7 +191,7 @@ def test_a_box_slides_to_rest():
 COIN = ji.Coin(0.1, 0.02, mass=0.5)
 
 
-ROLLS = ji.System(COIN, potential=ji.gravity(COIN))
+ROLLS = ji.System(COIN, gravity=True)
 
 
 TILT, TURNS = 0.9, 5.0  # [rad] between coin and ground, [rad/s] about the vertical
@@ -344,7 +344,7 @@ ON_EDGES = [
 def chosen(sizes, q, v, mu, before, touch, released):
     """The choice for a box of 1 kg."""
     box = ji.Box(sizes)
-    system = ji.System(box, potential=ji.gravity(box))
+    system = ji.System(box, gravity=True)
     contacts = contacts_at(system, q, v, jnp.zeros_like(mu), True)
     slack, slides = jnp.asarray(5e-10), jnp.zeros(8, bool)
     return choose_with_friction(contacts, mu * jnp.ones(8), before, touch, released, slides, slack)

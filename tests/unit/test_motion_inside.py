@@ -56,7 +56,7 @@ def test_what_a_motion_does_not_reach_has_no_derivatives():
 
 def test_a_motion_back_in_time_is_reported():
     ball, start = (
-        ji.ball_system(),
+        ji.System(ji.Column([1.0]), gravity=True),
         SimpleNamespace(q=jnp.ones(1), v=jnp.ones(1), t=jnp.asarray(1.0)),
     )
     codes = [status_at_start(ball, start, jnp.asarray(end), 1e-9) for end in (2.0, 1.0, 0.0)]
@@ -66,7 +66,7 @@ def test_a_motion_back_in_time_is_reported():
 A_BASE, W_BASE = 0.1, 2 * np.pi * 1.5  # of a plate at A sin(w t)
 
 
-PLATE = ji.ball_system(2.0, base=ji.HarmonicBase(A_BASE, 1.5))
+PLATE = ji.System(ji.Column([2.0]), gravity=True, base=ji.HarmonicBase(A_BASE, 1.5))
 
 
 def test_gaps_are_seen_from_the_base():
@@ -108,7 +108,7 @@ def test_several_motions_are_fitted_at_once(monkeypatch):
     own = np.array([1.0, 2.0, 0.5])[:, None, None] * 0.8 ** (2.0 * np.arange(4))[:, None]
     own[1, 2] = np.nan  # was not measured
     given = (
-        ji.ball_system(),
+        ji.System(ji.Column([1.0]), gravity=True),
         ji.Newton(0.7),
         own,
         [[1.0], [1.5], [0.5]],

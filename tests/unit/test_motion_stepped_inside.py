@@ -50,7 +50,7 @@ def test_a_tossed_cube_makes_its_second_impact_where_it_was_measured():
         [0.102] * 3, mass=0.37, inertia=[9.57e-4, 9.57e-4, 9.09e-4], centre=[0, 0, 0.0057],
         rounding=0.0036,
     )  # fmt: skip
-    system, law = ji.System(cube, potential=ji.gravity(cube, 9.604)), ji.Moreau(0.27, friction=0.16)
+    system, law = ji.System(cube, gravity=9.604), ji.Moreau(0.27, friction=0.16)
     misses = []
     for first, second in zip(rows[::2], rows[1::2], strict=True):
         e, (v, spin), (v2, spin2) = (

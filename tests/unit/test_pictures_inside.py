@@ -17,6 +17,8 @@ from pictures_cases import BALLS, STRIKE, force_chains, samples
 
 import jimpact as ji
 from jimpact.audits import Audit
+from jimpact.fits.profiles import Contour
+from jimpact.fits.uncertainty import Profile
 from jimpact.methods.advice_report import Advice, Candidate
 from jimpact.methods.chart import Point, Reference, Timing, WorkPrecision
 from jimpact.methods.comparison import Comparison, Entry
@@ -191,13 +193,13 @@ def region():
     x, k = np.linspace(0.4, 0.6, 5), np.geomspace(0.5, 3.0, 5)
     deviance = ((x - 0.5) / 0.03)[:, None] ** 2 + np.log(k) ** 2 / 0.04
     names = ("restitution[1]", "stiffness[2]")
-    return ji.Contour(names, x, k, deviance, 5.99, 0.95, (0.5, 1.0), (False, True))
+    return Contour(names, x, k, deviance, 5.99, 0.95, (0.5, 1.0), (False, True))
 
 
 def valley(name):
     x = np.linspace(0.0, 1.0, 9)
     pieces = ((0.25, 0.5), (0.75, 1.0))
-    return ji.Profile(name, x, 40 * (x - 0.5) ** 2, 3.84, 0.95, pieces, (0.0, 1.0))
+    return Profile(name, x, 40 * (x - 0.5) ** 2, 3.84, 0.95, pieces, (0.0, 1.0))
 
 
 BLOCK = ji.Block(width=0.2, height=0.6)

@@ -15,9 +15,9 @@ from PIL import Image
 from programs import CODE
 
 import jimpact as ji
-from jimpact import LawFits
-from jimpact.fits.selection import LawFit
-from jimpact.motion.record import KIND_CODE, no_events
+from jimpact.fits.selection import LawFit, LawFits
+from jimpact.fits.uncertainty import Profile
+from jimpact.motion.record import KIND_CODE, Motion, no_events
 from jimpact.plot.films import positions
 
 
@@ -64,9 +64,7 @@ def test_a_fit_in_one_sentence():
     assert canned(4, converged=False).verdict.startswith("No answer")
     bad = canned(4, warnings=("Lack of fit: the residuals are large.",))
     assert bad.verdict.startswith("LZB does not fit these 4 shots; it comes nearest with restit")
-    open_end = ji.Profile(
-        "restitution[1]", *np.zeros((2, 1)), 4.0, 0.95, ((0.97, 1.0),), (0.0, 1.0)
-    )
+    open_end = Profile("restitution[1]", *np.zeros((2, 1)), 4.0, 0.95, ((0.97, 1.0),), (0.0, 1.0))
     flat = replace(open_end, name="stiffness[1]", intervals=((0.0, 1.0),))
     reported = canned(4, profiles=(open_end, flat), standard_error=np.array([0.01, 1.0]))
     assert reported.verdict == (
@@ -110,7 +108,7 @@ def test_values_that_the_data_do_not_determine_are_marked():
     assert "Values in brackets are starts" in table
     assert table.startswith("The simplest law that fits is lzb: restitution[1] = 0.600")
     np.testing.assert_array_equal(found.determined, [True, False])
-    flat = ji.Profile("restitution[1]", *np.zeros((2, 1)), 4.0, 0.95, ((0.0, 1.0),), (0.0, 1.0))
+    flat = Profile("restitution[1]", *np.zeros((2, 1)), 4.0, 0.95, ((0.0, 1.0),), (0.0, 1.0))
     assert not canned(4, profiles=(flat, flat)).determined.any()
 
 
@@ -145,7 +143,7 @@ def test_motions_are_saved_and_loaded(tmp_path):
     _, found = rocked()
     batch = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * 2), found)
     for motion in (found, batch):
-        loaded = ji.load_motion(motion.save(tmp_path / "dimer.npz"))
+        loaded = ji.load(motion.save(tmp_path / "dimer.npz"))
         assert jax.tree.structure(loaded) == jax.tree.structure(motion)
         for one, other in zip(jax.tree.leaves(loaded), jax.tree.leaves(motion)):
             assert one.dtype == other.dtype
@@ -168,10 +166,10 @@ def test_files_that_hold_no_motion_are_refused(tmp_path):
     ):
         np.savez(tmp_path / name, **content)
         with pytest.raises(ValueError, match=message):
-            ji.load_motion(tmp_path / f"{name}.npz")
+            ji.load(tmp_path / f"{name}.npz")
     path.write_bytes(b"not a file of numbers")
     with pytest.raises(ValueError, match="cannot be read"):
-        ji.load_motion(path)
+        ji.load(path)
     with pytest.raises(ValueError, match=r"must end in \.npz, but is 'motion\.csv'"):
         found.save("motion.csv")
 
@@ -228,7 +226,7 @@ def test_picture_of_a_motion(tmp_path):
 
 def many_discs(count=8):
     """As if simulated: disc i rises by i, disc 1 only by rounding; contact i strikes i times."""
-    system = ji.System(ji.PlanarBodies([ji.Disc(0.1)] * count, planes=[0.0], pairs=[]))
+    system = ji.System(ji.Bodies([ji.Disc(0.1)] * count, planes=[0.0], pairs=[]))
     time, number = np.linspace(0.0, 1.0, 5), np.arange(count)
     q = np.zeros((5, count, 3))
     q[:, :, 1] = 1.0 + number * time[:, None]
@@ -239,7 +237,7 @@ def many_discs(count=8):
     events = replace(events, contacts=jnp.asarray(rows), time=jnp.linspace(0.1, 0.9, count))
     zero = np.zeros(5)
     velocity = np.zeros((5, count, 3))
-    return system, ji.Motion(
+    return system, Motion(
         *(time, q.reshape(5, -1), velocity.reshape(5, -1), zero, 1 + zero, zero, zero),
         *(np.full((5, 2, count), 1e-17), np.full((5, count), 0.1), events, jnp.int32(9)),
         status=jnp.int32(0),

@@ -68,7 +68,7 @@ def tosses(labels: Any) -> np.ndarray:
 
 def impacts() -> Impacts:
     """All clean impacts on one corner, clean and nearly clean ones on two."""
-    measured = ji.cube_impacts((1, 2), NEAR, nearly_clean=True)
+    measured = ji.data.cube_impacts((1, 2), NEAR, nearly_clean=True)
     poses = {}
     for name in ("cube_impacts.csv", "cube_nearly_clean.csv"):
         with (files("jimpact") / "data" / name).open() as file:
@@ -242,7 +242,7 @@ def scatter_of(
 HEAD = """# Laws on a tossed cube
 
 Written by `python tests/validation/cube.py`. The data are measured: {one} impacts on one corner and {two} on two,
-of {tosses} tosses of an acrylic cube (`ji.cube_impacts(nearly_clean=True)`). They are all impacts on one corner that
+of {tosses} tosses of an acrylic cube (`ji.data.cube_impacts(nearly_clean=True)`). They are all impacts on one corner that
 are clean, and all on two (the second one up to 2 mm above the first) that are clean or nearly so: the flights
 before and after meet within .5 mm.
 

@@ -58,7 +58,7 @@ def lowest(q: np.ndarray) -> np.ndarray:
 
 def drops() -> np.ndarray:
     """Poses (K, S, 3) of the drops that stay on the table."""
-    poses = ji.square_drops()[2]
+    poses = ji.data.square_drops()[2]
     return poses[lowest(poses).min(axis=1) > OFF]
 
 
@@ -129,7 +129,7 @@ class Simulator:
 
 def of_jimpact() -> Simulator:
     """Moreau's law, one e and one mu for all corners, by time stepping."""
-    system = ji.System(BLOCK, potential=ji.gravity(BLOCK, GRAVITY))
+    system = ji.System(BLOCK, gravity=GRAVITY)
 
     def one(x: jax.Array, state: jax.Array, frames: int) -> jax.Array:
         """Poses (frames + 1, 3)."""
@@ -288,7 +288,7 @@ def rocking(poses: np.ndarray) -> Rocking:
 TEXT = """# Whole drops of a square
 
 Written by `python tests/validation/drops.py`. The data are measured: {drops} drops of a square (side 60 mm, in the plane)
-at 250 Hz, from the flight to rest (`ji.square_drops()`; one more leaves the table).
+at 250 Hz, from the flight to rest (`ji.data.square_drops()`; one more leaves the table).
 
 Moreau's law in `ji.simulate` and MuJoCo are fitted alike, to the poses in the 32 ms after each hit; the state before
 it is that of an arc through the flight. *Held out*: the drops are divided into {folds} groups; each is predicted by a
@@ -402,7 +402,7 @@ def rocking_table(poses: np.ndarray, law: Any) -> list[str]:
 
 def edges() -> list[str]:
     """Section: e and mu of impacts on an edge beside those on a corner."""
-    square, lines = ji.square_impacts(), []
+    square, lines = ji.data.square_impacts(), []
     for words, contacts in (("a corner", 1), ("an edge (two corners within 2 mm)", 2)):
         shots = square.only(square.contacts == contacts)
         plain = ji.Experiments(shots.pre, shots.post, scenes=shots.scenes, units=shots.units)
@@ -410,7 +410,7 @@ def edges() -> list[str]:
         fit = ji.fit(law, None, plain, free, starts=1, loss="huber")
         (e, mu), (d, dmu) = fit.value, fit.standard_error
         lines.append(row(words, len(plain.pre), f"{e:.2f} +- {d:.2f}", f"{mu:.2f} +- {dmu:.2f}"))
-    head = ["Impacts cut out of the drops (`ji.square_impacts()`), Moreau's law:", ""]
+    head = ["Impacts cut out of the drops (`ji.data.square_impacts()`), Moreau's law:", ""]
     return [*head, row("impact on", "shots", "e", "mu"), row(*["---"] * 4), *lines]
 
 

@@ -235,7 +235,7 @@ def housner():
     """A block that rocks about A and hits with B: plastic, rough ground, no slip."""
     rows = []
     for aspect in (1.0, 2.0, 3.0, 5.0):
-        scene = ji.rocking_block(width=1.0, height=aspect)
+        scene = ji.Block(1.0, aspect, corners="base").scene()
         rate = -1.0
         v = rate * np.array([-aspect / 2, 0.5, 1.0])
         ratio = float(rough(scene.mass, scene.normals, scene.tangents, v)[2]) / rate
@@ -268,7 +268,13 @@ G = 9.80665
 def bouncing_ball():
     e = 0.8
     motion = ji.simulate(
-        ji.ball_system(), ji.Newton(e), [1.0], [0.0], 5.0, samples=101, max_events=100
+        ji.System(ji.Column([1.0]), gravity=True),
+        ji.Newton(e),
+        [1.0],
+        [0.0],
+        5.0,
+        samples=101,
+        max_events=100,
     )
     first, times = np.sqrt(2 / G), motion.event_times()
     rows = []
@@ -296,7 +302,7 @@ def vibrating_plate():
         base = ji.HarmonicBase(amplitude, frequency)
         start = base(x[0])
         motion = ji.simulate(
-            ji.ball_system(base=base), ji.Newton(e), start, x[1:], x[0] + 1.5 * period,
+            ji.System(ji.Column([1.0]), gravity=True, base=base), ji.Newton(e), start, x[1:], x[0] + 1.5 * period,
             t_start=x[0], samples=2, max_events=2,
         )  # fmt: skip
         events = motion.events

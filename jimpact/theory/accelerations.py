@@ -83,8 +83,8 @@ def quasi_lagrange(
     Source: Brogliato, Nonsmooth Mechanics (2016), (6.24)-(6.30).
 
     >>> import jimpact as ji
-    >>> block = ji.block_system(1.0, 2.0**0.5, acceleration=10.0, corners="base")
-    >>> terms = ji.quasi_lagrange(block, [0.0, 0.5**0.5, 0.0], [1.0, 0.0, 0.0])
+    >>> block = ji.System(ji.Block(1.0, 2.0**0.5, corners="base"), gravity=10.0)
+    >>> terms = ji.theory.quasi_lagrange(block, [0.0, 0.5**0.5, 0.0], [1.0, 0.0, 0.0])
     >>> [round(float(f), 6) for f in terms.normal]  # g / sqrt(W_jj), W_jj = 2: kinetic angle pi/2
     [7.071068, 7.071068]
     """
@@ -187,8 +187,8 @@ def contact_problem(system: System, q: Any, velocity: Any, time: Any = 0.0) -> C
     Source: Brogliato, Nonsmooth Mechanics (2016), 6.3.2.2 (the contact LCP of the rocking block).
 
     >>> import jimpact as ji
-    >>> block = ji.block_system(1.0, 2.0, acceleration=10.0, corners="base")
-    >>> problem = ji.contact_problem(block, [0.0, 1.0, 0.0], [0.0, 0.0, 0.0])
+    >>> block = ji.System(ji.Block(1.0, 2.0, corners="base"), gravity=10.0)
+    >>> problem = ji.theory.contact_problem(block, [0.0, 1.0, 0.0], [0.0, 0.0, 0.0])
     >>> problem.forces().round(6).tolist()  # half of its weight each
     [5.0, 5.0]
     """

@@ -1,0 +1,193 @@
+"""Outcomes against gaps: where contacts close at once, and linearized in the gaps."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact._checks import as_float_array, check_shape, check_values
+from jimpact.impacts import impact
+from jimpact.law import Law
+from jimpact.montecarlo.gaps import gap_scale
+from jimpact.montecarlo.results import MonteCarlo
+from jimpact.scene import Scene, with_gaps
+from jimpact.status import STATUS
+
+# Linearized over sampled standard deviation, less 1, up to which the outcome is called linear.
+AGREES = 0.2
+CONSTANT = 1e-12  # a standard deviation below this, relative to the velocities, is rounding
+
+
+class Crossover(eqx.Module):
+    """`velocity` (s, n) [m/s] and `status` (s,) over `offset` (s,), gap 1 - gap 2 over delta_c."""
+
+    offset: jax.Array
+    velocity: jax.Array
+    status: jax.Array
+
+
+def crossover(scene: Scene, law: Law, velocity: Any, offset: Any) -> Crossover:
+    """Outcome of a two-contact scene against the difference of its gaps.
+
+    The outcome depends on which contact closes first. Laws of instantaneous collisions jump where
+    both close at once. With indentation the jump is a smooth crossover, about 2 delta_c wide.
+
+    Args:
+        scene: with two contacts; the mean of its gaps (none: closed) is widened as needed.
+        law: a `Compliant`, or another one with a `contact_force` that uses gaps.
+        velocity: v- (n,) [m/s].
+        offset: (s,), or one, `(gap_1 - gap_2) / delta_c`, with the larger delta_c of the two.
+
+    Returns:
+        `Crossover`: `velocity` (s, n) [m/s] and `status` (s,), one row for each `offset` (s,).
+
+    Raises:
+        ValueError: not two contacts, offsets of another shape. TypeError: another law.
+
+    Source: Brogliato, Nonsmooth Mechanics (2016), section 6.1.1.1: balls of mass (m/4, m, m/4).
+
+    >>> import jimpact as ji
+    >>> balls = ji.chain([0.25, 1.0, 0.25])
+    >>> law = ji.Compliant(ji.Hertz(1.0))
+    >>> result = ji.theory.crossover(balls, law, [1.0, 0.0, -1.0], [-9.0, 0.0, 9.0])
+    >>> (result.velocity.round(4) + 0.0).tolist()  # one by one, both at once, the mirror image
+    [[-0.6, -0.16, 1.24], [-1.0, 0.0, 1.0], [-1.24, 0.16, 0.6]]
+    """
+    if scene.contacts != 2:
+        raise ValueError(f"Argument `scene` must have two contacts, but has {scene.contacts}.")
+    if not law.uses_gaps or law.contact_force is None:
+        raise TypeError(
+            f"Argument `law` must use gaps and have a `contact_force` (Compliant), but is {law!r}."
+        )
+    s = as_float_array("offset", offset)
+    if s.ndim != 1:
+        raise ValueError(f"Argument `offset` must have shape (s,), but has shape {s.shape}.")
+    check_values("offset", s)
+    scale = gap_scale(scene, law, velocity)
+    delta = jnp.max(scale.delta)
+    mean = jnp.maximum(jnp.mean(scale.gaps), 0.5 * delta * jnp.max(jnp.abs(s)))
+    gaps = mean + 0.5 * delta * s[:, None] * jnp.array([1.0, -1.0], s.dtype)[None, :]
+    v, gaps = as_float_array("velocity", velocity), jnp.maximum(gaps, 0.0)
+    out = jax.vmap(lambda each: impact(law, with_gaps(scene, each), v))(gaps)
+    return Crossover(s, out.velocity, out.status)
+
+
+@dataclass(frozen=True, eq=False)
+class GapSensitivity:
+    """The outcome at given gaps (m,) [m] and its derivatives in them; `print` gives a report.
+
+    Attributes:
+        gaps, velocity: (m,) [m], where it is linearized, and (n,) [m/s], the outcome there.
+        jacobian: (n, m) [1/s], `d v+_i / d gap_j`.
+        status: name of the impact's status.
+        sampled: the Monte Carlo run to compare with, or None.
+    """
+
+    gaps: np.ndarray
+    velocity: np.ndarray
+    jacobian: np.ndarray
+    status: str
+    sampled: MonteCarlo | None = None
+
+    def covariance(self, gap_covariance: Any) -> np.ndarray:
+        """Linearized covariance (n, n) of velocities, `J Sigma J^T`, Sigma = `gap_covariance`."""
+        sigma = np.asarray(gap_covariance, float)
+        m = len(self.gaps)
+        check_shape("gap_covariance", sigma, (m, m), "a row and a column per contact")
+        return self.jacobian @ sigma @ self.jacobian.T
+
+    @property
+    def explained(self) -> np.ndarray:
+        """Linearized over sampled standard deviation (n,): 1 where the linearization holds."""
+        if self.sampled is None:
+            raise ValueError("Argument `sampled` must be given for a comparison, but is None.")
+        linear = np.sqrt(np.diag(self.covariance(self.sampled.gap_covariance)))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return linear / self.sampled.std
+
+    def __str__(self) -> str:
+        """The linearized outcome and, if sampled, the spread."""
+        m = len(self.gaps)
+        at = ", ".join(f"{gap:g}" for gap in self.gaps)
+        lines = [f"Linearized at gaps ({at}) m, status {self.status}; d v+ / d gap [1/s]:"]
+        for i in range(len(self.velocity)):
+            row = "".join(f"{self.jacobian[i, j]:13.5g}" for j in range(m))
+            lines.append(f"v{i + 1}+ = {self.velocity[i]:10.6f} m/s: {row}")
+        return "\n".join(lines + ([] if self.sampled is None else self._comparison()))
+
+    def _comparison(self) -> list[str]:
+        """Lines on whether the linearization explains the sampled spread."""
+        assert self.sampled is not None
+        ratio = self.explained
+        largest = np.max(np.abs([self.sampled.minimum, self.sampled.maximum]), initial=0.0)
+        if np.all(self.sampled.std <= CONSTANT * largest):
+            return ["The outcome does not depend on the gaps."]
+        lines = ["standard deviations [m/s], linearized against sampled:"]
+        for i, (std, part) in enumerate(zip(self.sampled.std, ratio)):
+            lines.append(f"v{i + 1}+: {part * std:.3g} against {std:.3g}")
+        if np.all(np.abs(ratio - 1) <= AGREES):
+            lines.append("The outcome is nearly linear over the spread of the gaps.")
+        elif not self.jacobian.any():
+            lines.append(
+                "The outcome does not change with small changes of the gaps, yet it varies: it "
+                "jumps where the order of the collisions changes. Trust the samples."
+            )
+        else:
+            lines.append(
+                "The linearization fails over this spread: the gaps reach across a crossover or a "
+                "curved part. Trust the samples."
+            )
+        return lines
+
+
+def gap_sensitivity(
+    law: Law, scene: Scene, velocity: Any, gaps: Any, sampled: MonteCarlo | None = None
+) -> GapSensitivity:
+    """Jacobian of the outcome in the gaps, and the linearized covariance next to Monte Carlo's.
+
+    Equation: `J = d v+ / d gap`, `cov(v+) ~ J Sigma J^T`. It holds where the outcome is nearly
+    linear over the spread of the gaps, so not across a crossover of the order of contacts; for
+    laws that see gaps only in the order of collisions (Binary) J = 0, for laws that ignore the
+    sizes of gaps too.
+
+    Args:
+        law: as in `impact`.
+        scene: n coordinates, m contacts.
+        velocity: v- (n,) [m/s].
+        gaps: (m,) >= 0 [m], where to linearize: often `sampled.gap_mean`.
+        sampled: a run of `monte_carlo` with random gaps to compare with.
+
+    Returns:
+        `GapSensitivity`; `print` puts the linearized next to the sampled spread.
+
+    Raises:
+        ValueError: not one gap per contact, gaps < 0; what `impact` refuses.
+
+    Source: own derivation, propagation of errors to first order.
+
+    >>> import jimpact as ji
+    >>> law, balls = ji.Binary(1.0, order="earliest"), ji.chain([0.25, 1.0, 0.25])
+    >>> found = ji.theory.gap_sensitivity(law, balls, [1.0, 0.0, -1.0], [1e-6, 2e-6])
+    >>> found.velocity.round(6).tolist()
+    [-0.6, -0.16, 1.24]
+    """
+    at, v = as_float_array("gaps", gaps), as_float_array("velocity", velocity)
+    check_shape("gaps", at, (scene.contacts,), "one gap per contact")
+    check_values("gaps", at, low=0.0)
+
+    def outcome(gaps: jax.Array) -> tuple[jax.Array, Any]:
+        """v+, and v+ and status again as auxiliary data."""
+        out = impact(law, with_gaps(scene, gaps), v)
+        return out.velocity, (out.velocity, out.status)
+
+    jacobian, (after, status) = jax.jacfwd(outcome, has_aux=True)(at)
+    return GapSensitivity(
+        gaps=np.asarray(at),
+        velocity=np.asarray(after),
+        jacobian=np.asarray(jacobian),
+        status=STATUS[int(status)].name,
+        sampled=sampled,
+    )
