@@ -266,7 +266,7 @@ class Body(eqx.Module):
         return ((0.0, 0.0),)
 
     def touching(self, *where: Any, **options: Any) -> Any:
-        """q (n,) at which it touches what is around it."""
+        """q (n,) at which it touches what is around it; `where` and `options` as each body says."""
         raise TypeError(f"{type(self).__name__} has no `touching`: give its `q` yourself.")
 
     def scene(self, q: Any = None, closed_below: float = CLOSED_BELOW) -> Scene:

@@ -32,7 +32,7 @@ FLAT = 1e-3
 _SLACK = 1e-6  # of a moment of inertia: rounding of the largest one, of a thin plate
 _SERIES = 1e-2  # squares of angles below it go through the series: there the formula is 0/0
 _UPRIGHT = (1.0, 0.0, 0.0, 0.0)  # the quaternion of no rotation
-_LEVEL = (0.0, 0.0, 1.0)  # the normal of a level ground
+LEVEL = (0.0, 0.0, 1.0)  # the normal of a level ground
 
 
 def _quaternion_product() -> np.ndarray:
@@ -76,7 +76,9 @@ class Solid(Body):
         """Set what all bodies have; `homogeneous` are the moments of inertia over the mass."""
         self.total_mass = positive("mass", mass)
         self.middle = -_vector("centre", (0.0,) * 3 if centre is None else centre)
-        self.inertia = _inertia(inertia_of(inertia, self.total_mass * homogeneous, centre))
+        if inertia is None:
+            homogeneous = self.total_mass * homogeneous
+        self.inertia = _inertia(inertia_of(inertia, homogeneous, centre))
         n = _vector("normal", normal)
         if not is_traced(n) and not float(n[2]) > 0:
             raise ValueError(
@@ -257,7 +259,7 @@ class Box(Solid):
         inertia: Any = None,
         centre: Any = None,
         rounding: Any = 0.0,
-        normal: Any = _LEVEL,
+        normal: Any = LEVEL,
     ):
         self.sizes = positives("sizes", as_float_array("sizes", sizes), 3)
         square = self.sizes**2
@@ -321,7 +323,7 @@ class Sphere(Solid):
         mass: Any = 1.0,
         inertia: Any = None,
         centre: Any = None,
-        normal: Any = _LEVEL,
+        normal: Any = LEVEL,
     ):
         self.radius = positive("radius", radius)
         self.is_round = centre is None and np.ndim(0.0 if inertia is None else inertia) == 0
@@ -396,7 +398,7 @@ class Coin(Solid):
         mass: Any = 1.0,
         inertia: Any = None,
         corners: int = 0,
-        normal: Any = _LEVEL,
+        normal: Any = LEVEL,
     ):
         self.radius, self.thickness = positive("radius", radius), positive("thickness", thickness)
         self.corners = as_whole("corners", corners, 0)

@@ -79,11 +79,10 @@ MOTION_TABLES = {
 # `at`), which the classes document.
 _UNITS = {
     **dict.fromkeys(("mass", "masses", "sphere_mass", "rod_mass"), "kg"),
-    **dict.fromkeys(("disk_mass", "ball_masses"), "kg"),
     **dict.fromkeys(
         ("width", "height", "length", "thickness", "radius", "radii", "gaps", "sizes"), "m"
     ),
-    **dict.fromkeys(("centre", "rounding", "disk_radius", "ball_radius"), "m"),
+    **dict.fromkeys(("centre", "rounding"), "m"),
     "inertia": "kg_m2",
     "angle": "rad",
 }

@@ -335,7 +335,7 @@ def test_simulate_in_space(tmp_path, capsys):
             'kind = "car"',
             "must be one of Block, Box, Coin, Column, Corner, Dimer, Disc, Pend",
         ),
-        ('kind = "block"', 'kind = "planarbodies"', "[system] must have the key `bodies`"),
+        ('kind = "block"', 'kind = "bodies"', "[system] must have the key `bodies`"),
         ('kind = "block"', 'kind = "pendulumcradle"', "must have the key `masses_kg`"),
         ("width_m", "width", "[system] must have the key `width_m`, but has kind, width"),
         ("width_m", "depth_m = 1.0\nwidth_m", "may have the keys kind, width_m, height_m, mass_kg"),

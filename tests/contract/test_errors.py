@@ -134,7 +134,7 @@ SCENES = [
     (lambda: ji.Dimer(0.0, 0.0).scene(), r"`length`"),
     (lambda: ji.Dimer(0.1, 1.0, rod_mass=-1.0).scene(), r"`rod_mass`"),
     (lambda: ji.SpatialDimer(0.0, 1.0).scene(), r"`radius`"),
-    (lambda: ji.SpatialDimer(0.1, 1.0).touching(1.6), r"`angle`"),
+    (lambda: ji.SpatialDimer(0.1, 1.0).touching([1.0, 1.0, 0.0, 0.0]), r"`quaternion`"),
     (lambda: ji.Corner(np.pi).scene(), r"`angle`"),
     (lambda: ji.Corner(-0.1).scene(), r"`angle`"),
     (lambda: ji.Bodies([]), "`bodies` must hold one or more"),
