@@ -123,8 +123,8 @@ from .montecarlo.gaps import (
     gap_scale as gap_scale,
     gap_sensitivity as gap_sensitivity,
 )
-from .montecarlo.results import MonteCarlo as MonteCarlo
-from .montecarlo.running import monte_carlo as monte_carlo
+from .montecarlo.result import MonteCarlo as MonteCarlo
+from .montecarlo.run import monte_carlo as monte_carlo
 from .montecarlo.store import read_samples as read_samples
 from .motion.accelerations import (
     ContactProblem as ContactProblem,

@@ -13,8 +13,7 @@ from jimpact.contact import delassus_matrix
 from jimpact.files.records import readable_unit
 from jimpact.impacts import impact
 from jimpact.law import Law, check_law
-from jimpact.montecarlo.planning import DELTA_C
-from jimpact.montecarlo.results import MonteCarlo
+from jimpact.montecarlo.result import DELTA_C, MonteCarlo
 from jimpact.scene import Scene, as_velocity, gap_velocity, with_gaps
 from jimpact.solvers.tridiagonal import diagonal
 from jimpact.status import STATUS
