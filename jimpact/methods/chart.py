@@ -223,14 +223,9 @@ def work_precision(
         built = registered_laws(shared_parameters(law))[0]
         laws = {name: built[name] for name in ALGEBRAIC}
 
-    def make(contender: Contender) -> Programs:
-        """Its programs."""
-        if contender.jax:
-            return _jax_programs(contender, case, gradients, durations)
-        return _host_programs(contender, case)
-
     # of one name one program, which the reference shares with its own row
-    programs = {m.name: make(m) for m in {m.name: m for m in (exact, second, *chosen)}.values()}
+    different = {m.name: m for m in (exact, second, *chosen)}
+    programs = {n: _method_programs(m, case, gradients, durations) for n, m in different.items()}
     programs |= {name: _law_programs(other, case) for name, other in laws.items()}
     ladders: dict[str, tuple[float | None, ...]] = {m.name: m.ladder for m in chosen}
     ladders |= dict.fromkeys(laws, (None,))
@@ -248,9 +243,8 @@ def work_precision(
     labels = {m.name: m.label or m.name for m in chosen} | {name: f"law: {name}" for name in laws}
     points: dict[str, list[Point]] = {name: [] for name in solutions}
     for (name, setting, solution), timings in zip(rows, times):
-        status = STATUS[int(np.max(solution.out.status))].name
-        work, off = float(np.mean(solution.evaluations)), _errors(case, solution, truth)
-        points[name].append(Point(labels[name], setting, off, work, status, *timings))
+        off = _errors(case, solution, truth)
+        points[name].append(_point(labels[name], setting, off, solution, timings))
     return WorkPrecision(
         velocity=np.asarray(case.velocity),
         points={name: tuple(row) for name, row in points.items()},
@@ -403,8 +397,12 @@ def _solved(contender: Contender, law: LZB, case: Case, setting: Any) -> Solved:
     return Solved(out, solution.duration, solution.evaluations)
 
 
-def _jax_programs(contender: Contender, case: Case, gradients: bool, durations: bool) -> Programs:
+def _method_programs(
+    contender: Contender, case: Case, gradients: bool, durations: bool
+) -> Programs:
     """Programs of a contender at the stiffnesses of the case."""
+    if not contender.jax:
+        return _host_programs(contender, case)
     names = tuple(shared_parameters(case.law))
 
     def solve(k: jax.Array, case: Case, setting: jax.Array) -> Solved:
@@ -542,6 +540,14 @@ def _errors(case: Case, solution: Solved, truth: Solved) -> dict[str, float]:
         "duration": largest(solution.duration, truth.duration),
         "gradient": largest(solution.jacobian, truth.jacobian, fastest),
     }
+
+
+def _point(
+    label: str, setting: float | None, error: dict[str, float], solution: Solved, timings: Any
+) -> Point:
+    """A row of the chart."""
+    status = STATUS[int(np.max(solution.out.status))].name
+    return Point(label, setting, error, float(np.mean(solution.evaluations)), status, *timings)
 
 
 def _times(
