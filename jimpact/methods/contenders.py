@@ -67,18 +67,21 @@ class Contender(NamedTuple):
 class _KnownImpulses(Law):
     """A law whose impulses are known beforehand."""
 
-    solution: Solution
+    impulse: jax.Array
+    tangential: jax.Array | None
+    code: jax.Array
     initial_energy: jax.Array
 
     def impulses(self, contact: Contact) -> Impulses:
         """These impulses, whatever the contacts are."""
-        known = self.solution
-        return Impulses(known.impulse, known.tangential, jax.numpy.asarray(known.code))
+        return Impulses(self.impulse, self.tangential, self.code)
 
 
 def outcome(law: LZB, scene: Scene, velocity: Any, solution: Solution) -> Impact:
     """Velocities, energy and full status (`impact`'s own checks included) of a solution."""
-    return impact(_KnownImpulses(solution, law.initial_energy), scene, velocity)
+    code = jax.numpy.asarray(solution.code)
+    known = _KnownImpulses(solution.impulse, solution.tangential, code, law.initial_energy)
+    return impact(known, scene, velocity)
 
 
 _TIME_STEPS = (0.2, 0.1, 0.03, 0.01, 0.003)  # in units of `time_scale`, coarse to fine

@@ -59,6 +59,7 @@ def test_methods_converge_at_their_order(chart, name):
     work = [point.evaluations for point in row]
     assert all(a < b for a, b in itertools.pairwise(work))
     for point in row:
+        assert point.status == "ok"
         assert point.single.low <= point.single.median <= point.single.high
         assert point.batched.low <= point.batched.median <= point.batched.high
 
