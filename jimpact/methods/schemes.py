@@ -359,8 +359,10 @@ def _impulse_step(field: Field, dp: jax.Array, walk: ImpulseWalk) -> ImpulseWalk
     scale = dp / f_start[primary]
     # implicit first step: dp_j = scale F_j(u_j dp_j)
     first = (scale * force(approach)) * jnp.where(approach > 0, 1.0, 0.0)
-    increment = jnp.where(energy > 0, scale * f, power(first, eta + 1)).at[primary].set(dp)
-    increment = increment * _emptying(field, walk, primary, increment)
+    increment = jnp.where(energy > 0, scale * f, power(first, eta + 1))
+    is_primary = jnp.arange(len(gamma)) == primary  # in batches faster than an index
+    increment = jnp.where(is_primary, dp, increment)
+    increment = increment * _emptying(field, walk, is_primary, increment)
     after = gamma + field.coupling @ increment
     # exact work of the step; its error is the first-order one of the distributing rule alone
     middle = 0.5 * (gamma + after)
@@ -371,15 +373,15 @@ def _impulse_step(field: Field, dp: jax.Array, walk: ImpulseWalk) -> ImpulseWalk
 
 
 def _emptying(
-    field: Field, walk: ImpulseWalk, primary: jax.Array, increment: jax.Array
+    field: Field, walk: ImpulseWalk, is_primary: jax.Array, increment: jax.Array
 ) -> jax.Array:
     """Fraction of the step at which the primary contact is unloaded; 1 if it is not.
 
     Ending there, not on a fixed step, is what the derivative of the outcome depends on.
     """
-    gamma, energy, dp = walk.gamma[primary], walk.energy[primary], increment[primary]
-    bend = (field.coupling @ increment)[primary]
-    budget = energy * field.restitution[primary] ** 2 / dp
+    values = walk.gamma, walk.energy, increment, field.coupling @ increment, field.restitution
+    gamma, energy, dp, bend, e = (jnp.sum(jnp.where(is_primary, x, 0.0)) for x in values)
+    budget = energy * e**2 / dp
     expands = (gamma + 0.5 * bend > 0) & (energy > 0)
     root = jnp.sqrt(jnp.maximum(jnp.where(expands, gamma**2 + 2 * bend * budget, 1.0), 0.0))
     denominator = jnp.where(expands, gamma + root, 1.0)
