@@ -404,17 +404,18 @@ def by_diffrax(solver: diffrax.AbstractSolver, stages: int | None) -> Solve:
         problem = scaled(law, scene, velocity)
         field = field_of(problem)
         rtol = jnp.asarray(setting, field.gamma.dtype)
+        x, p, none = field.start  # no friction: each part more of a state costs time
         result = diffrax.diffeqsolve(
-            diffrax.ODETerm(lambda t, y, args: args[0].rates(*y, 0.0)),
+            diffrax.ODETerm(lambda t, y, args: args[0].rates(*y, none, 0.0)[:2]),
             solver,
             t0=jnp.zeros_like(rtol),
             t1=jnp.full_like(rtol, jnp.inf),
             dt0=None,
-            y0=field.start,
+            y0=(x, p),
             args=(field, rtol),
             stepsize_controller=diffrax.PIDController(rtol=rtol, atol=rtol),
             event=diffrax.Event(
-                lambda t, y, args, **_: args[0].at_work(*y) - args[1], direction=False
+                lambda t, y, args, **_: args[0].at_work(*y, none) - args[1], direction=False
             ),
             adjoint=diffrax.ForwardMode(),
             max_steps=problem.dynamics.max_steps,
@@ -425,8 +426,7 @@ def by_diffrax(solver: diffrax.AbstractSolver, stages: int | None) -> Solve:
         evaluations = jnp.full_like(steps, UNCOUNTED) if stages is None else stages * steps + 1
         ended = result.result == diffrax.RESULTS.event_occurred
         code = jnp.where(ended, CODE["ok"], CODE["max_steps"])
-        _, p, side = (y[-1] for y in result.ys)
-        return problem.solution(p, jnp.nan, evaluations, code, side)
+        return problem.solution(result.ys[1][-1], jnp.nan, evaluations, code, none)
 
     return solve
 
