@@ -219,16 +219,13 @@ def work_precision(
     chosen, left_out = _chosen(methods, case)
     chosen = _with_settings(chosen, settings or {})
     exact, second = _reference(reference, case), CONTENDERS["dop853"]
-    if laws is None:
-        built = registered_laws(shared_parameters(law))[0]
-        laws = {name: built[name] for name in ALGEBRAIC}
+    laws = _algebraic(law) if laws is None else laws
 
     # of one name one program, which the reference shares with its own row
     different = {m.name: m for m in (exact, second, *chosen)}
     programs = {n: _method_programs(m, case, gradients, durations) for n, m in different.items()}
     programs |= {name: _law_programs(other, case) for name, other in laws.items()}
-    ladders: dict[str, tuple[float | None, ...]] = {m.name: m.ladder for m in chosen}
-    ladders |= dict.fromkeys(laws, (None,))
+    ladders: dict[str, Any] = {m.name: m.ladder for m in chosen} | dict.fromkeys(laws, (None,))
     truth, other_truth = programs[exact.name].at(FINEST), programs[second.name].at(SECOND)
     solutions: dict[str, list[Solved]] = {}
     with counting_bar(sum(map(len, ladders.values())), "errors", progress) as advance:
@@ -269,6 +266,12 @@ def shared_parameters(law: LZB) -> dict[str, Any]:
     """What an algebraic law has in common with it: restitution, and friction where there is any."""
     friction = {} if law.friction is None else {"friction": law.friction}
     return {"restitution": law.restitution} | friction
+
+
+def _algebraic(law: LZB) -> dict[str, Law]:
+    """The algebraic laws with its parameters."""
+    built = registered_laws(shared_parameters(law))[0]
+    return {name: built[name] for name in ALGEBRAIC}
 
 
 # -------------------------------------------------------------- the impact, and the contenders
