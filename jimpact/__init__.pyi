@@ -92,7 +92,7 @@ from .montecarlo.distributions import Normal as Normal, RandomLaw as RandomLaw, 
 from .montecarlo.gaps import (
     gap_scale as gap_scale,
 )
-from .montecarlo.running import monte_carlo as monte_carlo
+from .montecarlo.run import monte_carlo as monte_carlo
 from .montecarlo.store import read_samples as read_samples
 from .motion.fitting_motion import fit_motion as fit_motion
 from .motion.pile_contacts import pile_contacts as pile_contacts

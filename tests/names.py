@@ -8,7 +8,7 @@ import jimpact as ji
 from jimpact.bodies.solids import Solid
 from jimpact.fits.fitting import LOSSES
 from jimpact.fits.solve import DEFAULT_STEPS
-from jimpact.methods.contenders import METHODS
+from jimpact.methods.contenders import CONTENDERS
 from jimpact.motion.simulate import METHODS as MOTION_METHODS
 
 PATH = Path(ji.__file__).parent / "data" / "names.json"
@@ -33,7 +33,7 @@ def names():
     return {
         "laws": {name: row.declaration for name, row in ours.items()},
         "bodies": bodies(),
-        "methods": {name: method.jax for name, method in METHODS.items()},
+        "methods": {name: method.jax for name, method in CONTENDERS.items()},
         "fit_methods": list(DEFAULT_STEPS),
         "losses": ["squares", *LOSSES],
         "motion_methods": list(MOTION_METHODS),

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jimpact as ji
-from jimpact.montecarlo.results import MonteCarlo
+from jimpact.montecarlo.result import MonteCarlo
 from jimpact.motion.record import Motion
 
 cradle = ji.chain([1.0, 1.0, 1.0])

@@ -6,12 +6,11 @@ Public names are taken from `jimpact` itself, so that a command imports no more 
 import re
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from io import BytesIO
 from json import dumps
-from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -22,9 +21,8 @@ import numpy as np
 import jimpact as ji
 from jimpact.cli import options
 from jimpact.cli.program_cache import stored_programs
-from jimpact.cli.starting import as_csv
 from jimpact.cli.study import Study, impact_study, without_none
-from jimpact.files.records import as_data, table
+from jimpact.files.records import Column, Table, as_data
 from jimpact.files.study_file import is_motion
 from jimpact.law import with_parameter
 from jimpact.progress import Steps, waiting, wrapped
@@ -39,7 +37,6 @@ if TYPE_CHECKING:
     from jimpact.motion.record import Motion
 
 DPI = 150  # of pictures that are pixels: readable on paper, a few hundred kB
-Table = tuple[Sequence[str], Sequence[Sequence[Any]]]  # names of columns, rows
 
 # Words of the printed results (regular expressions), and the sentences that explain them there.
 GLOSSARY = {
@@ -88,7 +85,7 @@ def _show(command: options.DrawingCommand, result: CommandResult, steps: Steps) 
         _write_picture(path, picture)
         steps(f"picture {path}")
     if command.csv:
-        print(as_csv(*result.table))
+        print(result.table.to_csv())
     elif command.json:
         data = {"title": result.title, "pictures": [str(path) for path in pictures]}
         print(dumps(data | as_data(result.data), indent=2))
@@ -199,14 +196,19 @@ def _fits_of(
 def _fits_result(title: str, fits: dict[str, "Fit"]) -> CommandResult:
     """All fits as text, table and picture."""
     text = "\n".join([str(fits[RAW]), "", *_fits_table(fits), ""])
-    heads = ["fit", "law", "parameter", "value", "standard_error", "rms_m_per_s", "rank"]
+    heads = ("fit", "law", "parameter", "value", "standard_error", "rms_m_per_s", "rank")
     rows = [
         [name, type(x.law).__name__, parameter, x.value[i], x.standard_error[i], x.rms, x.rank]
         for name, x in fits.items()
         for i, parameter in enumerate(x.names)
     ]
     picture = ji.plot.fit(fits[RAW], None, title)
-    return CommandResult(title, {"fits": dict(fits)}, picture, (heads, rows), text)
+    return CommandResult(title, {"fits": dict(fits)}, picture, _plain(heads, rows), text)
+
+
+def _plain(heads: Iterable[str], rows: Sequence[Sequence[Any]]) -> Table:
+    """A table for CSV only."""
+    return Table([Column(name) for name in heads], rows)
 
 
 def _fit_every_law(command: options.FitCommand, steps: Steps) -> CommandResult:
@@ -215,7 +217,7 @@ def _fit_every_law(command: options.FitCommand, steps: Steps) -> CommandResult:
     fits = _laws_fitted(study, steps, starts=command.starts, seed=command.seed)
     best = fits.best
     picture = ji.plot.fit(best.fit, None, f"{study.title}: {best.name}")
-    return CommandResult(study.title, fits, picture, fits.rows())
+    return CommandResult(study.title, fits, picture, _plain(*fits.rows()))
 
 
 def _laws_fitted(study: Study, steps: Steps, **chosen: int | None) -> "LawFits":
@@ -277,7 +279,7 @@ def _fits_table(fits: dict[str, "Fit"]) -> list[str]:
             ends = [""] * 4  # said once
     speeds = all(fit.experiments is not None for fit in fits.values())
     heads = ["law", "data", "parameter", "value", "rms [m/s]" if speeds else "rms", "rank"]
-    lines = table(heads, rows, left=["data", "parameter", "value"])
+    lines = str(_plain(heads, rows)).splitlines()
     if ALL_FREE in fits:
         fit = fits[ALL_FREE]
         names = ", ".join(fit.names)
@@ -324,18 +326,11 @@ def compare(command: options.CompareCommand, steps: Steps) -> CommandResult:
         str(result),
         *([] if fits is None else ["", "Fitted to all shots:", str(fits), ""]),
         f"Parameters: {values}.",
-        "T+/T-: kinetic energy after over before. Time (us): one compiled call with its argument "
-        "checks.",
+        "T+/T-: kinetic energy after over before. Time: a compiled call, with its checks.",
     ]
     data = {"velocity": before, "laws": result, "fits": fits, "left_out": left_out}
     picture = ji.plot.comparison(result, measured, study.title)
-    bodies = [f"v_{i + 1}_plus" for i in range(len(before))]
-    heads = ["law", *bodies, "energy_ratio", "dispersion", "time_s", "audit"]
-    columns = attrgetter("energy_ratio", "dispersion_index", "time", "verdict")
-    rows = [
-        [name, *np.asarray(x.outcome.velocity), *columns(x)] for name, x in result.entries.items()
-    ]
-    return CommandResult(_titled(study, before), data, picture, (heads, rows), "\n".join(lines))
+    return CommandResult(_titled(study, before), data, picture, result.table, "\n".join(lines))
 
 
 # ------------------------------------------------------------------------------------- montecarlo
@@ -347,10 +342,7 @@ def montecarlo(command: options.MonteCarloCommand, steps: Steps) -> CommandResul
     result = ji.monte_carlo(**_sampling(study, command), progress=steps.patience)
     steps(f"{result.samples:,} samples")
     picture = ji.plot.monte_carlo(result, study.title)
-    columns = result.mean, result.standard_error, result.std, result.minimum, result.maximum
-    heads = ["coordinate", "mean", "standard_error", "std", "least", "largest"]
-    rows = [[i + 1, *row] for i, row in enumerate(zip(*columns))]
-    return CommandResult(study.title, result, picture, (heads, rows))
+    return CommandResult(study.title, result, picture, result.table)
 
 
 def _sampling(study: Study, command: options.MonteCarloCommand) -> dict[str, Any]:
@@ -372,7 +364,7 @@ def chart(command: options.ChartCommand, steps: Steps) -> CommandResult:
     """Speed against accuracy on one scene."""
     study, before, _ = _impact_of(command)
     law = _lzb(study)
-    from jimpact.methods.chart import QUANTITIES, shared_parameters
+    from jimpact.methods.chart import shared_parameters
 
     laws, _ = registered_laws(shared_parameters(law))
     result = ji.work_precision(
@@ -389,14 +381,7 @@ def chart(command: options.ChartCommand, steps: Steps) -> CommandResult:
     )
     picture = ji.plot.work_precision(result, study.title)
     text = str(result) + ("" if command.full or command.methods else QUICK)
-    heads = ["method", "setting", *QUANTITIES, "evaluations", "alone_s", "batch_s", "status"]
-    columns = attrgetter("evaluations", "single.median", "batched.median", "status")
-    rows = [
-        [name, x.setting, *(x.error[q] for q in QUANTITIES), *columns(x)]
-        for name, points in result.points.items()
-        for x in points
-    ]
-    return CommandResult(_titled(study, before), result, picture, (heads, rows), text)
+    return CommandResult(_titled(study, before), result, picture, result.table, text)
 
 
 def _lzb(study: Study) -> "ji.LZB":
@@ -409,9 +394,9 @@ def _lzb(study: Study) -> "ji.LZB":
 
 def _quick_methods(law: "ji.LZB") -> list[str]:
     """Methods that compile soon and can solve the impact."""
-    from jimpact.methods.contenders import METHODS
+    from jimpact.methods.contenders import CONTENDERS
 
-    return [name for name in QUICK_METHODS if METHODS[name].supports(law) is None]
+    return [name for name in QUICK_METHODS if CONTENDERS[name].supports(law) is None]
 
 
 # -------------------------------------------------------------------------------------- stability
@@ -438,9 +423,8 @@ def stability(command: options.StabilityCommand, steps: Steps) -> CommandResult:
         file = path.with_name(f"{path.stem}-{name.replace('_', '-')}{path.suffix}")
         pairs[file] = ji.plot.stability_pairs(result, name)
     text = str(result) + ("" if command.full else QUICK)
-    counts = [[name, *result.counts(name).values()] for name in result.methods]
-    table = ["method", *result.counts(result.methods[0])], counts
-    return CommandResult("", result, ji.plot.stability_map(result, TITLE), table, text, pairs)
+    picture = ji.plot.stability_map(result, TITLE)
+    return CommandResult("", result, picture, result.table, text, pairs)
 
 
 # ----------------------------------------------------------------------------------------- advise
@@ -463,9 +447,7 @@ def advise(command: options.AdviseCommand, steps: Steps) -> CommandResult:
         **_advise_parameters(study),
     )
     picture = ji.plot.advice(result, study.title)
-    title, heads = _titled(study, before), ["law", "worst", "chosen"]
-    rows = [[name, x.worst, name == result.name] for name, x in result.candidates.items()]
-    return CommandResult(title, result, picture, (heads, rows))
+    return CommandResult(_titled(study, before), result, picture, result.table)
 
 
 def _advise_parameters(study: Study) -> dict[str, Any]:
@@ -511,8 +493,8 @@ def simulate(command: options.SimulateCommand, steps: Steps) -> CommandResult:
             progress=steps.patience,
             speed=command.speed,
         )
-    heads = ["time [s]", *system.body.names, *system.body.velocity_names]
-    table = heads, np.column_stack([motion.time, motion.q, motion.velocity]).tolist()
+    heads = ("time [s]", *system.body.names, *system.body.velocity_names)
+    table = _plain(heads, np.column_stack([motion.time, motion.q, motion.velocity]).tolist())
     picture = ji.plot.motion(motion, title, system=system)
     return CommandResult(title, motion, picture, table, more=more, failure=_failure(motion))
 

@@ -15,6 +15,7 @@ import tyro
 from jimpact._checks import check_choice
 from jimpact.cli import starting
 from jimpact.files import study_file
+from jimpact.files.records import Column, Table
 
 EVERY_LAW = "all"  # in the place of a law's name
 PICTURES = (".png", ".pdf", ".svg")
@@ -342,7 +343,7 @@ class LawsCommand(Command):
             text = "\n\n".join(dict.fromkeys(row["bibtex"] for row in laws.values()))
         elif self.csv:
             lines = [[x, " ".join(row.pop("parameters")), *row.values()] for x, row in rows.items()]
-            text = starting.as_csv(["law", *keys], lines)
+            text = Table([Column(key) for key in ("law", *keys)], lines).to_csv()
         else:
             text = starting.laws_as_text(rows)
         print(text)

@@ -1,12 +1,10 @@
-"""What the command line does without JAX: begin a user's own study, print tables and laws."""
+"""What the command line does without JAX: begin a user's own study, print laws."""
 
-import csv
-import io
 import json
 import shutil
 import textwrap
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -150,12 +148,3 @@ def laws_as_text(rows: Mapping[str, Mapping[str, Any]]) -> str:
             )
         lines.append("")
     return "\n".join(lines).rstrip()
-
-
-def as_csv(heads: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """Lines of a CSV file, the names of the columns first; None is an empty cell."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(heads)
-    writer.writerows(rows)
-    return text.getvalue().rstrip("\n")

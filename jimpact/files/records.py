@@ -1,13 +1,20 @@
-"""Results as data for a JSON file and as tables and numbers in text."""
+"""Results as data for a JSON file, and as tables: in text, CSV and pandas."""
 
+import csv
 import dataclasses
+import io
 import shutil
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import jax
 import numpy as np
+
+from jimpact._checks import needed
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure  # which takes long to import
 
 _LEAST_WIDTH = 20  # characters of a column whose text is wrapped; narrower ones are not readable
 
@@ -26,7 +33,7 @@ def as_data(value: Any) -> Any:
         value = value._asdict()
     elif dataclasses.is_dataclass(value):
         value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
-    elif isinstance(value, jax.Array | np.ndarray | np.generic):
+    elif hasattr(value, "__array__"):
         value = np.asarray(value).tolist()
     if isinstance(value, Mapping):
         return {key: as_data(each) for key, each in value.items()}
@@ -48,6 +55,16 @@ def number(value: float | None, form: str) -> str:
     ('0.2', '', '')
     """
     return "" if value is None or np.isnan(value) else format(value, form)
+
+
+def microseconds(time: float | None) -> str:
+    """A time [s] in microseconds, '' for None.
+
+    >>> from jimpact.files.records import microseconds
+    >>> microseconds(1.234e-5)
+    '12.3'
+    """
+    return number(None if time is None else 1e6 * time, ".3g")
 
 
 def listed(labels: Sequence[str], most: int = 6) -> str:
@@ -115,6 +132,115 @@ def table(
                 textwrap.wrap(line, room, subsequent_indent=" " * before) if wrapped else [line]
             )
     return lines
+
+
+class Column(NamedTuple):
+    """A column: its name in data and CSV, head and unit in print, and the form of its numbers.
+
+    `form`: as of `format`, or a function of the value. Text stands on the left.
+    """
+
+    name: str
+    form: str | Callable[[Any], str] = ""
+    head: str = ""
+    unit: str = ""
+
+    @property
+    def title(self) -> str:
+        """The head with its unit."""
+        return (self.head or self.name) + (f" [{self.unit}]" if self.unit else "")
+
+    def cell(self, value: Any) -> str:
+        """A value as it is printed; '' for None and NaN, unless `form` is a function."""
+        if callable(self.form):
+            return self.form(value)
+        return "" if value is None or value != value else format(value, self.form)
+
+
+@dataclasses.dataclass(frozen=True)
+class Table:
+    """Rows of values under columns; `print` leaves out columns that are empty.
+
+    Attributes:
+        columns: the columns.
+        rows: a value for each column; None or NaN: an empty cell.
+        head: lines above.
+        notes: lines below.
+        keys: how many columns are repeated where a terminal is too narrow for one table.
+
+    >>> from jimpact.files.records import Column, Table
+    >>> columns = Column("law"), Column("e", ".2f"), Column("time_s", "g", "time", "s")
+    >>> print(Table(columns, [("newton", 0.5, None)], notes=["One law."]))
+    law        e
+    newton  0.50
+    One law.
+    """
+
+    columns: Sequence[Column]
+    rows: Sequence[Sequence[Any]]
+    head: Sequence[str] = ()
+    notes: Sequence[str] = ()
+    keys: int = 1
+
+    def __str__(self) -> str:
+        """The table with its head and notes."""
+        cells = [[c.cell(x) for c, x in zip(self.columns, row)] for row in self.rows]
+        used = [i for i in range(len(self.columns)) if any(row[i] for row in cells)]
+        text = [any(isinstance(x, str) for x in column) for column in zip(*self.rows)]
+        left = [c.title for c, is_text in zip(self.columns, text) if is_text]
+        titles = [self.columns[i].title for i in used]
+        lines = table(titles, [[row[i] for i in used] for row in cells], left, self.keys)
+        return "\n".join([*self.head, *lines, *self.notes])
+
+    def to_dict(self) -> list[dict[str, Any]]:
+        """A mapping by column for each row, as a JSON file can hold it."""
+        return [as_data({c.name: x for c, x in zip(self.columns, row)}) for row in self.rows]
+
+    def to_csv(self, path: str | Path | None = None) -> str:
+        """Lines of a CSV file, also written to the path; what is None or NaN is an empty cell."""
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow([c.name for c in self.columns])
+        writer.writerows([[None if x != x else x for x in row] for row in self.rows])
+        if path is not None:
+            Path(path).write_text(text.getvalue(), encoding="utf-8")
+        return text.getvalue().rstrip("\n")
+
+    def to_pandas(self) -> Any:
+        """A pandas `DataFrame`."""
+        pandas = needed("pandas", "pip install pandas")
+        return pandas.DataFrame(list(self.rows), columns=[c.name for c in self.columns])
+
+
+class Tabular:
+    """A result whose main part is a table: it prints, exports and draws itself."""
+
+    picture = ""  # its function in `ji.plot`
+
+    @property
+    def table(self) -> Table:
+        """The result as a `Table`."""
+        raise NotImplementedError
+
+    def __str__(self) -> str:
+        """The table."""
+        return str(self.table)
+
+    def to_csv(self, path: str | Path | None = None) -> str:
+        """The table as CSV, see `Table`."""
+        return self.table.to_csv(path)
+
+    def to_pandas(self) -> Any:
+        """The table as a pandas `DataFrame`."""
+        return self.table.to_pandas()
+
+    def plot(self, title: str = "") -> "Figure":
+        """The result's picture of `ji.plot`."""
+        if not self.picture:
+            raise TypeError(f"{type(self).__name__} has no picture, only a `table`.")
+        import jimpact.plot  # late: matplotlib takes long to import
+
+        return getattr(jimpact.plot, self.picture)(self, title=title)
 
 
 def _parts(widths: Sequence[int], keys: int, room: int) -> list[list[int]]:

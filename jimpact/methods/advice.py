@@ -23,7 +23,7 @@ from jimpact.laws.kinematic import Moreau, Newton
 from jimpact.laws.lzb import LZB, default_rtol
 from jimpact.laws.poisson import Poisson
 from jimpact.methods.advice_report import Advice, Candidate, ContactBlock, Unknown
-from jimpact.methods.timing import in_turns
+from jimpact.methods.points import EnergyNorm, Outcomes, in_batches, in_turns, raised
 from jimpact.montecarlo.gaps import gap_scale
 from jimpact.progress import counting_bar
 from jimpact.registry import ADVISED, REGISTRY, simplest_first
@@ -92,11 +92,10 @@ class Situation(NamedTuple):
         """Blocks of two contacts and more in which one approaches."""
         return tuple(b for b in self.blocks if b.approaches and len(b.contacts) > 1)
 
-    def distance(self, change: np.ndarray) -> np.ndarray:
-        """Energy norm of differences of velocities (..., n), over that of v- (of 1 at rest)."""
-        mass = dense_mass(self.scene)
-        before = float(np.sqrt(self.velocity @ mass @ self.velocity)) or 1.0
-        return np.sqrt(np.sum((change @ mass) * change, axis=-1)) / before
+    @property
+    def distance(self) -> EnergyNorm:
+        """The norm of differences of velocities."""
+        return EnergyNorm.of(self.scene, self.velocity)
 
 
 class StiffnessSamples(NamedTuple):
@@ -111,15 +110,6 @@ class StiffnessSamples(NamedTuple):
     alone: np.ndarray
     nudged: np.ndarray
     random: slice
-
-
-class Outcomes(NamedTuple):
-    """v+ (r, n), p (r, m), p_t (r, t) or None, status (r,) of a batch; JAX, then numpy."""
-
-    velocity: Any
-    impulse: Any
-    tangential: Any
-    status: Any
 
 
 class Trial(NamedTuple):
@@ -243,7 +233,15 @@ def _advice(
 ) -> Advice:
     """Runs every law, chooses the reference and the simplest law near it."""
     v, k = situation.velocity, tried.stiffness
-    outcomes = {name: _outcomes(law, v, k, progress) for name, law in laws.items()}
+    outcomes, left_out = {}, {}
+    for name, law in laws.items():
+        try:
+            outcomes[name] = _outcomes(law, v, k, progress)
+        except Exception as error:
+            if name in ("lzb", "compliant"):  # one of them is the reference
+                raise
+            left_out[name] = raised(error)  # a user's law may fail in any way; the others stand
+    laws = {name: laws[name] for name in outcomes}
     apart = _reclosing(situation, outcomes)
     follows_gaps = situation.gapped.any() or apart > tolerance / SMALL_PART
     name = "compliant" if follows_gaps else "lzb"
@@ -278,6 +276,7 @@ def _advice(
         gap_ratio=gap_ratio,
         far=tuple(np.flatnonzero(situation.far).tolist()),
         reclosing=apart,
+        left_out=left_out,
     )
 
 
@@ -463,8 +462,8 @@ def _batch(law: Law, scene: Scene, velocity: jax.Array, stiffness: jax.Array | N
 
     def one(v: jax.Array, k: jax.Array | None) -> Outcomes:
         """One impact."""
-        out = impact(law if k is None else with_entries(law, ("stiffness",), k), scene, v)
-        return Outcomes(out.velocity, out.impulse, out.tangential_impulse, out.status)
+        tried = law if k is None else with_entries(law, ("stiffness",), k)
+        return Outcomes.of(impact(tried, scene, v))
 
     return jax.vmap(one)(velocity, stiffness)
 
@@ -472,15 +471,10 @@ def _batch(law: Law, scene: Scene, velocity: jax.Array, stiffness: jax.Array | N
 def _outcomes(
     trial: Trial, velocity: np.ndarray, stiffness: np.ndarray, progress: float | None
 ) -> Outcomes:
-    """Outcomes over rows of stiffness (r, m), a chunk at a time; one row of a law without it."""
-    r, chunk = len(stiffness) if trial.has_stiffness else 1, _chunk(stiffness)
-    parts = []
-    with counting_bar(r, "impacts", progress) as advance:
-        for first in range(0, r, chunk):
-            chosen = np.minimum(np.arange(first, first + chunk), r - 1)
-            parts.append(jax.device_get(trial.run(velocity, stiffness[chosen])))
-            advance(min(chunk, r - first))
-    return jax.tree.map(lambda *x: np.concatenate(x)[:r], *parts)
+    """Outcomes over rows of stiffness (r, m); one row of a law without it."""
+    rows = stiffness if trial.has_stiffness else stiffness[:1]
+    with counting_bar(len(rows), "impacts", progress) as advance:
+        return in_batches(partial(trial.run, velocity), rows, _chunk(stiffness), advance)
 
 
 def _chunk(stiffness: np.ndarray) -> int:
@@ -500,15 +494,10 @@ def _costs(laws: dict[str, Trial], velocity: np.ndarray, stiffness: np.ndarray) 
 # -------------------------------------------------------------------------- the evidence
 
 
-def _failed(outcomes: Outcomes) -> np.ndarray:
-    """Which rows (r,) have a status that is a failure."""
-    return np.array([STATUS[int(code)].failure for code in outcomes.status])
-
-
 def _reclosing(situation: Situation, outcomes: dict[str, Outcomes]) -> float:
     """Largest distance between LZB and Compliant, both on contacts without gaps."""
     lzb, compliant = outcomes["lzb"], outcomes["compliant"]
-    usable = ~(_failed(lzb) | _failed(compliant))
+    usable = ~(lzb.failed | compliant.failed)
     if situation.gapped.any() or not usable.any():
         return 0.0
     return float(situation.distance((lzb.velocity - compliant.velocity)[usable]).max())
@@ -516,22 +505,12 @@ def _reclosing(situation: Situation, outcomes: dict[str, Outcomes]) -> float:
 
 def _usable_rows(reference: Outcomes, name: str) -> Outcomes:
     """The reference with NaN where it failed; at the nominal stiffness it must not."""
-    failed = _failed(reference)
-    if failed[0]:
+    if reference.failed[0]:
         raise RuntimeError(
             f"The reference law {name} fails on this scene: "
             f"{STATUS[int(reference.status[0])].message}."
         )
-
-    def usable(rows: Any) -> Any:
-        """Rows (r, ...) with NaN where the reference failed."""
-        return None if rows is None else np.where(failed[:, None], np.nan, rows)
-
-    return reference._replace(
-        velocity=usable(reference.velocity),
-        impulse=usable(reference.impulse),
-        tangential=usable(reference.tangential),
-    )
+    return reference.where_usable()
 
 
 def _candidate(

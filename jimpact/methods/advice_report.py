@@ -1,13 +1,14 @@
 """What `advise` reports, in words with the numbers of the scene: half a page."""
 
 import math
+import shutil
 import textwrap
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from jimpact.files.records import as_data, fields_as_data, number, table
+from jimpact.files.records import Column, Table, Tabular, as_data, fields_as_data
 from jimpact.law import Declared, Law, parameters_of
 from jimpact.laws import REGISTRY
 from jimpact.montecarlo.gaps import NEARLY_TOUCHING, WIDE
@@ -15,7 +16,6 @@ from jimpact.scene import Scene
 from jimpact.status import CODE, STATUS
 
 _WIDTH = 80  # characters of the printed lines
-_BODIES = 5  # velocities in the printed table
 _NAMED = 4  # stiffness ratios named one by one; the others are "..."
 _PERCENT_FROM = 1e-4  # smaller errors are printed as 2e-05, not as 0.002 %
 _ROUNDING = 1e-12  # errors up to this are printed as "rounding"
@@ -89,7 +89,7 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class Advice:
+class Advice(Tabular):
     """The result of `advise`; `ji.impact(advice.law, advice.scene, advice.velocity)` applies it.
 
     Attributes:
@@ -109,6 +109,7 @@ class Advice:
         far: open contacts (from 0) that cannot close during the impact and take no part.
         reclosing: largest difference between LZB and Compliant on contacts without gaps: LZB lets
             opened contacts close again at once.
+        left_out: why a law is missing: it raised.
     """
 
     name: str
@@ -125,6 +126,9 @@ class Advice:
     gap_ratio: np.ndarray | None
     far: tuple[int, ...] = ()
     reclosing: float = 0.0
+    left_out: dict[str, str] = field(default_factory=dict)
+
+    picture = "advice"
 
     @property
     def law(self) -> Law:
@@ -161,32 +165,30 @@ class Advice:
         parts = {"laws": laws, "blocks": blocks, "unknown": unknown, "far": far}
         return words | fields_as_data(self, "name", "candidates", *parts) | parts
 
-    def __str__(self) -> str:
-        """Half a page."""
+    @property
+    def table(self) -> Table:
+        """A row for each law, below the advice: half a page."""
         verdict = "within" if self.within else "NOT within"
-        lines = [
-            f"Advice: {as_code(self.law)}, {verdict} {share(self.tolerance)}",
-            *_wrapped("because", self.reason),
-            *_wrapped("scene", structure(self)),
-        ]
+        head = [f"Advice: {as_code(self.law)}, {verdict} {share(self.tolerance)}"]
+        head += _wrapped("because", self.reason) + _wrapped("scene", structure(self))
         if len(self.unknown) > 1:
-            lines += _wrapped("unknown", f"{ratios(self)}; {effects(self)}")
+            head += _wrapped("unknown", f"{ratios(self)}; {effects(self)}")
         if also := agreeing(self):
-            lines += _wrapped("also", also)
-        return "\n".join([*lines, "", *self._table(), "", self._footnote()])
-
-    def _table(self) -> list[str]:
-        """A row for each law."""
-        bodies = min(len(self.velocity), _BODIES)
-        heads = ["law", "median", "worst", "cost"]
-        heads += [*(f"v{i + 1}+" for i in range(bodies)), "status"]
-        rows = []
-        for name, c in self.candidates.items():
-            v = [f"{x:.4f}" for x in c.velocity[:bodies]]
-            cost = number(c.cost, ".1f" if (c.cost or 0) < 10 else ".0f")
-            mark = "*" if name == self.name else " "
-            rows.append([mark + name, share(c.median), share(c.worst), cost, *v, c.status])
-        return table(heads, rows, left=["status"])
+            head += _wrapped("also", also)
+        columns = (
+            Column("law", lambda name: ("*" if name == self.name else " ") + name),
+            *(Column(name, share) for name in ("median", "worst")),
+            Column("cost", lambda x: "" if x is None else f"{x:.{1 if x < 10 else 0}f}"),
+            *(Column(f"v_{i + 1}_plus", ".4f", f"v{i + 1}+") for i in range(len(self.velocity))),
+            Column("status"),
+        )
+        rows = [
+            [name, c.median, c.worst, c.cost, *c.velocity.tolist(), c.status]
+            for name, c in self.candidates.items()
+        ]
+        notes = ["", *textwrap.wrap(self._footnote(), _width())]
+        notes += [f"{name} is left out: it {why}" for name, why in self.left_out.items()]
+        return Table(columns, rows, [*head, ""], notes)
 
     def _footnote(self) -> str:
         """What the columns of the table mean."""
@@ -200,13 +202,18 @@ class Advice:
             words += "; cost of an impact in a batch, cheapest = 1"
         if self.gap_ratio is not None:
             words += "; delta_c: the indentation scale of a contact, see ji.gap_scale"
-        return textwrap.fill(f"{words}.", _WIDTH)
+        return f"{words}."
+
+
+def _width() -> int:
+    """Characters of the printed lines."""
+    return min(_WIDTH, shutil.get_terminal_size((_WIDTH, 0)).columns)
 
 
 def _wrapped(key: str, text: str) -> list[str]:
     """Lines behind a key word; a number keeps its unit."""
     whole = f"{text}.".replace(" %", "\u00a0%")
-    lines = textwrap.wrap(whole, _WIDTH, initial_indent=f"{key:9s}", subsequent_indent=" " * 9)
+    lines = textwrap.wrap(whole, _width(), initial_indent=f"{key:9s}", subsequent_indent=" " * 9)
     return [line.replace("\u00a0%", " %") for line in lines]
 
 
@@ -234,17 +241,17 @@ def share(x: float) -> str:
 def as_code(law: Declared) -> str:
     """The law as one writes it: `LZB(0.9, 1, 1.5, rtol=0.001)`."""
     words, keywords = [], []
-    for field in fields(law):
-        value = getattr(law, field.name)
+    for each in fields(law):
+        value = getattr(law, each.name)
         if isinstance(value, Declared):
             words.append(as_code(value))
-        elif field.name in _POSITIONAL:
+        elif each.name in _POSITIONAL:
             words.append(_in_code(value))
-        elif field.name in _KEYWORDS and value is not None:
+        elif each.name in _KEYWORDS and value is not None:
             if not isinstance(value, str):
-                keywords.append(f"{field.name}={_in_code(value)}")
-            elif value != field.default:
-                keywords.append(f"{field.name}={value!r}")
+                keywords.append(f"{each.name}={_in_code(value)}")
+            elif value != each.default:
+                keywords.append(f"{each.name}={value!r}")
     return f"{type(law).__name__}({', '.join(words + keywords)})"
 
 

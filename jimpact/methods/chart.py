@@ -3,7 +3,7 @@
 import functools
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -13,13 +13,14 @@ import numpy as np
 
 from jimpact._checks import as_whole, check_choice, check_values, in_common_dtype
 from jimpact.compiling import full_precision
-from jimpact.files.records import fields_as_data, number, table
+from jimpact.files.records import Column, Table, Tabular, fields_as_data, microseconds
 from jimpact.fits.parameters import with_entries
 from jimpact.impacts import Impact, impact
 from jimpact.law import Law, check_law
 from jimpact.laws.lzb import LZB
-from jimpact.methods.contenders import METHODS, UNCOUNTED, Method, outcome
-from jimpact.methods.timing import in_turns
+from jimpact.methods.contenders import CONTENDERS, Contender, outcome
+from jimpact.methods.points import in_turns, raised
+from jimpact.methods.schemes import UNCOUNTED
 from jimpact.progress import counting_bar
 from jimpact.registry import registered_laws
 from jimpact.scene import Scene, as_velocity, kinetic_energy
@@ -42,10 +43,15 @@ class Timing(NamedTuple):
     low: float
     high: float
 
+    def __str__(self) -> str:
+        """In microseconds, the quartiles in brackets."""
+        low, high = microseconds(self.low), microseconds(self.high)
+        return f"{microseconds(self.median)} ({low}-{high})"
+
 
 @dataclass(frozen=True)
 class Point:
-    """A method at one of its settings, or a law (`setting` None).
+    """A contender at one of its settings, or a law (`setting` None).
 
     `error[quantity]` is relative, the largest over the sample (of a law: its model error); NaN
     where there is none. `evaluations`: mean number of field evaluations an impact, NaN where there
@@ -61,19 +67,6 @@ class Point:
     batched: Timing
     gradient: Timing | None = None
 
-    def cells(self) -> list[str]:
-        """The cells of its row."""
-        times = [_us(t and t.median) for t in (self.single, self.batched, self.gradient)]
-        times[1] += f" ({_us(self.batched.low)}-{_us(self.batched.high)})"
-        setting = "law" if self.setting is None else f"{self.setting:g}"
-        errors = [number(self.error[q], ".1e") for q in QUANTITIES]
-        return [setting, *errors, number(self.evaluations, ".0f"), *times]
-
-
-def _us(seconds: float | None) -> str:
-    """A time in microseconds."""
-    return "" if seconds is None else f"{1e6 * seconds:.3g}"
-
 
 @dataclass(frozen=True)
 class Reference:
@@ -87,16 +80,16 @@ class Reference:
 
 
 @dataclass(frozen=True)
-class WorkPrecision:
+class WorkPrecision(Tabular):
     """Error against time and work; `print` gives a table, `ji.plot.work_precision` a picture.
 
     Attributes:
         velocity: v- (n,) [m/s].
-        points: by method, from coarse to fine.
+        points: by contender, from coarse to fine.
         reference: what errors are measured from.
-        compile_time: [s] by method and program ('single', 'batched', 'gradient').
-        left_out: why a method is missing.
-        without_gradient: why a method has none.
+        compile_time: [s] by contender and program ('single', 'batched', 'gradient').
+        left_out: why a contender is missing.
+        without_gradient: why a contender has none.
         batch: impacts in a batch.
         sample: impacts on which errors are measured.
         spread: factor within which their stiffnesses lie.
@@ -114,37 +107,54 @@ class WorkPrecision:
     spread: float
     repeats: int
 
+    picture = "work_precision"
+
     def to_dict(self) -> dict[str, Any]:
         """Everything, as a JSON file can hold it (NaN: null)."""
         return fields_as_data(self)
 
-    def __str__(self) -> str:
-        """A table of all points, and how they were measured."""
-        heads = ["method", "setting", "v+", "impulse", "energy", "time", "gradient", "evals"]
-        heads += ["alone [us]", "batch", "with J", "compile [s]", "status"]
+    @property
+    def table(self) -> Table:
+        """A row for each point, and how they were measured."""
+        heads = ("v+", "impulse", "energy", "time", "gradient")
+        columns = (
+            Column("method"),
+            Column("setting", lambda x: "law" if x is None else f"{x:g}"),
+            *(Column(name, ".1e", head) for name, head in zip(QUANTITIES, heads)),
+            Column("evaluations", ".0f", "evals"),
+            Column("alone_s", microseconds, "alone", "µs"),
+            Column("batch_s", lambda x: str(x), "batch", "µs"),
+            Column("gradient_s", microseconds, "with J", "µs"),
+            Column("compile_s", ".1f", "compile", "s"),
+            Column("status"),
+        )
         rows = []
         for name, points in self.points.items():
-            compiled = sum(self.compile_time[name].values())
-            first = [name, f"{compiled:.1f}" if compiled else ""]
-            for point in points:
-                rows.append([first[0], *point.cells(), first[1], point.status])
-                first = ["", ""]
-        filled = [i for i, column in enumerate(zip(*rows)) if any(column)]
-        heads, rows = [heads[i] for i in filled], [[row[i] for i in filled] for row in rows]
+            compiled = sum(self.compile_time.get(name, {}).values()) or None  # said once
+            for x in points:
+                errors = [x.error.get(q, np.nan) for q in QUANTITIES]
+                times = [x.single.median, x.batched, x.gradient and x.gradient.median]
+                rows.append([name, x.setting, *errors, x.evaluations, *times, compiled, x.status])
+                compiled = None
         uncertain = ", ".join(
             f"{k} {v:.0e}" for k, v in self.reference.uncertainty.items() if not np.isnan(v)
         )
-        lines = [
-            *table(heads, rows, left=["status"], keys=2),
+        notes = [
             f"Reference: {self.reference.how}; uncertain by {uncertain}.",
             f"Errors: relative, the largest of {self.sample} impacts with stiffness spread over a "
             f"factor {self.spread:g}; of a law its model error.",
-            f"Times: medians of {self.repeats} in turns, µs per impact: alone, in a batch of "
-            f"{self.batch} (quartiles){', with the Jacobian' if 'with J' in heads else ''}.",
+            f"Times: medians of {self.repeats} in turns, per impact: alone, in a batch of "
+            f"{self.batch} (quartiles), with J: with the Jacobian.",
         ]
-        lines += [f"left out: {name}: {why}." for name, why in self.left_out.items()]
-        lines += [f"no gradient: {name}: {why}." for name, why in self.without_gradient.items()]
-        return "\n".join(lines)
+        notes += [f"left out: {name}: {why}." for name, why in self.left_out.items()]
+        notes += [f"no gradient: {name}: {why}." for name, why in self.without_gradient.items()]
+        return Table(columns, rows, notes=notes, keys=2)
+
+    def to_csv(self, path: Any = None) -> str:
+        """The table as CSV; of times in a batch the medians."""
+        table = self.table
+        rows = [[getattr(x, "median", x) for x in row] for row in table.rows]
+        return Table(table.columns, rows).to_csv(path)
 
 
 @full_precision
@@ -152,7 +162,7 @@ def work_precision(
     scene: Scene,
     velocity: Any,
     law: LZB,
-    methods: Sequence[str] | None = None,
+    methods: Sequence[str | Contender] | None = None,
     settings: Mapping[str, Sequence[float]] | None = None,
     laws: Mapping[str, Law] | None = None,
     reference: str | None = None,
@@ -176,7 +186,8 @@ def work_precision(
         velocity: v- (n,) [m/s], at least one contact approaching.
         law: the `LZB` law; its `method` and `rtol` play no part, its `max_steps` does. With
             `friction` (scenes with tangents, planar or in space) methods without it are left out.
-        methods: names in `jimpact.methods.contenders.METHODS`; None: all that support the impact.
+        methods: names in `jimpact.methods.contenders.CONTENDERS`, or contenders of your own; None:
+            all that support the impact. One that raises is left out, and the table says why.
         settings: settings by method, in place of its default ones.
         laws: algebraic laws by name, points with their *model* error against LZB on this impact;
             None: Newton, Moreau, Poisson and Binary with the law's restitution and friction.
@@ -206,30 +217,31 @@ def work_precision(
     repeats = as_whole("repeats", repeats, 1)
     case = _case(scene, velocity, law, as_whole("batch", batch, 1))
     chosen, left_out = _chosen(methods, case)
-    ladders = _ladders(chosen, settings or {})
-    exact, second = _reference(reference, case), METHODS["dop853"]
-    if laws is None:
-        built = registered_laws(shared_parameters(law))[0]
-        laws = {name: built[name] for name in ALGEBRAIC}
-    needed = {m.name: m for m in (*chosen, exact, second)}
-    programs = {n: _method_programs(m, case, gradients, durations) for n, m in needed.items()}
+    chosen = _with_settings(chosen, settings or {})
+    exact, second = _reference(reference, case), CONTENDERS["dop853"]
+    laws = _algebraic(law) if laws is None else laws
+
+    # of one name one program, which the reference shares with its own row
+    different = {m.name: m for m in (exact, second, *chosen)}
+    programs = {n: _method_programs(m, case, gradients, durations) for n, m in different.items()}
     programs |= {name: _law_programs(other, case) for name, other in laws.items()}
-    rows: list[tuple[str, float | None]] = [(n, x) for n, row in ladders.items() for x in row]
-    rows += [(name, None) for name in laws]
+    ladders: dict[str, Any] = {m.name: m.ladder for m in chosen} | dict.fromkeys(laws, (None,))
     truth, other_truth = programs[exact.name].at(FINEST), programs[second.name].at(SECOND)
-    solutions = []
-    with counting_bar(len(rows), "errors", progress) as advance:
-        for name, value in rows:
-            solutions.append(programs[name].at(value))
-            advance(1)
-    times = _times([(programs[name], value) for name, value in rows], repeats, progress)
-    labels = {m.name: m.label for m in chosen} | {name: f"law: {name}" for name in laws}
-    points: dict[str, list[Point]] = {name: [] for name, _ in rows}
-    for (name, value), solution, timings in zip(rows, solutions, times):
-        status = STATUS[int(np.max(solution.out.status))].name
-        work = float(np.mean(solution.evaluations))
-        error = _errors(case, solution, truth)
-        points[name].append(Point(labels[name], value, error, work, status, *timings))
+    solutions: dict[str, list[Solved]] = {}
+    with counting_bar(sum(map(len, ladders.values())), "errors", progress) as advance:
+        for name, ladder in ladders.items():
+            try:
+                solutions[name] = [programs[name].at(setting) for setting in ladder]
+            except Exception as error:  # a contender may fail in any way; the others stand
+                left_out[name] = raised(error)
+            advance(len(ladder))
+    rows = [(n, setting, s) for n, row in solutions.items() for setting, s in zip(ladders[n], row)]
+    times = _times([(programs[name], setting) for name, setting, _ in rows], repeats, progress)
+    labels = {m.name: m.label or m.name for m in chosen} | {name: f"law: {name}" for name in laws}
+    points: dict[str, list[Point]] = {name: [] for name in solutions}
+    for (name, setting, solution), timings in zip(rows, times):
+        off = _errors(case, solution, truth)
+        points[name].append(_point(labels[name], setting, off, solution, timings))
     return WorkPrecision(
         velocity=np.asarray(case.velocity),
         points={name: tuple(row) for name, row in points.items()},
@@ -256,7 +268,13 @@ def shared_parameters(law: LZB) -> dict[str, Any]:
     return {"restitution": law.restitution} | friction
 
 
-# ------------------------------------------------------------------ the impact, and methods
+def _algebraic(law: LZB) -> dict[str, Law]:
+    """The algebraic laws with its parameters."""
+    built = registered_laws(shared_parameters(law))[0]
+    return {name: built[name] for name in ALGEBRAIC}
+
+
+# -------------------------------------------------------------- the impact, and the contenders
 
 
 class Case(NamedTuple):
@@ -294,41 +312,50 @@ def _case(scene: Scene, velocity: Any, law: LZB, batch: int) -> Case:
     return Case(law, scene, v, stiffness, min(SAMPLE, batch))
 
 
-def _chosen(names: Sequence[str] | None, case: Case) -> tuple[list[Method], dict[str, str]]:
-    """Methods by name; without names all that support the law, and why others do not."""
-    if names is not None:
-        return [_supported("methods", name, case) for name in names], {}
-    left_out = {n: why for n, m in METHODS.items() if (why := m.supports(case.law)) is not None}
-    return [m for n, m in METHODS.items() if n not in left_out], left_out
+def _chosen(
+    methods: Sequence[str | Contender] | None, case: Case
+) -> tuple[list[Contender], dict[str, str]]:
+    """Contenders by name; without names all that support the law, and why others do not."""
+    if methods is not None:
+        return [_supported("methods", each, case) for each in methods], {}
+    left_out = {n: why for n, m in CONTENDERS.items() if (why := m.supports(case.law)) is not None}
+    return [m for n, m in CONTENDERS.items() if n not in left_out], left_out
 
 
-def _supported(argument: str, name: str, case: Case) -> Method:
-    """The method of this name, if it supports the law."""
-    check_choice(argument, name, METHODS)
-    reason = METHODS[name].supports(case.law)
+def _supported(argument: str, contender: str | Contender, case: Case) -> Contender:
+    """The contender, or that of this name, if it supports the law."""
+    if not isinstance(contender, Contender):
+        check_choice(argument, contender, CONTENDERS)
+        contender = CONTENDERS[contender]
+    elif CONTENDERS.get(contender.name, contender) is not contender:
+        raise ValueError(
+            f"Argument `{argument}` must have contenders of new names, but has {contender.name!r}."
+        )
+    reason = contender.supports(case.law)
     if reason is not None:
         raise ValueError(
-            f"Argument `{argument}` must be able to solve the impact, but has {name!r}: {reason}."
+            f"Argument `{argument}` must be able to solve the impact, but has {contender.name!r}: "
+            f"{reason}."
         )
-    return METHODS[name]
+    return contender
 
 
-def _ladders(
-    chosen: list[Method], settings: Mapping[str, Sequence[float]]
-) -> dict[str, tuple[float, ...]]:
-    """Settings by method."""
+def _with_settings(
+    chosen: list[Contender], settings: Mapping[str, Sequence[float]]
+) -> list[Contender]:
+    """The contenders with these settings."""
     for name, values in settings.items():
-        check_choice("settings", name, [method.name for method in chosen])
+        check_choice("settings", name, [contender.name for contender in chosen])
         check_values(f"settings[{name!r}]", values, low=0.0, open_low=True)
-    return {m.name: tuple(settings.get(m.name, m.ladder)) for m in chosen}
+    return [m._replace(ladder=tuple(settings.get(m.name, m.ladder))) for m in chosen]
 
 
-def _reference(name: str | None, case: Case) -> Method:
-    """The method that errors are measured from."""
-    method = _supported("reference", name or "dop853", case)
-    if method.setting != "rtol":
+def _reference(name: str | None, case: Case) -> Contender:
+    """The contender that errors are measured from."""
+    contender = _supported("reference", name or "dop853", case)
+    if contender.setting != "rtol":
         raise ValueError(f"Argument `reference` must take an rtol, but is {name!r}.")
-    return method
+    return contender
 
 
 # ------------------------------------------------------------------------------- programs
@@ -345,7 +372,7 @@ class Solved(NamedTuple):
 
 @dataclass(frozen=True)
 class Programs:
-    """The programs of a method, functions of its setting, or of a law.
+    """The programs of a contender, functions of its setting, or of a law.
 
     `single` solves one impact, `batched` a number `batch` of them, `sampled` those on which errors
     are measured; `compile_time` [s] by program, filled in by the first calls.
@@ -355,8 +382,8 @@ class Programs:
     batched: Callable[[Any], Any]
     batch: int
     sampled: Callable[[Any], Solved]
-    gradient: Callable[[Any], Any] | None
-    compile_time: dict[str, float]
+    gradient: Callable[[Any], Any] | None = None
+    compile_time: dict[str, float] = field(default_factory=dict)
 
     def at(self, setting: float | None) -> Solved:
         """Solution and Jacobian of the sample, as numpy; evaluations NaN where not counted."""
@@ -366,50 +393,57 @@ class Programs:
         return solution._replace(evaluations=work, jacobian=jacobian)
 
 
-def _method_programs(method: Method, case: Case, gradients: bool, durations: bool) -> Programs:
-    """Programs of a method at the stiffnesses of the case."""
-    if not method.jax:
-        return _host_programs(method, case)
+def _solved(contender: Contender, law: LZB, case: Case, setting: Any) -> Solved:
+    """One impact by a contender."""
+    solution = contender.solve(law, case.scene, case.velocity, setting)
+    out = outcome(law, case.scene, case.velocity, solution)
+    return Solved(out, solution.duration, solution.evaluations)
 
-    def solve(k: jax.Array, law: LZB, scene: Scene, v: jax.Array, setting: jax.Array) -> Solved:
+
+def _method_programs(
+    contender: Contender, case: Case, gradients: bool, durations: bool
+) -> Programs:
+    """Programs of a contender at the stiffnesses of the case."""
+    if not contender.jax:
+        return _host_programs(contender, case)
+    names = tuple(shared_parameters(case.law))
+
+    def solve(k: jax.Array, case: Case, setting: jax.Array) -> Solved:
         """The impact with stiffness k (m,)."""
-        law = with_entries(law, ("stiffness",), k)
-        result = method.solve(law, scene, v, setting)
-        return Solved(outcome(law, scene, v, result), result.duration, result.evaluations)
+        return _solved(contender, with_entries(case.law, ("stiffness",), k), case, setting)
 
-    def timed(*arguments: Any) -> Solved:
+    def timed(k: jax.Array, case: Case, setting: jax.Array) -> Solved:
         """The same, without a duration that would cost a run of its own."""
-        solution = solve(*arguments)
-        without = method.duration_apart or not durations
+        solution = solve(k, case, setting)
+        without = contender.duration_apart or not durations
         return solution._replace(duration=jnp.nan) if without else solution
 
-    def jacobian(k: jax.Array, law: LZB, scene: Scene, v: jax.Array, setting: jax.Array) -> Any:
+    def jacobian(k: jax.Array, case: Case, setting: jax.Array) -> Any:
         """(d v+ / d ln k, d v+ / d e) (n, 2 m), with friction also d v+ / d mu (n, 3 m)."""
-        names = tuple(shared_parameters(law))
 
         def velocity(log_factor: jax.Array, *values: jax.Array) -> jax.Array:
             """v+ (n,)."""
-            changed = law
+            law = case.law
             for name, value in zip(names, values):
-                changed = with_entries(changed, (name,), value)
-            return timed(k * jnp.exp(log_factor), changed, scene, v, setting).out.velocity
+                law = with_entries(law, (name,), value)
+            changed = case._replace(law=law)
+            return timed(k * jnp.exp(log_factor), changed, setting).out.velocity
 
-        at = (jnp.zeros_like(k), *(getattr(law, name) for name in names))
+        at = (jnp.zeros_like(k), *(getattr(case.law, name) for name in names))
         parts = jax.jacfwd(velocity, argnums=tuple(range(len(at))))(*at)
         return jnp.concatenate(parts, axis=-1)
 
-    seconds: dict[str, float] = {}
-    constant = (case.law, case.scene, case.velocity)
+    compile_time: dict[str, float] = {}
 
     def program(name: str, function: Callable[..., Any], rows: int | None) -> Callable[[Any], Any]:
         """The function of a setting, over the first stiffnesses; None: over the law's alone."""
         k = case.stiffness[0] if rows is None else case.stiffness[:rows]
-        each = function if rows is None else jax.vmap(function, in_axes=(0, *[None] * 4))
-        return _compiled(seconds, name, each, k, *constant)
+        each = function if rows is None else jax.vmap(function, in_axes=(0, None, None))
+        return _compiled(compile_time, name, each, k, case)
 
     batched = program("batched", timed, len(case.stiffness))
     complete = batched
-    if durations and method.duration_apart:
+    if durations and contender.duration_apart:
         complete = program("errors", solve, case.sample)
     return Programs(
         single=program("single", timed, None),
@@ -417,21 +451,21 @@ def _method_programs(method: Method, case: Case, gradients: bool, durations: boo
         batch=len(case.stiffness),
         sampled=lambda setting: jax.tree.map(lambda a: a[: case.sample], complete(setting)),
         gradient=program("gradient", jacobian, case.sample) if gradients else None,
-        compile_time=seconds,
+        compile_time=compile_time,
     )
 
 
 def _compiled(
-    seconds: dict[str, float], name: str, function: Callable[..., Any], *arguments: Any
+    compile_time: dict[str, float], name: str, function: Callable[..., Any], *arguments: Any
 ) -> Callable[[Any], Any]:
-    """The function of a setting; its first call enters the time of compiling in `seconds`."""
+    """The function of a setting; its first call enters the time of compiling."""
 
     @functools.cache
     def compiled() -> Callable[..., Any]:
         """The compiled function."""
         begin = time.perf_counter()
         program = jax.jit(function).lower(*arguments, jnp.ones((), float)).compile()
-        seconds[name] = time.perf_counter() - begin
+        compile_time[name] = time.perf_counter() - begin
         return program
 
     return lambda setting: compiled()(
@@ -439,41 +473,36 @@ def _compiled(
     )
 
 
-def _host_programs(method: Method, case: Case) -> Programs:
-    """The same of a method that runs on the host: loops."""
+def _host_programs(contender: Contender, case: Case) -> Programs:
+    """The same of a contender that runs on the host: loops."""
     rows = min(HOST_BATCH, len(case.stiffness))
     laws = [
         with_entries(case.law, ("stiffness",), k)
         for k in case.stiffness[: max(HOST_BATCH, case.sample)]
     ]
 
-    def one(law: LZB, setting: Any) -> Any:
-        """One impact."""
-        return method.solve(law, case.scene, case.velocity, setting)
+    def several(count: int) -> Callable[[Any], Solved]:
+        """So many impacts, one after the other."""
 
-    def sampled(setting: Any) -> Solved:
-        """The impacts on which errors are measured."""
-        solutions = []
-        for law in laws[: case.sample]:
-            result = one(law, setting)
-            out = outcome(law, case.scene, case.velocity, result)
-            solutions.append(Solved(out, result.duration, result.evaluations))
-        return jax.tree.map(lambda *a: jnp.stack(a), *solutions)
+        def run(setting: Any) -> Solved:
+            """At a setting."""
+            solved = [_solved(contender, law, case, setting) for law in laws[:count]]
+            return jax.tree.map(lambda *a: jnp.stack(a), *solved)
 
-    return Programs(
-        single=lambda setting: one(laws[0], setting),
-        batched=lambda setting: [one(law, setting) for law in laws[:rows]],
-        batch=rows,
-        sampled=sampled,
-        gradient=None,
-        compile_time={},
-    )
+        return run
+
+    def alone(setting: Any, count: int = 1) -> list[Any]:
+        """The solver itself, for its time."""
+        return [contender.solve(law, case.scene, case.velocity, setting) for law in laws[:count]]
+
+    batched = functools.partial(alone, count=rows)
+    return Programs(single=alone, batched=batched, batch=rows, sampled=several(case.sample))
 
 
 def _law_programs(law: Law, case: Case) -> Programs:
     """Programs of another law: it has no setting, and its sample is the impact itself."""
     law, batch = in_common_dtype(law, case.velocity)[0], len(case.stiffness)
-    seconds: dict[str, float] = {}
+    compile_time: dict[str, float] = {}
 
     def run(v: jax.Array, law: Law, scene: Scene, setting: jax.Array) -> Solved:
         """One impact."""
@@ -481,14 +510,13 @@ def _law_programs(law: Law, case: Case) -> Programs:
 
     many = jax.vmap(run, in_axes=(0, None, None, None))
     velocities = jnp.tile(case.velocity[None, :], (batch, 1))
-    one = _compiled(seconds, "single", run, case.velocity, law, case.scene)
+    one = _compiled(compile_time, "single", run, case.velocity, law, case.scene)
     return Programs(
         single=one,
-        batched=_compiled(seconds, "batched", many, velocities, law, case.scene),
+        batched=_compiled(compile_time, "batched", many, velocities, law, case.scene),
         batch=batch,
         sampled=lambda _: jax.tree.map(lambda a: a[None], one(None)),
-        gradient=None,
-        compile_time=seconds,
+        compile_time=compile_time,
     )
 
 
@@ -502,35 +530,43 @@ def _errors(case: Case, solution: Solved, truth: Solved) -> dict[str, float]:
     before = float(kinetic_energy(case.scene, case.velocity)) or np.abs(exact.energy_change).max()
 
     def largest(a: Any, b: Any, scale: Any = None) -> float:
-        """Largest difference over the scale, that of the truth by default."""
+        """Largest difference over the scale, that of the truth by default; NaN without both."""
+        if a is None or b is None:
+            return float("nan")
         scale = np.abs(b).max() if scale is None else scale
         return float(np.abs(a - b[: len(out.velocity)]).max() / scale)
 
-    errors = {
+    return {
         "velocity": largest(out.velocity, exact.velocity, fastest),
         "impulse": largest(out.impulse, exact.impulse),
         "energy": largest(out.energy_change, exact.energy_change, before),
         "duration": largest(solution.duration, truth.duration),
-        "gradient": float("nan"),
+        "gradient": largest(solution.jacobian, truth.jacobian, fastest),
     }
-    if solution.jacobian is not None and truth.jacobian is not None:
-        errors["gradient"] = largest(solution.jacobian, truth.jacobian, fastest)
-    return errors
+
+
+def _point(
+    label: str, setting: float | None, error: dict[str, float], solution: Solved, timings: Any
+) -> Point:
+    """A row of the chart."""
+    status = STATUS[int(np.max(solution.out.status))].name
+    return Point(label, setting, error, float(np.mean(solution.evaluations)), status, *timings)
 
 
 def _times(
     rows: list[tuple[Programs, float | None]], repeats: int, progress: float | None
 ) -> list[list[Timing]]:
     """Single and batched time of each row, and with its gradient if it has one; all in turns."""
-    tasks = []
-    for row, (programs, value) in enumerate(rows):
+    tasks = [
+        (row, impacts, functools.partial(run, value))
+        for row, (programs, value) in enumerate(rows)
         for run, impacts in (
             (programs.single, 1),
             (programs.batched, programs.batch),
             (programs.gradient, min(SAMPLE, programs.batch)),
-        ):
-            if run is not None:
-                tasks.append((row, impacts, functools.partial(run, value)))
+        )
+        if run is not None
+    ]
     with counting_bar(len(tasks) * repeats, "timings", progress) as advance:
         times_of_tasks = in_turns([run for *_, run in tasks], repeats, lambda: advance(1))
     times: list[list[Timing]] = [[] for _ in rows]

@@ -10,10 +10,10 @@ import numpy as np
 
 from jimpact._checks import check_kind, check_values
 from jimpact.audits import Audit, audit, nothing_approaches
-from jimpact.files.records import as_data, fields_as_data, number, table
+from jimpact.files.records import Column, Table, Tabular, as_data, fields_as_data, microseconds
 from jimpact.impacts import Impact, impact
 from jimpact.law import Law
-from jimpact.methods.timing import in_turns, seconds
+from jimpact.methods.points import in_turns, raised, seconds
 from jimpact.registry import registered_laws
 from jimpact.scene import Scene, as_velocity
 from jimpact.status import STATUS
@@ -56,7 +56,7 @@ class Entry:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class Comparison(Tabular):
     """The result of `compare`; `print` gives a table.
 
     Attributes:
@@ -72,6 +72,8 @@ class Comparison:
     entries: dict[str, Entry]
     left_out: dict[str, str] = field(default_factory=dict)
     measured: np.ndarray | None = None
+
+    picture = "comparison"
 
     @property
     def distances(self) -> dict[str, float]:
@@ -94,33 +96,39 @@ class Comparison:
         """The laws' rows, as a JSON file can hold them."""
         return as_data(self.entries)
 
-    def __str__(self) -> str:
+    @property
+    def table(self) -> Table:
         """A row for each law, and the measured velocities."""
-        bodies = [f"v{i + 1}+" for i in range(self.scene.size)]
-        heads = ["law", *bodies, "T+/T-", "dispersion", "us", "audit"]
+        unit = "m/s" if self.scene.walls is not None else ""  # others may be rad/s
+        columns = (
+            Column("law"),
+            *(Column(f"v_{i + 1}_plus", ".5f", f"v{i + 1}+", unit) for i in range(self.scene.size)),
+            Column("energy_ratio", ".4f", "T+/T-"),
+            Column("dispersion", ".3f"),
+            Column("time_s", microseconds, "time", "µs"),
+            Column("audit"),
+        )
         rows = [
-            [name, *self._cells(entry.outcome.velocity), f"{1e6 * entry.time:.0f}", entry.verdict]
-            for name, entry in self.entries.items()
+            [name, *self._numbers(x.outcome.velocity), x.time, x.verdict]
+            for name, x in self.entries.items()
         ]
         if self.measured is not None:
-            rows.append(["measured", *self._cells(self.measured), "", ""])
-        lines = table(heads, rows, left=["audit"])
+            rows.append(["measured", *self._numbers(self.measured), None, ""])
+        notes = []
         if self.closest:
             rms = self.distances[self.closest[0]]
             named = ", ".join(self.closest)
-            lines.append(f"closest to the measured velocities: {named} (rms {rms:.3g} m/s)")
-        lines += [f"{name} is left out: it {reason}" for name, reason in self.left_out.items()]
+            notes.append(f"closest to the measured velocities: {named} (rms {rms:.3g} m/s)")
+        notes += [f"{name} is left out: it {reason}" for name, reason in self.left_out.items()]
         quiet = nothing_approaches(self.scene, self.velocity)
         if quiet is not None:
-            lines.append(f"no impact: {quiet}")
-        return "\n".join(lines)
+            notes.append(f"no impact: {quiet}")
+        return Table(columns, rows, notes=notes)
 
-    def _cells(self, after: Any) -> list[str]:
-        """Velocities [m/s], energy ratio and dispersion; an empty text for NaN."""
-        ratio = energy_ratio(self.scene, self.velocity, after)
-        spread = dispersion_index(self.scene, after)
-        v = [number(x, ".5f") for x in np.asarray(after)]
-        return [*v, number(float(ratio), ".4f"), number(float(spread), ".3f")]
+    def _numbers(self, after: Any) -> list[float]:
+        """Velocities [m/s], energy ratio and dispersion."""
+        ratio, spread = energy_ratio(self.scene, self.velocity, after), dispersion_index
+        return [*np.asarray(after).tolist(), float(ratio), float(spread(self.scene, after))]
 
 
 def compare(
@@ -138,6 +146,7 @@ def compare(
 
     Returns:
         `Comparison`: an entry for each law, `print` gives a table, `ji.plot.comparison` a picture.
+        A law that raises is left out, and the table says why.
 
     Raises:
         ValueError: velocities of another size or NaN; both `laws` and values.
@@ -159,9 +168,17 @@ def compare(
             "came with it."
         )
     check_kind("laws", laws, Mapping)
-    runs = {name: partial(impact, law, scene, v) for name, law in laws.items()}
-    first = [seconds(run) for run in runs.values()]
-    each = [float(np.median(x)) for x in in_turns(list(runs.values()), _REPEATS)]
+    runs, first = {}, {}
+    for name, law in laws.items():
+        run = partial(impact, law, scene, v)
+        try:
+            first[name] = seconds(run)
+        except Exception as error:  # a user's law may fail in any way; the others stand
+            left_out[name] = raised(error)
+        else:
+            runs[name] = run
+    each = dict(zip(runs, in_turns(list(runs.values()), _REPEATS)))
+    times = {name: float(np.median(x)) for name, x in each.items()}
     entries = {
         name: Entry(
             law=laws[name],
@@ -169,9 +186,9 @@ def compare(
             audit=audit(scene, v, out),
             energy_ratio=float(energy_ratio(scene, v, out.velocity)),
             dispersion_index=float(dispersion_index(scene, out.velocity)),
-            time=each[i],
-            compile_time=max(first[i] - each[i], 0.0),
+            time=times[name],
+            compile_time=max(first[name] - times[name], 0.0),
         )
-        for i, (name, run) in enumerate(runs.items())
+        for name, run in runs.items()
     }
     return Comparison(scene, np.asarray(v), entries, left_out)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -12,12 +13,13 @@ import numpy as np
 from jimpact._checks import as_whole, check_kind, check_shape, check_values
 from jimpact.compiling import precise_jit
 from jimpact.contact import delassus_matrix
-from jimpact.files.records import fields_as_data, listed, number, table
+from jimpact.files.records import Column, Table, Tabular, fields_as_data, listed
 from jimpact.impacts import impact
 from jimpact.law import Law, check_law
 from jimpact.methods.advice import blocks_of
 from jimpact.methods.advice_report import ContactBlock, share
-from jimpact.scene import Scene, as_velocity, dense_mass, gap_velocity, with_gaps
+from jimpact.methods.points import EnergyNorm, Outcomes, in_batches
+from jimpact.scene import Scene, as_velocity, gap_velocity, with_gaps
 from jimpact.solvers.tridiagonal import diagonal
 from jimpact.status import STATUS
 
@@ -28,7 +30,7 @@ PRINTED = 12  # contacts in the printed table; ten times more fill three pages
 
 
 @dataclass(frozen=True)
-class SceneAdvice:
+class SceneAdvice(Tabular):
     """The result of `simplest_scene`; `ji.impact(result.law, result.scene, velocity)` applies it.
 
     Errors are changes of v+ in the energy norm over that of v-. NaN: the law fails without this
@@ -79,14 +81,15 @@ class SceneAdvice:
         kept = {"kept": [j + 1 for j in self.kept]}
         return fields_as_data(self, "law", "scene", "blocks", "kept") | kept
 
-    def __str__(self) -> str:
-        """Half a page."""
+    @property
+    def table(self) -> Table:
+        """A row for each contact, the most needed first."""
         m = len(self.names)
-        lines = [
+        head = [
             f"{len(self.kept)} of {m} contacts suffice within {share(self.tolerance)}; "
             f"the error of v+ is {share(self.error)}"
         ]
-        lines += [
+        head += [
             f"friction, {name}: " + (f"error {share(x)}" if np.isfinite(x) else "the law fails")
             for name, x in self.friction.items()
         ]
@@ -95,21 +98,27 @@ class SceneAdvice:
             angles = f"; kinetic angles {ends[0]:.0f} to {ends[1]:.0f} degrees" if ends else ""
             some = listed([str(j + 1) for j in block.contacts])
             state = "impact" if block.approaches else "nothing approaches"
-            lines.append(f"group of contacts {some}: {state}{angles}")
-        order = np.argsort(-np.nan_to_num(self.errors, nan=np.inf), kind="stable")[:PRINTED]
+            head.append(f"group of contacts {some}: {state}{angles}")
+        order = np.argsort(-np.nan_to_num(self.errors, nan=np.inf), kind="stable")
+        columns = (
+            Column("contact"),
+            Column("impulse", ".3g", unit="N s"),
+            Column("error", lambda x: share(x) if np.isfinite(x) else "not known", "error without"),
+            Column("change", ".2g", "change of v+"),
+            Column("advice"),
+        )
+        values = self.impulses, self.errors, self.changes
         rows = [
-            [
-                f"{j + 1} {self.names[j]}".strip(),
-                number(self.impulses[j], ".3g"),
-                share(self.errors[j]) if np.isfinite(self.errors[j]) else "not known",
-                number(self.changes[j], ".2g") if np.isfinite(self.changes[j]) else "",
-                self.reason(int(j)),
-            ]
+            [f"{j + 1} {self.names[j]}".strip(), *(x[j] for x in values), self.reason(int(j))]
             for j in order
         ]
-        heads = ["contact", "impulse [N s]", "error without", "change of v+", "advice"]
-        lines += ["", *table(heads, rows, left=["advice"])]
-        return "\n".join([*lines, *([f"and {m - PRINTED} more"] if m > PRINTED else [])])
+        return Table(columns, rows, [*head, ""])
+
+    def __str__(self) -> str:
+        """Half a page: the table, as far as its first rows."""
+        table, more = self.table, len(self.names) - PRINTED
+        notes = [f"and {more} more"] if more > 0 else []
+        return str(replace(table, rows=table.rows[:PRINTED], notes=notes))
 
 
 def simplest_scene(
@@ -163,7 +172,7 @@ def simplest_scene(
     as_whole("runs", runs, 1)
     labels = ("",) * scene.contacts if names is None else tuple(map(str, names))
     check_shape("names", np.empty(len(labels)), (scene.contacts,), "one per contact")
-    norm = _Norm.of(scene, np.asarray(v), watched)
+    norm = EnergyNorm.of(scene, np.asarray(v), watched)
     whole = _Simpler(law, scene).run(v, [()])
     if STATUS[int(whole.status[0])].failure:
         raise RuntimeError(
@@ -192,43 +201,6 @@ def simplest_scene(
     )
 
 
-class _Outcomes(NamedTuple):
-    """v+ (r, n), p (r, m), p_t (r, t) and status (r,) of impacts."""
-
-    velocity: Any
-    impulse: Any
-    tangential: Any
-    status: Any
-
-
-class _Norm(NamedTuple):
-    """Energy norm of changes of the watched velocities, over that of v-."""
-
-    mass: np.ndarray
-    before: float
-    watched: np.ndarray
-
-    @classmethod
-    def of(cls, scene: Scene, velocity: np.ndarray, watched: Any) -> "_Norm":
-        """For a scene at v- (n,)."""
-        count = scene.size
-        index = np.arange(count) if watched is None else np.atleast_1d(np.asarray(watched))
-        whole = index.ndim == 1 and index.size > 0 and np.issubdtype(index.dtype, np.integer)
-        if not whole or index.min() < 0 or index.max() >= count:
-            raise ValueError(
-                f"Argument `watched` must be indices of coordinates from 0 to {count - 1}, but has "
-                f"value {watched!r}."
-            )
-        mass = dense_mass(scene)
-        before = float(np.sqrt(velocity @ mass @ velocity)) or 1.0
-        return cls(mass[np.ix_(index, index)], before, index)
-
-    def of_changes(self, change: np.ndarray) -> np.ndarray:
-        """Errors (r,) of changes of v+ (r, n)."""
-        dv = change[:, self.watched]
-        return np.sqrt(np.sum((dv @ self.mass) * dv, axis=1)) / self.before
-
-
 class _Simpler(NamedTuple):
     """A law on a scene of which contacts are left out."""
 
@@ -255,38 +227,31 @@ class _Simpler(NamedTuple):
             row[list(index)] = np.inf
         return gaps
 
-    def run(self, velocity: jax.Array, left_out: Sequence[Any]) -> _Outcomes:
+    def run(self, velocity: jax.Array, left_out: Sequence[Any]) -> Outcomes:
         """An impact for each set of contacts to leave out, some at a time."""
-        rows, parts = self.gaps(left_out), []
-        for first in range(0, len(rows), self.lanes):
-            part = np.minimum(np.arange(first, first + self.lanes), len(rows) - 1)
-            out = _batch(self.law, self.scene, velocity, jnp.asarray(rows[part]))
-            parts.append(jax.device_get(out))
-        return _Outcomes(*(np.concatenate(x)[: len(rows)] for x in zip(*parts)))
+        run = partial(_batch, self.law, self.scene, velocity)
+        return in_batches(run, self.gaps(left_out), self.lanes)
 
     def changes(
         self, velocity: jax.Array, left_out: Sequence[Any], reference: np.ndarray
     ) -> np.ndarray:
         """Changes (r, n) of v+ from the reference (n,); NaN where the law fails."""
-        out = self.run(velocity, left_out)
-        failed = np.array([STATUS[int(code)].failure for code in out.status])
-        return np.where(failed[:, None], np.nan, out.velocity - reference)
+        return self.run(velocity, left_out).where_usable().velocity - reference
 
 
 @precise_jit
-def _batch(law: Law, scene: Scene, velocity: jax.Array, gaps: jax.Array) -> _Outcomes:
+def _batch(law: Law, scene: Scene, velocity: jax.Array, gaps: Any) -> Outcomes:
     """The impact with each row of gaps (r, m)."""
 
-    def one(gaps: jax.Array) -> _Outcomes:
+    def one(gaps: jax.Array) -> Outcomes:
         """One impact."""
-        out = impact(law, with_gaps(scene, gaps), velocity)
-        return _Outcomes(out.velocity, out.impulse, out.tangential_impulse, out.status)
+        return Outcomes.of(impact(law, with_gaps(scene, gaps), velocity))
 
     return jax.vmap(one)(gaps)
 
 
 def _frictions(
-    trial: _Simpler, v: jax.Array, whole: _Outcomes, norm: _Norm, tolerance: float
+    trial: _Simpler, v: jax.Array, whole: Outcomes, norm: EnergyNorm, tolerance: float
 ) -> tuple[dict[str, float], _Simpler]:
     """The error of each simpler friction, and the simplest that is within tolerance."""
     law, scene = trial
@@ -298,7 +263,7 @@ def _frictions(
         ways["one direction"] = _Simpler(law, _with_tangents(scene, _along(scene, whole)))
     errors, chosen = {}, None
     for name, way in ways.items():
-        errors[name] = float(norm.of_changes(way.changes(v, [()], whole.velocity[0]))[0])
+        errors[name] = float(norm(way.changes(v, [()], whole.velocity[0]))[0])
         if chosen is None and errors[name] <= tolerance:
             chosen = way
     return errors, chosen or trial
@@ -309,7 +274,7 @@ def _with_tangents(scene: Scene, tangents: jax.Array | None) -> Scene:
     return eqx.tree_at(lambda tree: tree.tangents, scene, tangents)
 
 
-def _along(scene: Scene, whole: _Outcomes) -> jax.Array:
+def _along(scene: Scene, whole: Outcomes) -> jax.Array:
     """One tangent (n, m) of each contact, along its tangential impulse."""
     m = scene.contacts
     impulse = whole.tangential[0].reshape(m, 2)
@@ -320,7 +285,7 @@ def _along(scene: Scene, whole: _Outcomes) -> jax.Array:
 
 
 def _alone(
-    trial: _Simpler, v: jax.Array, norm: _Norm, runs: int
+    trial: _Simpler, v: jax.Array, norm: EnergyNorm, runs: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Contacts with an impulse, and of each contact (m,) the error and change of v+ without it.
 
@@ -335,7 +300,7 @@ def _alone(
     errors[working] = changes[working] = np.nan
     if len(largest):
         change = trial.changes(v, [(j,) for j in largest], whole.velocity[0])
-        errors[largest] = norm.of_changes(change)
+        errors[largest] = norm(change)
         changes[largest] = np.abs(change[:, norm.watched]).max(axis=1)
     return working, errors, changes
 
@@ -343,8 +308,8 @@ def _alone(
 def _together(
     trial: _Simpler,
     v: jax.Array,
-    whole: _Outcomes,
-    norm: _Norm,
+    whole: Outcomes,
+    norm: EnergyNorm,
     working: np.ndarray,
     errors: np.ndarray,
     tolerance: float,
@@ -363,7 +328,7 @@ def _together(
         last = max(len(waiting) - (not kept), 0)  # one is always kept
         counts = np.unique(np.linspace(0, last, min(runs, last) + 1, dtype=int))
         sets = [left_out + waiting[:count] for count in counts]
-        error = norm.of_changes(trial.changes(v, sets, whole.velocity[0]))
+        error = norm(trial.changes(v, sets, whole.velocity[0]))
         suffice = np.flatnonzero(error <= tolerance)
         best = int(suffice[-1]) if len(suffice) else 0
         left_out, left = sets[best], waiting[counts[best] :]

@@ -14,7 +14,7 @@ wait for their slowest point, so the number of steps is bounded.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache, partial
 from itertools import combinations
 from typing import Any, NamedTuple
@@ -26,14 +26,12 @@ import numpy as np
 from jimpact._checks import as_whole, check_choice, check_values
 from jimpact.audits import audit
 from jimpact.compiling import full_precision
-from jimpact.contact import delassus_matrix
-from jimpact.files.records import as_data, fields_as_data, table
+from jimpact.files.records import Column, Table, Tabular, as_data, fields_as_data
 from jimpact.laws.lzb import LZB
-from jimpact.methods.contenders import METHODS
-from jimpact.methods.contenders.base import Method, outcome
+from jimpact.methods.contenders import CONTENDERS, Contender, outcome
+from jimpact.methods.points import in_batches, raised
 from jimpact.progress import counting_bar
 from jimpact.scene import Scene, as_velocity, chain
-from jimpact.solvers.tridiagonal import as_matrix
 from jimpact.status import CODE
 
 
@@ -57,7 +55,7 @@ _AXES = {  # base: three equal Hertz balls; rtol 1e-8, time step 0.05, impulse s
 AXES = tuple(_AXES)
 OF_CHAINS = tuple(name for name in AXES if name != "friction")
 OF_SCENES = tuple(name for name in AXES if name not in ("mass_ratio", "balls"))
-# kind of setting (see `jimpact.methods.contenders.Method`): value at level 0 and at level 1
+# kind of setting (see `jimpact.methods.contenders.Contender`): value at level 0 and at level 1
 SETTINGS = {"rtol": (1e-2, 1e-12), "step": (3.0, 3e-3), "impulse step": (0.3, 3e-5)}
 
 CLASSES = (
@@ -117,7 +115,7 @@ class Confirmation(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class StabilityMap:
+class StabilityMap(Tabular):
     """The result of `stability_map`; `print` gives numbers of points.
 
     Attributes:
@@ -129,6 +127,7 @@ class StabilityMap:
         sampled: by method, a `Slice` over the samples.
         confirmation: of the reference, by an integrator that shares no code with it.
         max_steps: of every run.
+        left_out: why a method is missing: it raised.
     """
 
     methods: tuple[str, ...]
@@ -139,6 +138,9 @@ class StabilityMap:
     sampled: dict[str, Slice]
     confirmation: Confirmation
     max_steps: int
+    left_out: dict[str, str] = field(default_factory=dict)
+
+    picture = "stability_map"
 
     def counts(self, method: str) -> dict[str, int]:
         """Points of each class of a method, over all slices and samples."""
@@ -162,25 +164,26 @@ class StabilityMap:
         words = {"classes": CLASSES, "methods": by_method}
         return fields_as_data(self, "slices", "sampled") | as_data(words)
 
-    def __str__(self) -> str:
+    @property
+    def table(self) -> Table:
         """Points of each class, by method; docs/stability.md says why methods fail."""
         base = ", ".join(f"{name.replace('_', ' ')} {x:g}" for name, x in self.base.items())
-        checked = self.confirmation
-        counts = [[m, *(str(x or "") for x in self.counts(m).values())] for m in self.methods]
-        others = ""
+        checked, others = self.confirmation, ""
         if checked.confirmed < checked.tried:
             others = f"; v+ of the others differs by up to {checked.difference:.1g} of |v-|: scipy "
             others += "may end an impact too early (docs/stability.md)"
-        lines = [
+        head = [
             f"base: {base}; at most {self.max_steps:,} steps",
             f"reference: {checked.points} points at rtol {REFERENCE_RTOL:g}; of {checked.tried} "
             f"solved by scipy, too, {checked.confirmed} agree to {checked.within:g}{others}",
             f"right: error in v+ within {HONEST:g} rtol, or {FIXED_STEP_RIGHT:g} for fixed steps, "
             "of the largest |v-|",
             "",
-            *table(["method", *CLASSES], counts),
         ]
-        return "\n".join(lines)
+        counts = [Column(name, lambda count: str(count or "")) for name in CLASSES]
+        rows = [[name, *self.counts(name).values()] for name in self.methods]
+        notes = [f"{name} is left out: it {why}" for name, why in self.left_out.items()]
+        return Table([Column("method"), *counts], rows, head, notes)
 
 
 @full_precision
@@ -210,7 +213,7 @@ def stability_map(
     error), `does not end` (in `max_steps`), `not finite`, `unchecked` (no reference ends).
 
     Args:
-        methods: names in `jimpact.methods.contenders.METHODS` that JAX can batch, and 'default',
+        methods: names in `jimpact.methods.contenders.CONTENDERS` that JAX can batch, and 'default',
             what `impact` does; None: that, rk4, verlet and impulse_euler. With friction: those
             that have it.
         axes: values by name, of `setting` (0 coarse .. 1 fine), `stiffness_ratio` 1e-8..1e8,
@@ -245,9 +248,9 @@ def stability_map(
     samples, max_steps = as_whole("samples", samples, 0), as_whole("max_steps", max_steps, 1)
     if not jnp.zeros(()).dtype == jnp.float64:
         raise ValueError("A stability map needs double precision: enable jax_enable_x64.")
-    given = _given(scene, velocity)
-    names = _axes_of(given)
-    chosen = _methods(methods, given)
+    place = _checked_scene(scene, velocity)
+    names = _axes_of(place)
+    chosen = _methods(methods, place)
     lines = _axis_values(axes, as_whole("resolution", resolution, 2), names)
     start = {name: axis.base for name, axis in _AXES.items()}
     start |= {name: float(x) for name, x in _checked("base", base or {}, names).items()}
@@ -257,11 +260,16 @@ def stability_map(
     parts = [_slice_points(start, lines, names) for names in axis_sets]
     sampled = _sample_points(start, lines, samples, seed)
     points = np.concatenate([*(part.reshape(-1, len(AXES)) for part in parts), sampled])
-    runners = cache(partial(runner, max_steps, given))
+    runners = cache(partial(runner, max_steps, place))
     total = len(points) * (len(chosen) + 1)
     with counting_bar(total, "impacts", progress) as advance:
-        exact, confirmation = references(points, given, runners, advance)
-        results = {m.name: classes_of(m, points, given, exact, runners, advance) for m in chosen}
+        exact, confirmation = references(points, place, runners, advance)
+        results, left_out = {}, {}
+        for m in chosen:
+            try:
+                results[m.name] = classes_of(m, points, place, exact, runners, advance)
+            except Exception as error:  # a contender may fail in any way; the others stand
+                left_out[m.name] = raised(error)
     ends = np.cumsum([part[..., 0].size for part in parts])
     by_slice, by_sample = {}, {}
     for name, columns in results.items():
@@ -280,15 +288,15 @@ def stability_map(
         sampled=by_sample,
         confirmation=confirmation,
         max_steps=max_steps,
+        left_out=left_out,
     )
 
 
-class Given(NamedTuple):
-    """A scene in place of chains, its v- (n,) with 1 as the largest, and W (m, m)."""
+class OneScene(NamedTuple):
+    """A scene in place of chains, and its v- (n,) with 1 as the largest."""
 
     scene: Scene
     velocity: jax.Array
-    delassus: np.ndarray
 
     @property
     def friction(self) -> bool:
@@ -296,7 +304,7 @@ class Given(NamedTuple):
         return self.scene.tangents is not None
 
 
-def _given(scene: Scene | None, velocity: Any) -> Given | None:
+def _checked_scene(scene: Scene | None, velocity: Any) -> OneScene | None:
     """The scene with its velocity, checked; None for chains."""
     if scene is None:
         if velocity is not None:
@@ -308,30 +316,30 @@ def _given(scene: Scene | None, velocity: Any) -> Given | None:
     check_values("velocity", v)
     if not bool(LZB(1.0).contact(scene, v).happens):
         raise ValueError("Argument `velocity` must let a closed contact approach.")
-    w = np.asarray(as_matrix(delassus_matrix(scene)), float)
-    return Given(scene, v / jnp.max(jnp.abs(v)), w)
+    return OneScene(scene, v / jnp.max(jnp.abs(v)))
 
 
-def _axes_of(given: Given | None) -> tuple[str, ...]:
+def _axes_of(place: OneScene | None) -> tuple[str, ...]:
     """The axes of chains, or of a scene."""
-    if given is None:
+    if place is None:
         return OF_CHAINS
-    missing = set() if given.scene.contacts > 1 else {"stiffness_ratio"}
-    missing |= set() if given.friction else {"friction"}
+    missing = set() if place.scene.contacts > 1 else {"stiffness_ratio"}
+    missing |= set() if place.friction else {"friction"}
     return tuple(name for name in OF_SCENES if name not in missing)
 
 
-def _methods(names: Sequence[str] | None, given: Given | None) -> list[Method]:
-    """Methods by name, those to map by default."""
-    known = {"default": DEFAULT} | {name: m for name, m in METHODS.items() if m.jax}
+def _methods(methods: Sequence[str | Contender] | None, place: OneScene | None) -> list[Contender]:
+    """Contenders, those of these names, or those to map by default."""
+    known = {"default": DEFAULT} | {name: m for name, m in CONTENDERS.items() if m.jax}
     defaults: tuple[str, ...] = NAMES
-    if given is not None and given.friction:
+    if place is not None and place.friction:
         known = {name: m for name, m in known.items() if m.friction}
-        defaults = tuple(name for name in FRICTION_NAMES if name in known)
-    names = defaults if names is None else tuple(names)
-    for name in names or ("",):
-        check_choice("methods", name, known)
-    return [known[name] for name in names]
+        defaults = FRICTION_NAMES
+    chosen = defaults if methods is None else tuple(methods)
+    for each in chosen or ("",):
+        if not isinstance(each, Contender):
+            check_choice("methods", each, known)
+    return [each if isinstance(each, Contender) else known[each] for each in chosen]
 
 
 def _checked(argument: str, values: Mapping[str, Any], names: tuple[str, ...]) -> Mapping[str, Any]:
@@ -440,21 +448,21 @@ def stiffness_of(kappa: Any, contacts: int) -> jax.Array:
 
 
 def impact_at(
-    point: Any, balls: int, given: Given | None, max_steps: int
+    point: Any, balls: int, place: OneScene | None, max_steps: int
 ) -> tuple[LZB, Scene, jax.Array]:
     """Law, scene and v- of a point; the law's friction is None where there is none."""
     _, kappa, eta, e, mass_ratio, _, friction = point
-    if given is None:
+    if place is None:
         mass, stiffness = chain_of(kappa, mass_ratio, balls)
         v = jnp.zeros_like(mass).at[0].set(1.0)
         return LZB(e, stiffness, eta, max_steps=max_steps), chain(mass), v
-    mu = friction if given.friction else None
-    stiffness = stiffness_of(kappa, given.scene.contacts)
+    mu = friction if place.friction else None
+    stiffness = stiffness_of(kappa, place.scene.contacts)
     law = LZB(e, stiffness, eta, friction=mu, max_steps=max_steps)
-    return law, given.scene, given.velocity
+    return law, place.scene, place.velocity
 
 
-DEFAULT = METHODS["dop853"]._replace(name="default")
+DEFAULT = CONTENDERS["dop853"]._replace(name="default")
 
 
 class PointOutcomes(NamedTuple):
@@ -467,39 +475,33 @@ class PointOutcomes(NamedTuple):
 
 
 Runner = Callable[[np.ndarray, Any], PointOutcomes]  # of points (L, 7) and settings () or (L,)
-Runners = Callable[[Method, int], Runner]
+Runners = Callable[[Contender, int], Runner]
 
 
-def runner(max_steps: int, given: Given | None, method: Method, balls: int) -> Runner:
+def runner(max_steps: int, place: OneScene | None, method: Contender, balls: int) -> Runner:
     """A function of points (L, 7) and settings: one method on chains of N balls or a scene."""
 
     def one(point: jax.Array, setting: jax.Array) -> PointOutcomes:
         """The outcome at one point."""
-        law, scene, v = impact_at(point, balls, given, max_steps)
-        result = method.solve(law, scene, v, setting)
-        out = outcome(law, scene, v, result)
-        return PointOutcomes(
-            out.velocity, result.code, out.status, audit(scene, v, out).energy_gain
-        )
+        law, scene, v = impact_at(point, balls, place, max_steps)
+        solution = method.solve(law, scene, v, setting)
+        out, code = outcome(law, scene, v, solution), jnp.asarray(solution.code)
+        return PointOutcomes(out.velocity, code, out.status, audit(scene, v, out).energy_gain)
 
     batch = jax.jit(jax.vmap(one))
 
     def run(points: np.ndarray, settings: Any) -> PointOutcomes:
         """The outcomes at all points, a batch at a time."""
-        settings, parts = np.broadcast_to(settings, len(points)), []
-        for begin in range(0, len(points), BATCH):
-            rows = np.arange(begin, begin + BATCH).clip(max=len(points) - 1)  # the last repeats
-            out = batch(jnp.asarray(points[rows]), jnp.asarray(settings[rows]))
-            parts.append([np.asarray(x)[: len(points) - begin] for x in out])
-        return PointOutcomes(*(np.concatenate(column) for column in zip(*parts)))
+        rows = points, np.broadcast_to(settings, len(points))
+        return in_batches(lambda part: batch(*part), rows, BATCH)
 
     return run
 
 
-def _groups(points: np.ndarray, given: Given | None) -> Iterator[tuple[np.ndarray, int]]:
+def _groups(points: np.ndarray, place: OneScene | None) -> Iterator[tuple[np.ndarray, int]]:
     """Points (indices) of equal shapes, and how many velocities they have: the number of balls."""
-    if given is not None:
-        yield np.arange(len(points)), given.scene.size
+    if place is not None:
+        yield np.arange(len(points)), place.scene.size
         return
     balls = points[:, AXES.index("balls")]
     for n in np.unique(balls):
@@ -510,10 +512,10 @@ def _groups(points: np.ndarray, given: Given | None) -> Iterator[tuple[np.ndarra
 
 
 def references(
-    points: np.ndarray, given: Given | None, runners: Runners, advance: Callable[[int], None]
+    points: np.ndarray, place: OneScene | None, runners: Runners, advance: Callable[[int], None]
 ) -> tuple[np.ndarray, Confirmation]:
     """v+ of each point (P, largest n), NaN where no run ends; how many scipy confirms."""
-    groups = list(_groups(points, given))
+    groups = list(_groups(points, place))
     exact = np.full((len(points), max((n for _, n in groups), default=0)), np.nan)
     for at, n in groups:
         unique, back = np.unique(points[at, 1:], axis=0, return_inverse=True)
@@ -522,39 +524,43 @@ def references(
         ended = (out.code == CODE["ok"]) | (out.code == CODE["plastic_limit"])
         exact[at, :n] = np.where(ended[:, None], out.velocity, np.nan)[np.ravel(back)]
         advance(len(at))
-    return exact, _confirm(points, given, exact)
+    return exact, _confirm(points, place, exact)
 
 
-def _confirm(points: np.ndarray, given: Given | None, exact: np.ndarray) -> Confirmation:
+def _confirm(points: np.ndarray, place: OneScene | None, exact: np.ndarray) -> Confirmation:
     """Differences from scipy's integrator at points spread over those that it solves quickly."""
-    quick = np.array([_is_quick(point, given) for point in points])
+    quick = np.array([_is_quick(point, place) for point in points])
     candidates = np.flatnonzero(np.isfinite(exact[:, 0]) & quick)
     _, first = np.unique(points[candidates, 1:], axis=0, return_index=True)
     candidates = candidates[np.sort(first)]
     stride = max(1, -(-len(candidates) // CHECKED))
-    differences = np.array([_from_scipy(points[i], given, exact[i]) for i in candidates[::stride]])
+    differences = np.array([_from_scipy(points[i], place, exact[i]) for i in candidates[::stride]])
     largest = float(differences.max(initial=0.0)) if len(differences) else float("nan")
-    within = FRICTION_CONFIRMED if given is not None and given.friction else CONFIRMED
+    within = FRICTION_CONFIRMED if place is not None and place.friction else CONFIRMED
     agree = int((differences <= within).sum())
     return Confirmation(len(points), len(differences), agree, largest, within)
 
 
-def _is_quick(point: np.ndarray, given: Given | None) -> bool:
-    """Whether scipy solves the point soon, and does not end it too early (small e)."""
-    highest, ratio = frequencies(point, given)
-    separates = point[AXES.index("restitution")] >= RECLOSING
-    balls = point[AXES.index("balls")] if given is None else given.scene.contacts
-    return bool(separates and balls <= QUICK_BALLS and highest * ratio < QUICK_RATIO)
+def _is_quick(point: np.ndarray, place: OneScene | None) -> bool:
+    """Whether scipy solves the point soon, and does not end it too early (small e).
+
+    By the largest frequency of the linearized flow, at most `sqrt(2) eta / e` of the fastest
+    contact's, times the ratio of that to the slowest contact's.
+    """
+    _, kappa, eta, e, mass_ratio, balls, _ = map(float, point)
+    spread = max(kappa, 1 / kappa) ** (1 / (eta + 1)) * max(mass_ratio, 1 / mass_ratio) ** 0.5
+    few = (balls if place is None else place.scene.contacts) <= QUICK_BALLS
+    return few and e >= RECLOSING and np.sqrt(2) * eta / e * spread < QUICK_RATIO
 
 
-def _from_scipy(point: np.ndarray, given: Given | None, exact: np.ndarray) -> float:
+def _from_scipy(point: np.ndarray, place: OneScene | None, exact: np.ndarray) -> float:
     """Largest difference of v+ from what scipy gives."""
     balls = int(point[AXES.index("balls")])
-    law, scene, v = impact_at(list(map(float, point)), balls, given, CHECK_STEPS)
+    law, scene, v = impact_at(list(map(float, point)), balls, place, CHECK_STEPS)
     name, rtol = "scipy_dop853", CHECK_RTOL
     if law.friction is not None:
         name, rtol = "scipy_radau", FRICTION_RTOL
-    result = METHODS[name].solve(law, scene, v, rtol)
+    result = CONTENDERS[name].solve(law, scene, v, rtol)
     return float(np.abs(outcome(law, scene, v, result).velocity - exact[: len(v)]).max())
 
 
@@ -562,9 +568,9 @@ def _from_scipy(point: np.ndarray, given: Given | None, exact: np.ndarray) -> fl
 
 
 def classes_of(
-    method: Method,
+    method: Contender,
     points: np.ndarray,
-    given: Given | None,
+    place: OneScene | None,
     exact: np.ndarray,
     runners: Runners,
     advance: Callable[[int], None],
@@ -577,7 +583,7 @@ def classes_of(
     if method.setting == "rtol":
         allowed = HONEST * setting
     e = points[:, AXES.index("restitution")]
-    for group, n in _groups(points, given):
+    for group, n in _groups(points, place):
         run = runners(method, n)
 
         at = group[e[group] > 0] if method.divides else group
@@ -607,32 +613,3 @@ def _classified(out: PointOutcomes, error: np.ndarray, allowed: np.ndarray) -> n
         WRONG: np.isfinite(error),
     }
     return np.select(list(cases.values()), list(cases), UNCHECKED)
-
-
-def frequencies(point: np.ndarray, given: Given | None = None) -> tuple[float, float]:
-    """`sqrt(lambda_max)` of the linearized flow in units of the fastest contact, and the ratio of
-    the fastest contact's frequency to the slowest's.
-
-    lambda: eigenvalues of `omega G omega eta (eta + 1) / (2 e^2)`, the slope of the force at x = 1.
-
-    >>> import numpy as np
-    >>> from jimpact.methods.stability import frequencies
-    >>> [round(x, 3) for x in frequencies(np.array([0.5, 1.0, 1.0, 1.0, 1.0, 2, 0]))]
-    [1.0, 1.0]
-    """
-    _, kappa, eta, e, mu, balls, _ = map(float, point)
-    if given is None:
-        mass, k = (np.asarray(x, float) for x in chain_of(kappa, mu, int(balls)))
-        delassus = np.diag(1 / mass[:-1] + 1 / mass[1:])
-        delassus -= np.diag(1 / mass[1:-1], 1) + np.diag(1 / mass[1:-1], -1)
-    else:
-        k, delassus = np.asarray(stiffness_of(kappa, given.scene.contacts)), given.delassus
-    w = np.diag(delassus)
-    # 1 / t_ref at the largest normalized speed, up to a common factor
-    omega = k ** (1 / (eta + 1)) * np.sqrt(w)
-    ratio = omega.max() / omega.min()
-    omega = omega / omega.max()
-    g = delassus / np.sqrt(w[:, None] * w[None, :])
-    largest = np.linalg.eigvalsh(omega[:, None] * g * omega[None, :])[-1]
-    fastest = float(np.sqrt(largest * eta * (eta + 1) / 2) / e) if e else np.inf
-    return fastest, float(ratio)

@@ -1,5 +1,6 @@
 """Validity map: for which stiffness ratios Moreau's law, or binary collisions, are right."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from jimpact._checks import as_axis, as_float_array, check_choice, check_per_contact, check_values
 from jimpact.compiling import precise_jit
-from jimpact.files.records import fields_as_data, table
+from jimpact.files.records import Column, Table, Tabular, fields_as_data
 from jimpact.impacts import impact
 from jimpact.law import Law
 from jimpact.laws.binary import Binary
@@ -23,7 +24,7 @@ RATIOS = (1e-3, 1e3, 121)  # default ratios: from, to, how many
 
 
 @dataclass(frozen=True)
-class ValidityMap:
+class ValidityMap(Tabular):
     """Outcomes of LZB over exponents (x,) and stiffness ratios (r,), next to laws without them.
 
     `scene` and v- `before` (n,) [m/s] as passed; `velocity` (x, r, n) [m/s], `dispersion` and
@@ -40,6 +41,8 @@ class ValidityMap:
     status: np.ndarray
     laws: dict[str, np.ndarray]
     law_dispersion: dict[str, float]
+
+    picture = "validity_map"
 
     def error(self, law: str) -> np.ndarray:
         """Error of v+ of a law, 'moreau' or 'binary', against LZB (x, r), relative to max |v-|."""
@@ -64,17 +67,20 @@ class ValidityMap:
         status = [[STATUS[code].name for code in row] for row in self.status]
         return fields_as_data(self, "scene") | {"status": status}
 
-    def __str__(self) -> str:
+    @property
+    def table(self) -> Table:
         """Where each law is within 1 %, by exponent."""
+        columns = (
+            Column("exponent", ".3g"),
+            Column("binary_up_to", _range("<="), "binary within 1 %"),
+            Column("moreau_from", _range(">="), "Moreau within 1 %"),
+        )
+        return Table(columns, [*zip(self.exponents, self.limit("binary"), self.limit("moreau"))])
 
-        def ends(law: str, sign: str) -> list[str]:
-            """The ends of its ranges."""
-            return ["nowhere" if np.isnan(x) else f"ratio {sign} {x:.3g}" for x in self.limit(law)]
 
-        exponents = [f"{eta:.3g}" for eta in self.exponents]
-        heads = ["exponent", "binary within 1 %", "Moreau within 1 %"]
-        rows = zip(exponents, ends("binary", "<="), ends("moreau", ">="))
-        return "\n".join(table(heads, rows, left=heads))
+def _range(sign: str) -> Callable[[Any], str]:
+    """The ratios that a law is right for, in words."""
+    return lambda ratio: "nowhere" if np.isnan(ratio) else f"ratio {sign} {ratio:.3g}"
 
 
 def validity_map(

@@ -11,7 +11,7 @@ from jimpact._checks import check_values, is_traced
 from jimpact.contact import delassus_matrix
 from jimpact.files.records import readable_unit
 from jimpact.law import Law, check_law
-from jimpact.montecarlo.planning import DELTA_C
+from jimpact.montecarlo.result import DELTA_C
 from jimpact.scene import Scene, as_velocity, gap_velocity
 from jimpact.solvers.tridiagonal import diagonal
 

@@ -1,7 +1,13 @@
-"""Statistics in float64 on the host: mean and covariance, histograms, what a chunk reduces to."""
+"""Statistics in float64 on the host: what a chunk of samples reduces to, and how chunks are joined.
 
-import dataclasses
-from dataclasses import dataclass, field
+A chunk is a mapping of arrays, as its file holds them: `number`, `count` of its samples, `statuses`
+(how many ended with each code), `used` of them that did not fail with their `mean` and `products`
+of deviations over the velocities after (n) and the random gaps (m), `low` and `high` (n,), `ends`
+(n, 2) and `counts` (n, bins + 2) of histograms; `bad.*`: numbers, codes, gaps and velocities of the
+first failed samples; `raw.*`: all samples, or the first few (`IN_MEMORY`) of a run, or none.
+"""
+
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,8 +27,24 @@ OUTCOMES = (
 )
 BAD_GAP, BAD_VELOCITY, BAD_LAW = range(len(STATUS), len(OUTCOMES))
 FAILURE = np.array([row.failure for row in OUTCOMES])
-_SAMPLE_FIELDS = ("gaps", "velocity_before", "velocity", "status")
-_PLAIN = ("number", "count", "statuses", "low", "high", "ends", "counts")
+
+Chunk = dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a chunk needs besides the plan: its number, how many samples count, bins, given rows."""
+
+    number: int
+    count: int
+    ends: np.ndarray | None  # (n, 2) of the histograms; None: from this chunk
+    rows: dict[str, np.ndarray]
+
+
+def part(chunk: Chunk, prefix: str) -> Chunk:
+    """The arrays whose names begin with `prefix.`, without it."""
+    start = f"{prefix}."
+    return {k.removeprefix(start): v for k, v in chunk.items() if k.startswith(start)}
 
 
 @dataclass(frozen=True)
@@ -51,9 +73,7 @@ def moments(values: np.ndarray) -> Moments:
     """
     values = np.ascontiguousarray(values, dtype=np.float64)
     count = values.shape[1]
-    if count == 0:
-        return Moments(0, np.zeros(len(values)), np.zeros((len(values),) * 2))
-    mean = values.sum(axis=1) / count  # along contiguous rows: pairwise
+    mean = values.sum(axis=1) / max(count, 1)  # along contiguous rows: pairwise
     deviation = values - mean[:, None]
     # not BLAS: its summation order depends on the number of threads
     return Moments(count, mean, np.einsum("ik,jk->ij", deviation, deviation))
@@ -84,10 +104,9 @@ def merged(a: Moments, b: Moments) -> Moments:
 def bin_range(values: np.ndarray) -> np.ndarray:
     """Low and high ends (d, 2) for the bins of `values` (d, count), with a margin."""
     low, high = values.min(axis=1).astype(float), values.max(axis=1).astype(float)
-    margin = MARGIN * (high - low)
     size = np.maximum(np.abs(low), np.abs(high))
     flat = FLAT * np.where(size > 0, size, 1.0)
-    margin = np.maximum(margin, flat)  # also where the range is rounding
+    margin = np.maximum(MARGIN * (high - low), flat)  # also where the range is rounding
     return np.stack([low - margin, high + margin], axis=1)
 
 
@@ -99,12 +118,10 @@ def bin_counts(values: np.ndarray, ends: np.ndarray, bins: int) -> np.ndarray:
     >>> bin_counts(np.array([[-1.0, 0.1, 0.6, 0.7, 1.0]]), np.array([[0.0, 1.0]]), 2).tolist()
     [[1, 1, 2, 1]]
     """
-    counts = np.empty((len(values), bins + 2), np.int64)
-    for row, (low, high), count in zip(values, ends, counts):
-        place = np.floor((np.asarray(row, float) - low) * (bins / (high - low)))
-        place = np.clip(place, -1, bins).astype(np.int64) + 1
-        count[:] = np.bincount(place, minlength=bins + 2)
-    return counts
+    low, high = ends[:, :1], ends[:, 1:]
+    place = np.floor((values.astype(float) - low) * (bins / (high - low)))
+    place = np.clip(place, -1, bins).astype(np.int64) + 1
+    return np.array([np.bincount(row, minlength=bins + 2) for row in place])
 
 
 def bin_edges(ends: np.ndarray, bins: int) -> np.ndarray:
@@ -137,128 +154,59 @@ def binned_quantiles(
     return np.clip(np.stack(quantiles, axis=-1), low, high)
 
 
-@dataclass(frozen=True)
-class Task:
-    """What a chunk needs besides the plan: its number, how many samples count, bins, given rows."""
-
-    number: int
-    count: int
-    ends: np.ndarray | None  # (n, 2) of the histograms; None: from this chunk
-    rows: dict[str, np.ndarray] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Chunk:
-    """Statistics of one chunk; `values` are the velocities after (n), then the random gaps (m).
-
-    Attributes:
-        statuses: how many samples ended with each code.
-        moments: of the samples that did not fail.
-        low, high: smallest and largest velocities (n,); inf, -inf without any.
-        ends, counts: histogram ranges (n, 2) and counts (n, bins + 2).
-        bad: numbers, codes, gaps and velocities before of the first failed samples.
-        samples: all samples, or the first few (`IN_MEMORY`), or none.
-    """
-
-    number: int
-    count: int
-    statuses: np.ndarray
-    moments: Moments
-    low: np.ndarray
-    high: np.ndarray
-    ends: np.ndarray
-    counts: np.ndarray
-    bad: dict[str, np.ndarray]
-    samples: dict[str, np.ndarray]
-
-    def without_samples(self) -> "Chunk":
-        """Without raw samples but the few first ones of a run."""
-        first = self.samples if self.number == 0 else {}
-        samples = {name: values[:IN_MEMORY].copy() for name, values in first.items()}
-        return dataclasses.replace(self, samples=samples)
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """Everything as named arrays, for a file."""
-        plain = {name: np.asarray(getattr(self, name)) for name in _PLAIN}
-        parts = {f"moments.{k}": np.asarray(v) for k, v in vars(self.moments).items()}
-        bad = {f"bad.{k}": v for k, v in self.bad.items()}
-        return plain | parts | bad | {f"samples.{k}": v for k, v in self.samples.items()}
+def reduced(task: Task, samples: Chunk, bins: int, keep_samples: bool) -> Chunk:
+    """The statistics of the first `task.count` samples of a chunk."""
+    status, n, count = samples["status"], samples["velocity"].shape[1], task.count
+    fine = ~FAILURE[status]
+    values = np.concatenate([samples["velocity"].T, samples["gaps"].T]).astype(np.float64)
+    ends = task.ends
+    if ends is None:  # the first chunk sets the histograms
+        if not fine.any():
+            counts = ", ".join(f"{k} {name}" for name, k in named(np.bincount(status)).items())
+            raise RuntimeError(
+                f"None of the first {len(status)} samples gave a usable outcome: {counts}."
+            )
+        ends = bin_range(values[:n, fine])
+    used = values[:, :count][:, fine[:count]]
+    lanes = np.flatnonzero(~fine[:count])[:LISTED]
+    raw = count if keep_samples else min(count, IN_MEMORY) if task.number == 0 else 0
+    whole = moments(used)
+    return {
+        "number": np.array(task.number),
+        "count": np.array(count),
+        "statuses": np.bincount(status[:count], minlength=len(FAILURE)),
+        "used": np.array(whole.count),
+        "mean": whole.mean,
+        "products": whole.products,
+        "low": used[:n].min(axis=1, initial=np.inf),
+        "high": used[:n].max(axis=1, initial=-np.inf),
+        "ends": ends,
+        "counts": bin_counts(used[:n], ends, bins),
+        "bad.index": task.number * len(status) + lanes,
+        **{f"bad.{name}": values[lanes] for name, values in samples.items()},
+        **({f"raw.{name}": values[:raw].copy() for name, values in samples.items()} if raw else {}),
+    }
 
 
-def chunk_from(arrays: dict[str, np.ndarray]) -> Chunk:
-    """The inverse of `Chunk.arrays`."""
-
-    def part(prefix: str) -> dict[str, np.ndarray]:
-        """The arrays whose names begin with `prefix.`, without it."""
-        start = f"{prefix}."
-        return {k.removeprefix(start): v for k, v in arrays.items() if k.startswith(start)}
-
-    plain: dict[str, Any] = {name: arrays[name] for name in _PLAIN}
-    plain |= {name: int(plain[name]) for name in ("number", "count")}
-    m = part("moments")
-    whole = Moments(int(m["count"]), m["mean"], m["products"])
-    return Chunk(**plain, moments=whole, bad=part("bad"), samples=part("samples"))
+def moments_of(chunk: Chunk) -> Moments:
+    """The moments of a chunk."""
+    return Moments(int(chunk["used"]), chunk["mean"], chunk["products"])
 
 
 def joined(before: Chunk, chunk: Chunk) -> Chunk:
     """The statistics of all chunks before and of the next one, with the first ones' samples."""
-    assert chunk.number == before.number + 1  # floating-point sums depend on the order
-    bad = {k: np.concatenate([v, chunk.bad[k]])[:LISTED] for k, v in before.bad.items()}
-    return Chunk(
-        number=chunk.number,
-        count=before.count + chunk.count,
-        statuses=before.statuses + chunk.statuses,
-        moments=merged(before.moments, chunk.moments),
-        low=np.minimum(before.low, chunk.low),
-        high=np.maximum(before.high, chunk.high),
-        ends=before.ends,
-        counts=before.counts + chunk.counts,
-        bad=bad,
-        samples=before.samples,
+    assert chunk["number"] == before["number"] + 1  # floating-point sums depend on the order
+    whole = merged(moments_of(before), moments_of(chunk))
+    sums = {name: before[name] + chunk[name] for name in ("count", "statuses", "counts")}
+    bad = {k: np.concatenate([v, chunk[k]])[:LISTED] for k, v in before.items() if k[:4] == "bad."}
+    return (
+        before
+        | sums
+        | bad
+        | {"used": np.array(whole.count), "mean": whole.mean, "products": whole.products}
+        | {"low": np.minimum(before["low"], chunk["low"]), "number": chunk["number"]}
+        | {"high": np.maximum(before["high"], chunk["high"])}
     )
-
-
-def reduced(task: Task, samples: dict[str, np.ndarray], bins: int, keep_samples: bool) -> Chunk:
-    """The statistics of the first `task.count` samples of a chunk."""
-    failed = FAILURE[samples["status"]]
-    whole = np.concatenate([samples["velocity"].T, samples["gaps"].T]).astype(np.float64)
-    n = samples["velocity"].shape[1]
-    ends = task.ends
-    if ends is None:
-        ends = _first_ends(whole[:n, ~failed], samples["status"])
-    count = task.count
-    failed = failed[:count]
-    used = whole[:, :count] if not failed.any() else whole[:, :count][:, ~failed]
-    velocity = used[:n]
-    lanes = np.flatnonzero(failed)[:LISTED]
-    bad = {"index": task.number * len(samples["status"]) + lanes}
-    bad |= {name: samples[name][lanes] for name in _SAMPLE_FIELDS}
-    if keep_samples:
-        raw = count
-    else:
-        raw = min(count, IN_MEMORY) if task.number == 0 else 0
-    return Chunk(
-        number=task.number,
-        count=count,
-        statuses=np.bincount(samples["status"][:count], minlength=len(FAILURE)),
-        moments=moments(used),
-        low=velocity.min(axis=1, initial=np.inf),
-        high=velocity.max(axis=1, initial=-np.inf),
-        ends=ends,
-        counts=bin_counts(velocity, ends, bins),
-        bad=bad,
-        samples={k: v[:raw].copy() for k, v in samples.items()} if raw else {},
-    )
-
-
-def _first_ends(velocity: np.ndarray, status: np.ndarray) -> np.ndarray:
-    """Histogram ranges from the first chunk; an error where none of its samples is usable."""
-    if velocity.shape[1] == 0:
-        counts = ", ".join(f"{count} {name}" for name, count in named(np.bincount(status)).items())
-        raise RuntimeError(
-            f"None of the first {len(status)} samples gave a usable outcome: {counts}."
-        )
-    return bin_range(velocity)
 
 
 def named(counts: np.ndarray) -> dict[str, int]:

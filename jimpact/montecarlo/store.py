@@ -1,7 +1,7 @@
 """The folder of a run: one file a chunk, written whole or not at all, and a manifest of hashes.
 
-`manifest.json` names what the run is (a hash of each thing that determines its result); every
-`chunk-0000012.npz` carries that hash and a checksum of its own content.
+`manifest.json` names what the run is, by a hash of each thing that determines its result; every
+`chunk-0000012.npz` carries the hash of these, and numpy's zip files a checksum of each array.
 """
 
 import dataclasses
@@ -21,9 +21,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from jimpact.montecarlo.statistics import Chunk, chunk_from
+from jimpact.montecarlo.statistics import Chunk, part
 
-FORMAT = 1  # version of the files of a run
 MANIFEST = "manifest.json"
 
 
@@ -38,8 +37,8 @@ def fingerprint(value: Any) -> str:
     True
     """
     digest = hashlib.sha256()
-    for part in _parts(value, ()):
-        digest.update(len(part).to_bytes(8, "little") + part)
+    for each in _parts(value, ()):
+        digest.update(len(each).to_bytes(8, "little") + each)
     return digest.hexdigest()
 
 
@@ -50,15 +49,17 @@ def _parts(value: Any, inside: tuple[int, ...]) -> Iterator[bytes]:
         yield b"itself"
     elif isinstance(value, jax.Array | np.ndarray | np.generic):
         array = np.asarray(value)
-        yield f"{array.dtype} {array.shape}".encode()
-        yield np.ascontiguousarray(array).tobytes()
+        yield f"{array.dtype} {array.shape}".encode() + np.ascontiguousarray(array).tobytes()
+    elif (content := _content(value)) is not None:
+        for each in content:
+            yield from _parts(each, (*inside, id(value)))
     elif value is None or isinstance(value, str | bytes | int | float | complex):
         yield repr(value).encode()
-    elif (content := _content(value)) is not None:
-        for part in content:
-            yield from _parts(part, (*inside, id(value)))
     else:
-        yield _pickled(value)
+        try:
+            yield pickle.dumps(value, protocol=4)
+        except Exception:  # objects refuse to be pickled in many ways
+            yield _name(value).encode()
 
 
 def _content(value: Any) -> Iterable[Any] | None:
@@ -93,14 +94,6 @@ def _source(function: Any) -> Any:
         return code.co_code, code.co_names, constants
 
 
-def _pickled(value: Any) -> bytes:
-    """Bytes of a value of unknown parts; its name where it cannot be pickled."""
-    try:
-        return pickle.dumps(value, protocol=4)
-    except Exception:
-        return _name(value).encode()
-
-
 def _name(value: Any) -> str:
     """Module and qualified name."""
     return f"{getattr(value, '__module__', '')}.{getattr(value, '__qualname__', type(value))}"
@@ -116,19 +109,24 @@ class Store:
 
     def __init__(self, folder: str | Path, identity: dict[str, str]):
         """Open the folder of the run that has this identity, or begin it."""
-        self.folder = Path(folder)
-        self.run = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
+        self.folder, self.run = Path(folder), _run(identity)
         self.folder.mkdir(parents=True, exist_ok=True)
         manifest = self.folder / MANIFEST
         if not any(self.folder.glob("chunk-*.npz")):  # nothing of any run is lost
-            content = {"format": FORMAT, "run": self.run, "identity": identity}
-            _write(manifest, json.dumps(content, indent=2).encode())
-        elif manifest.exists():
-            _check_same(manifest, identity)
-        else:
+            _write(manifest, json.dumps(identity, indent=2).encode())
+            return
+        if not manifest.exists():
             raise ValueError(
-                f"Folder '{self.folder}' has chunks but no {MANIFEST}, so the run that they belong "
+                f"Folder '{folder}' has chunks but no {MANIFEST}, so the run that they belong "
                 "to is unknown: give another folder, or delete them."
+            )
+        other = _identity(self.folder)
+        names = sorted(identity.keys() | other.keys())
+        differ = [name for name in names if identity.get(name) != other.get(name)]
+        if differ:
+            raise ValueError(
+                f"Folder '{folder}' holds another run, which differs in {', '.join(differ)}: "
+                "give another folder (or repeat that run's arguments to continue it)."
             )
 
     def path(self, number: int) -> Path:
@@ -137,12 +135,9 @@ class Store:
 
     def write(self, chunk: Chunk) -> None:
         """Store a chunk."""
-        arrays = chunk.arrays()
-        checksum = np.frombuffer(_checksum(arrays, self.run), np.uint8)
         buffer = io.BytesIO()
-        labels: dict[str, Any] = {"run": np.array(self.run), "checksum": checksum}
-        np.savez(buffer, **labels, **arrays)  # type: ignore[arg-type]
-        _write(self.path(chunk.number), buffer.getvalue())
+        np.savez(buffer, run=np.array(self.run), **chunk)  # type: ignore[arg-type]
+        _write(self.path(int(chunk["number"])), buffer.getvalue())
 
     def read(self, number: int, count: int, all_samples: bool) -> Chunk | None:
         """A chunk with `count` samples; None where there is none, or only an unusable one."""
@@ -150,19 +145,18 @@ class Store:
         if not path.exists():
             return None
         try:
-            arrays = _checked(path, self.run)
-            if int(arrays["number"]) != number:
-                raise ValueError(f"it is chunk {int(arrays['number'])} of this run")
+            chunk = _checked(path, self.run)
+            if chunk["number"] != number:
+                raise ValueError(f"it is chunk {chunk['number']} of this run")
         except Exception as error:  # zip, zlib, numpy: a damaged file makes all of them complain
             text = str(error) or type(error).__name__
             warnings.warn(
                 f"'{path}' is not used, its samples are computed again: {text}.", stacklevel=2
             )
             return None
-        chunk = chunk_from(arrays)
-        complete = chunk.count == count
+        complete = chunk["count"] == count
         if all_samples:
-            complete = complete and len(chunk.samples.get("status", ())) == count
+            complete = complete and len(chunk.get("raw.status", ())) == count
         return chunk if complete else None
 
 
@@ -188,64 +182,45 @@ def read_samples(folder: str | Path) -> Iterator[dict[str, np.ndarray]]:
     ...     [part["velocity"].shape for part in ji.read_samples(folder)]
     [(20, 2), (10, 2)]
     """
-    folder = Path(folder)
-    run = _manifest(folder / MANIFEST)["run"]
-    for path in sorted(folder.glob("chunk-*.npz")):
+    run = _run(_identity(Path(folder)))
+    for path in sorted(Path(folder).glob("chunk-*.npz")):
         try:
-            chunk = chunk_from(_checked(path, run))
+            chunk = _checked(path, run)
         except Exception as error:
             raise ValueError(f"'{path}' cannot be used: {error}.") from None
-        if len(chunk.samples.get("status", ())) != chunk.count:
+        samples = part(chunk, "raw")
+        if len(samples.get("status", ())) != chunk["count"]:
             raise ValueError(f"'{path}' has no raw samples: run with keep_samples=True.")
-        yield chunk.samples
+        yield samples
 
 
-def _checked(path: Path, run: str) -> dict[str, np.ndarray]:
-    """The arrays of a chunk file of this run."""
+def _checked(path: Path, run: str) -> Chunk:
+    """The arrays of a chunk file of this run; zip checks the sums of their bytes."""
     with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
         arrays = {name: file[name] for name in file.files}
-    owner, checksum = str(arrays.pop("run")), arrays.pop("checksum").tobytes()
+    owner = str(arrays.pop("run"))
     if owner != run:
         raise ValueError(f"it belongs to another run ({owner[:12]}, not {run[:12]})")
-    if checksum != _checksum(arrays, run):
-        raise ValueError("its content does not match its checksum")
     return arrays
 
 
-def _checksum(arrays: dict[str, np.ndarray], run: str) -> bytes:
-    """SHA-256 of all arrays, of this run."""
-    digest = hashlib.sha256(run.encode())
-    for name in sorted(arrays):
-        array = np.ascontiguousarray(arrays[name])
-        digest.update(f"{name} {array.dtype} {arrays[name].shape} ".encode())
-        digest.update(array.tobytes())
-    return digest.digest()
+def _run(identity: dict[str, str]) -> str:
+    """The hash of a run's identity."""
+    return hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
 
 
-def _manifest(path: Path) -> dict[str, Any]:
+def _identity(folder: Path) -> dict[str, str]:
     """The content of a manifest, or a ValueError."""
+    path = folder / MANIFEST
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        if content["format"] != FORMAT or not isinstance(content["identity"], dict):
-            raise ValueError(f"format {content['format']}")
-    except (ValueError, KeyError, TypeError) as error:
+        if not isinstance(content, dict):
+            raise ValueError("it is no mapping")
+    except ValueError as error:
         raise ValueError(
-            f"'{path}' is damaged or of another version ({error}): give another folder, or delete "
-            "this one."
+            f"'{path}' is damaged ({error}): give another folder, or delete this one."
         ) from None
     return content
-
-
-def _check_same(path: Path, identity: dict[str, str]) -> None:
-    """Raise where the manifest is of another run."""
-    other = _manifest(path)["identity"]
-    names = sorted(identity.keys() | other.keys())
-    differ = [name for name in names if identity.get(name) != other.get(name)]
-    if differ:
-        raise ValueError(
-            f"Folder '{path.parent}' holds another run, which differs in {', '.join(differ)}: "
-            "give another folder (or repeat that run's arguments to continue it)."
-        )
 
 
 def _write(path: Path, content: bytes) -> None:

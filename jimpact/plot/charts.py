@@ -18,6 +18,7 @@ from jimpact.plot.style import (
     COLOURS,
     COLUMNS,
     GREY,
+    HIGHLIGHT,
     SMALL,
     finish,
     heading,
@@ -429,13 +430,19 @@ def advice(result: Advice, title: str = "") -> Figure:
         range_ = np.array([[c.low[i], c.high[i]] for c in rows])
         top.vlines(x + dodge[i], range_[:, 0], range_[:, 1], color=colour, lw=4, alpha=0.4)
         top.plot(x + dodge[i], v, "o", color=colour, label=f"{what} {i + 1}")
-    worst = np.maximum([c.worst for c in rows], _FLOOR)
-    colours = [COLOURS[2] if name == result.name else GREY for name in names]
-    bottom.bar(x, worst, 0.5, color=colours, label="worst")
-    bottom.plot(x, np.maximum([c.median for c in rows], _FLOOR), "k_", ms=18, label="median")
+    chosen = names.index(result.name)
+    for axes, label in ((top, None), (bottom, "advised")):
+        axes.axvspan(chosen - 0.5, chosen + 0.5, color=HIGHLIGHT, lw=0, label=label)
+    lowest = result.tolerance / 1000
+    worst, median = (
+        np.maximum(errors, lowest) for errors in ([c.worst for c in rows], [c.median for c in rows])
+    )
+    bottom.vlines(x, median, worst, color=GREY, lw=1)
+    bottom.plot(x, worst, "s", color="black", label="worst")
+    bottom.plot(x, median, "_", color="black", ms=14, label="median")
     bottom.axhline(result.tolerance, color=COLOURS[1], lw=1, label="tolerance")
     bottom.set_yscale("log")
-    bottom.set_ylim(result.tolerance / 1000, 30)  # space above for the legend
+    bottom.set_ylim(lowest / 2, 10)
     logarithmic(bottom, "y")
     bottom.set_ylabel("error of v+ (energy norm)")
     top.set_ylabel(f"velocity after the impact [{unit}]")

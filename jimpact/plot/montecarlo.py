@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from jimpact._checks import check_kind
 from jimpact.files.records import readable_unit
-from jimpact.montecarlo.results import MonteCarlo
+from jimpact.montecarlo.result import MonteCarlo
 from jimpact.montecarlo.statistics import FAILURE
 from jimpact.plot.style import COLOURS, SMALL, finish, heading, new_figure
 

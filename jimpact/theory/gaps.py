@@ -12,7 +12,7 @@ from jimpact._checks import as_float_array, check_shape, check_values
 from jimpact.impacts import impact
 from jimpact.law import Law
 from jimpact.montecarlo.gaps import gap_scale
-from jimpact.montecarlo.results import MonteCarlo
+from jimpact.montecarlo.result import MonteCarlo
 from jimpact.scene import Scene, with_gaps
 from jimpact.status import STATUS
 

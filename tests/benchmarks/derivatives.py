@@ -28,7 +28,7 @@ from three_balls import SCENE, V, law_of, one_impact, problem, steps
 
 import jimpact as ji
 from jimpact import velocity_change
-from jimpact.methods.contenders.schemes import DOP853_ALIGNED
+from jimpact.methods.schemes import aligned
 
 BATCH, REPEATS = 4096, 7
 POINTS = 16  # single impacts, one after the other
@@ -93,7 +93,7 @@ def single(points, repeats, settings):
         return jax.jit(jax.value_and_grad(loss, argnums=(0, 1)))
 
     def at_any_rtol(k, e, rtol):
-        result = DOP853_ALIGNED.solve(law_of(k, e), SCENE, V, rtol)
+        result = aligned(law_of(k, e), SCENE, V, rtol)
         return (V + velocity_change(SCENE, result.impulse)) @ weight
 
     k, e = jnp.asarray(stiffness), jnp.asarray(restitution)

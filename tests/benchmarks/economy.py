@@ -14,7 +14,7 @@ from harness import alternating, arguments, quartiles, save_figure, show, stage,
 import jax  # isort: skip
 import jax.numpy as jnp
 import numpy as np
-from three_balls import DOP853, DOP853_ALIGNED
+from three_balls import DOP853, aligned
 
 import jimpact as ji
 from jimpact.events import impact_dynamics
@@ -147,7 +147,7 @@ def passes(batch):
 
     def count(k):
         law = ji.LZB(E, k, 1.5)
-        evaluations = DOP853_ALIGNED.solve(law, ji.chain(jnp.ones(3)), struck(3), 1e-8).evaluations
+        evaluations = aligned(law, ji.chain(jnp.ones(3)), struck(3), 1e-8).evaluations
         return evaluations / len(DOP853.c)
 
     each = jax.vmap(count)

@@ -17,7 +17,7 @@ import numpy as np
 
 import jimpact as ji
 from jimpact.events.tableaux import DOP853
-from jimpact.methods.contenders.schemes import DOP853_ALIGNED
+from jimpact.methods.schemes import aligned
 
 LENGTHS = (10, 30, 100, 300, 1000)
 RESTITUTIONS = (1.0, 0.9)
@@ -54,7 +54,7 @@ def counted(n):
 
     def passes(e):
         law = ji.LZB(e, 1.0, 1.5, rtol=RTOL)
-        return DOP853_ALIGNED.solve(law, scene, v, RTOL).evaluations / len(DOP853.c)
+        return aligned(law, scene, v, RTOL).evaluations / len(DOP853.c)
 
     return jax.jit(passes)
 

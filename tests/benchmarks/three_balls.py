@@ -29,7 +29,7 @@ from kernels import compiled, diffrax_event, siconos
 import jimpact as ji
 from jimpact import velocity_change
 from jimpact.events.tableaux import DOP853
-from jimpact.methods.contenders.schemes import DOP853_ALIGNED
+from jimpact.methods.schemes import aligned
 
 BATCH, CHUNK, REPEATS = 4096, 256, 11
 TRUTH, FINE, COARSE = 1e-13, 3e-8, 1e-6
@@ -57,7 +57,7 @@ def one_impact(k, e, rtol):
 
 def at_any_rtol(k, e, rtol):
     """The same v+ and the passes of the integrator, compiled once for all tolerances."""
-    result = DOP853_ALIGNED.solve(law_of(k, e), SCENE, V, rtol)
+    result = aligned(law_of(k, e), SCENE, V, rtol)
     return V + velocity_change(SCENE, result.impulse), result.evaluations / len(DOP853.c)
 
 

@@ -59,6 +59,7 @@ def test_methods_converge_at_their_order(chart, name):
     work = [point.evaluations for point in row]
     assert all(a < b for a, b in itertools.pairwise(work))
     for point in row:
+        assert point.status == "ok"
         assert point.single.low <= point.single.median <= point.single.high
         assert point.batched.low <= point.batched.median <= point.batched.high
 
@@ -82,7 +83,7 @@ def test_chart_in_words_and_picture(chart):
 @pytest.mark.release
 def test_gradients_and_the_other_methods():
     linear = ji.LZB([0.9, 0.9], [1.0, 1.0], 1.0)
-    others = ("verlet", "impulse_rk4", "tsit5", "scipy_lsoda")  # and one of each kind
+    others = ("verlet", "tsit5", "scipy_lsoda")  # and one of each kind
     result = ji.work_precision(BALLS, STRIKE, linear, others, laws={}, batch=8, repeats=1)
     assert not result.left_out
     assert result.reference.uncertainty["velocity"] < 1e-11  # two independent integrators

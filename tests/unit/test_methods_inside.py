@@ -9,7 +9,8 @@ from friction_reference import routh
 
 import jimpact as ji
 from jimpact.methods.advice import situation_of
-from jimpact.methods.contenders import METHODS, outcome
+from jimpact.methods.contenders import CONTENDERS, outcome
+from jimpact.methods.points import EnergyNorm
 from jimpact.methods.stability import chain_of
 from jimpact.methods.validity import ValidityMap
 
@@ -33,7 +34,7 @@ def test_verlet_with_friction():
     @jax.vmap
     def run(mu, step):
         law = ji.LZB(0.6, friction=mu)
-        return outcome(law, DISK, SLIDES, METHODS["verlet"].solve(law, DISK, SLIDES, step))
+        return outcome(law, DISK, SLIDES, CONTENDERS["verlet"].solve(law, DISK, SLIDES, step))
 
     steps, mu = np.array([0.03, 0.003]), np.array([0.1, 2.0])
     out = run(np.repeat(mu, 2), np.tile(steps, 2))
@@ -56,7 +57,7 @@ def rod(angle):
 def test_scipy_with_friction(angle):
     """A rod in Routh's closed form; between slip and stick friction is regularized."""
     v = [0.5, -1.0, 0.0]
-    result = METHODS["scipy_radau"].solve(ji.LZB(0.5, friction=0.3), rod(angle), v, 1e-6)
+    result = CONTENDERS["scipy_radau"].solve(ji.LZB(0.5, friction=0.3), rod(angle), v, 1e-6)
     normal, side = routh(rod(angle), v, 0.3, 0.5)
     np.testing.assert_allclose(result.impulse, [normal], atol=1e-5)
     np.testing.assert_allclose(result.tangential, [side], atol=1e-5)
@@ -121,11 +122,11 @@ def test_honest_tolerance_over_random_scenes(rtol):
 
 def test_distance_is_a_ratio_of_energy_norms():
     """sqrt(dv^T M dv) / sqrt(v-^T M v-): no unit of an angle enters."""
-    metres = situation_of(ji.Scene([4.0, 1.0], np.eye(2)), np.array([1.0, 0.0]), ji.LZB(0.5), False)
-    assert metres.distance(np.array([0.1, 0.2])) == pytest.approx(math.sqrt(0.04 + 0.04) / 2)
+    metres = EnergyNorm.of(ji.Scene([4.0, 1.0], np.eye(2)), np.array([1.0, 0.0]))
+    assert metres(np.array([0.1, 0.2])) == pytest.approx(math.sqrt(0.04 + 0.04) / 2)
     degrees = ji.Scene([4.0, 0.01], np.diag([1.0, 0.1]))  # the second coordinate ten times larger
-    scaled = situation_of(degrees, np.array([1.0, 0.0]), ji.LZB(0.5), False)
-    assert scaled.distance(np.array([0.1, 2.0])) == pytest.approx(math.sqrt(0.08) / 2)
+    scaled = EnergyNorm.of(degrees, np.array([1.0, 0.0]))
+    assert scaled(np.array([0.1, 2.0])) == pytest.approx(math.sqrt(0.08) / 2)
 
 
 def test_far_contacts_take_no_part():

@@ -1,25 +1,39 @@
 """`monte_carlo`: the distribution of outcomes over gaps, velocities and parameters."""
 
+import functools
+import itertools
+import pickle
+import queue
 import time
 import warnings
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from jimpact._checks import in_common_dtype
+from jimpact._checks import in_common_dtype, needed
 from jimpact.law import Law
-from jimpact.montecarlo.executors import check_executor, computed
 from jimpact.montecarlo.gaps import gap_scale
-from jimpact.montecarlo.planning import BINS, CHUNK, Run, Sources, planned_run
-from jimpact.montecarlo.results import MonteCarlo, result_of
-from jimpact.montecarlo.statistics import Chunk, joined
+from jimpact.montecarlo.plan import Plan, Run, Sources, planned_run
+from jimpact.montecarlo.result import MonteCarlo, result_of
+from jimpact.montecarlo.statistics import IN_MEMORY, Chunk, Task, joined
 from jimpact.montecarlo.store import Store
 from jimpact.progress import counting_bar
 from jimpact.scene import Scene
+
+CHUNK = 4096  # samples: fast on a CPU for cheap and costly laws alike; a GPU wants more
+BINS = 1000  # of a histogram; ten times more: quantiles finer than 100 000 samples determine them
+EXECUTORS = ("serial", "devices", "dask")
+# Chunks that a `map` gets at once. Ten times more: their results fill the memory of the workers;
+# ten times less: workers wait for the last chunk of each part.
+WINDOW = 512
+
+Work = Callable[[Task], Chunk]
 
 
 def monte_carlo(
@@ -84,13 +98,11 @@ def monte_carlo(
     [-0.6, 0.16, 1.24]
     """
     run = planned_run(Sources(law, velocity, gaps), scene, samples, key, chunk, bins, keep_samples)
-    check_executor(executor)
+    _check_executor(executor)
     if keep_samples and folder is None:
         raise ValueError("Argument `folder` must be given to keep samples, but is None.")
     store = None if folder is None else Store(folder, run.identity)
-    begin = time.perf_counter()
-    total, resumed = _total(run, executor, store, progress)
-    rate = (run.samples - resumed) / (time.perf_counter() - begin)
+    total, resumed, rate = _total(run, executor, store, progress)
     result = result_of(run, total, resumed, rate, _gap_scale(run.plan.sources, scene))
     failed = result.samples - result.count
     if failed:
@@ -105,8 +117,11 @@ def monte_carlo(
 
 def _total(
     run: Run, executor: Any, store: Store | None, progress: float | None
-) -> tuple[Chunk, int]:
-    """All chunks, read or computed, joined in their order; how many samples were read."""
+) -> tuple[Chunk, int, float]:
+    """All chunks joined in their order, how many samples were read, and computed a second.
+
+    The first chunk that is computed compiles the program: it does not count for the rate.
+    """
 
     def read(number: int) -> Chunk | None:
         """The chunk as it is stored, if it is."""
@@ -116,39 +131,39 @@ def _total(
     stored = {number for number in range(run.chunks) if read(number) is not None}
     resumed = finished = sum(run.task(number).count for number in stored)
     missing = (n for n in range(1, run.chunks) if n not in stored)
+    times = [(resumed, time.perf_counter())]
 
     def new(chunk: Chunk) -> Chunk:
         """A computed chunk, stored and counted."""
         nonlocal finished
         if store is not None:
             store.write(chunk)
-        finished += chunk.count
-        advance(chunk.count)
+        finished += int(chunk["count"])
+        times.append((finished, time.perf_counter()))
+        advance(int(chunk["count"]))
         return chunk
 
     try:
         with counting_bar(run.samples, "samples", progress, resumed) as advance:
-            # the first chunk sets the histograms
-            first = read(0) or new(run.plan(run.task(0)))
-            tasks = (run.task(number, first.ends) for number in missing)
-            total = first.without_samples()
-            with closing(computed(executor, run.plan, tasks)) as chunks:
+            first = read(0) or new(run.plan(run.task(0)))  # it sets the histograms
+            tasks = (run.task(number, first["ends"]) for number in missing)
+            total = first | {k: v[:IN_MEMORY] for k, v in first.items() if k.startswith("raw.")}
+            with closing(_computed(executor, run.plan, tasks)) as chunks:
                 for number in range(1, run.chunks):
                     chunk = read(number) if number in stored else new(next(chunks))
                     if chunk is None:
                         raise OSError(f"Chunk {number} changed during the run: run again.")
                     total = joined(total, chunk)
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(_interrupted(run, store, finished)) from None
-    return total, resumed
-
-
-def _interrupted(run: Run, store: Store | None, done: int) -> str:
-    """The message of an interrupted run."""
-    text = f"stopped after {done:,} of {run.samples:,} samples; "
-    if store is None:
-        return text + "nothing is stored, because no `folder` was given."
-    return text + f"they are in '{store.folder}': the same call continues from there."
+        text = f"stopped after {finished:,} of {run.samples:,} samples; "
+        text += (
+            "nothing is stored, because no `folder` was given."
+            if store is None
+            else f"they are in '{store.folder}': the same call continues from there."
+        )
+        raise KeyboardInterrupt(text) from None
+    (before, begin), (after, end) = times[1 if len(times) > 2 else 0], times[-1]
+    return total, resumed, (after - before) / (end - begin) if after > before else 0.0
 
 
 def _gap_scale(sources: Sources, scene: Scene) -> np.ndarray | None:
@@ -161,3 +176,91 @@ def _gap_scale(sources: Sources, scene: Scene) -> np.ndarray | None:
     law, scene, velocity = in_common_dtype(law, scene, velocity)
     delta = np.asarray(gap_scale(scene, law, velocity).delta, float)
     return delta if (delta > 0).all() else None  # 0: nothing approaches
+
+
+# ------------------------------------------ where chunks are computed, which changes no result
+
+
+def _check_executor(executor: Any) -> None:
+    """Raise where nothing can compute chunks with it."""
+    known = callable(getattr(executor, "map", None))
+    if isinstance(executor, str):
+        known = executor in EXECUTORS or ":" in executor  # host and port of a scheduler
+    if not known:
+        raise ValueError(
+            f"Argument `executor` must be one of {', '.join(EXECUTORS)}, the address of a Dask "
+            f"scheduler, or an object with a method `map`, but is {executor!r}."
+        )
+
+
+def _computed(executor: Any, plan: Plan, tasks: Iterable[Task]) -> Generator[Chunk]:
+    """`plan(task)` for every task, in order."""
+    remaining = iter(tasks)
+    with _opened(executor, plan) as (mapped, work):
+        while window := list(itertools.islice(remaining, WINDOW)):
+            for each in mapped(work, window):
+                yield each.result() if hasattr(each, "result") else each  # Dask maps to futures
+
+
+@contextmanager
+def _opened(executor: Any, plan: Plan) -> Iterator[tuple[Callable[..., Any], Work]]:
+    """The `map` of an executor, and what it maps tasks by."""
+    if executor == "serial":
+        yield map, plan
+    elif executor == "devices":
+        free: queue.SimpleQueue[jax.Device] = queue.SimpleQueue()
+        for device in jax.devices():
+            free.put(device)
+
+        def compute(task: Task) -> Chunk:
+            """One chunk, on a device that is free; each device compiles the program once."""
+            device = free.get()
+            try:
+                return plan(task, device)
+            finally:
+                free.put(device)
+
+        with ThreadPoolExecutor(free.qsize()) as pool:
+            yield pool.map, compute
+    elif isinstance(executor, str):
+        distributed = needed("distributed", "pip install 'jimpact[distributed]'")
+        here = {"threads_per_worker": 1, "dashboard_address": None}  # processes on this machine
+        options = here if executor == "dask" else {"address": executor}
+        with distributed.Client(**options) as client:
+            yield client.map, _shipped(plan)
+    else:
+        yield executor.map, _shipped(plan)
+
+
+def _shipped(plan: Plan) -> Work:
+    """A plan that other processes can compute with; as it is where it cannot be pickled.
+
+    Functions in it are pickled where cloudpickle is installed, which Dask brings.
+    """
+    try:
+        from cloudpickle import dumps  # type: ignore[import-untyped]
+    except ImportError:
+        dumps = pickle.dumps
+    try:
+        return _Shipped(dumps(plan), plan.x64)
+    except Exception:  # objects refuse to be pickled in many ways; threads need no pickle
+        return plan
+
+
+@dataclass(frozen=True)
+class _Shipped:
+    """A plan as bytes, and its precision."""
+
+    plan: bytes
+    x64: bool
+
+    def __call__(self, task: Task) -> Chunk:
+        """One chunk."""
+        return _unpacked(self)(task)
+
+
+@functools.lru_cache(maxsize=4)
+def _unpacked(shipped: _Shipped) -> Plan:
+    """The same object for the same bytes, so that a worker compiles a run only once."""
+    with jax.enable_x64(shipped.x64):  # else a worker would read float64 arrays as float32
+        return pickle.loads(shipped.plan)

@@ -7,18 +7,21 @@ import jax
 import numpy as np
 
 from jimpact._checks import check_values
-from jimpact.files.records import as_data, fields_as_data, table
+from jimpact.files.records import Column, Table, Tabular, as_data, fields_as_data
 from jimpact.law import Law
-from jimpact.montecarlo.planning import DELTA_C, Run
+from jimpact.montecarlo.plan import Run
 from jimpact.montecarlo.statistics import (
     OUTCOMES,
     Chunk,
     bin_edges,
     binned_quantiles,
+    moments_of,
     named,
+    part,
 )
 from jimpact.scene import Scene
 
+DELTA_C = "delta_c: how deep a contact is indented at the largest approach speed of the scene"
 REPORTED = (0.05, 0.5, 0.95)  # quantiles in the report
 _OUTCOMES = {row.name: row for row in OUTCOMES}
 
@@ -37,7 +40,7 @@ class BadSample:
 
 
 @dataclass(frozen=True, eq=False)
-class MonteCarlo:
+class MonteCarlo(Tabular):
     """Statistics of the velocities after an impact; `print` gives a report.
 
     Attributes:
@@ -56,7 +59,7 @@ class MonteCarlo:
         bad: the first failed samples; `replay(sample.index)` gives one to run again.
         first: the first samples, for pictures: gaps, velocity_before, velocity, status.
         gap_scale: delta_c (m,) [m], the indentation of a contact (`ji.gap_scale`), or None.
-        rate: samples computed a second [1/s].
+        rate: samples computed a second [1/s], without compiling.
         resumed: samples that were read from the folder.
         description: law, scene and distributions, in words.
         run: the requested run; `replay` needs it.
@@ -81,6 +84,8 @@ class MonteCarlo:
     resumed: int
     description: str
     run: Run = field(repr=False)
+
+    picture = "monte_carlo"
 
     @property
     def standard_error(self) -> np.ndarray:
@@ -118,25 +123,30 @@ class MonteCarlo:
         derived |= {"quantile_resolution": self.quantile_resolution}
         return fields_as_data(self, "first", "run", "description") | as_data(derived)
 
-    def __str__(self) -> str:
-        """The report."""
-        heads = ["[m/s]", "mean", "± error", "std", *(f"{100 * q:g} %" for q in REPORTED)]
-        columns = [self.std, *self.quantile(REPORTED), self.minimum, self.maximum]
-        rows = [
-            [f"v{i + 1}+", f"{mean:.6f}", f"{error:.1g}", *(f"{x[i]:.5f}" for x in columns)]
-            for i, (mean, error) in enumerate(zip(self.mean, self.standard_error))
-        ]
-        lines = [
-            f"{self.samples:,} samples of {self.description}",
-            self._rate(),
-            "",
-            *table([*heads, "least", "largest"], rows),
-            f"Quantiles are right to {self.quantile_resolution.max():.2g} m/s.",
-            "",
-            *self._gap_lines(),
-            *self._status_lines(),
-        ]
-        return "\n".join(lines)
+    @property
+    def table(self) -> Table:
+        """A row for each velocity after, with quantiles; numbers in m/s."""
+        columns = (
+            Column("coordinate", head="[m/s]"),
+            Column("mean", ".6f"),
+            Column("standard_error", ".1g", "± error"),
+            *(
+                Column(name, ".5f", head)
+                for name, head in (
+                    ("std", "std"),
+                    *((f"quantile_{q:g}", f"{100 * q:g} %") for q in REPORTED),
+                    ("least", "least"),
+                    ("largest", "largest"),
+                )
+            ),
+        )
+        names = [f"v{i + 1}+" for i in range(len(self.mean))]
+        values = self.std, *self.quantile(REPORTED), self.minimum, self.maximum
+        rows = [*zip(names, self.mean, self.standard_error, *values)]
+        head = [f"{self.samples:,} samples of {self.description}", self._rate(), ""]
+        notes = [f"Quantiles are right to {self.quantile_resolution.max():.2g} m/s.", ""]
+        notes += [*self._gap_lines(), *self._status_lines()]
+        return Table(columns, rows, head, notes)
 
     def _rate(self) -> str:
         """Samples a second, and how many were read."""
@@ -174,28 +184,24 @@ def result_of(
     run: Run, total: Chunk, resumed: int, rate: float, gap_scale: np.ndarray | None
 ) -> MonteCarlo:
     """The result of a run from the statistics of all its chunks."""
-    n, bad = len(total.ends), total.bad
-    mean, covariance = total.moments.mean, total.moments.covariance
+    n, bad, whole = len(total["ends"]), part(total, "bad"), moments_of(total)
+    mean, covariance = whole.mean, whole.covariance
+    failed = zip(bad["index"], bad["status"], bad["gaps"], bad["velocity_before"])
     return MonteCarlo(
         samples=run.samples,
-        count=total.moments.count,
+        count=whole.count,
         mean=mean[:n],
         covariance=covariance[:n, :n],
-        minimum=total.low,
-        maximum=total.high,
+        minimum=total["low"],
+        maximum=total["high"],
         gap_mean=mean[n:],
         gap_covariance=covariance[n:, n:],
         cross_covariance=covariance[:n, n:],
-        edges=bin_edges(total.ends, run.plan.bins),
-        counts=total.counts,
-        statuses=named(total.statuses),
-        bad=tuple(
-            BadSample(int(index), OUTCOMES[code].name, gaps, velocity)
-            for index, code, gaps, velocity in zip(
-                bad["index"], bad["status"], bad["gaps"], bad["velocity_before"]
-            )
-        ),
-        first=total.samples,
+        edges=bin_edges(total["ends"], run.plan.bins),
+        counts=total["counts"],
+        statuses=named(total["statuses"]),
+        bad=tuple(BadSample(int(i), OUTCOMES[code].name, *rest) for i, code, *rest in failed),
+        first=part(total, "raw"),
         gap_scale=gap_scale,
         rate=rate,
         resumed=resumed,

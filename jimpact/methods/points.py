@@ -1,0 +1,125 @@
+"""Candidates at points against a reference: outcomes in batches, their errors, and their times."""
+
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jimpact.impacts import Impact
+from jimpact.scene import Scene, dense_mass
+from jimpact.status import STATUS
+
+SHORT = 2e-3  # [s]: calls that are faster are run several times for one measurement, so that the
+MOST_RUNS = 20  # clock's resolution does not count, but no more often than this
+BUDGET = 2.0  # [s] for one call, after which it is not repeated
+LEAST_REPEATS = 3  # more often than this
+
+
+class Outcomes(NamedTuple):
+    """v+ (r, n), p (r, m), p_t (r, t) or None, status (r,) of impacts; JAX, then numpy."""
+
+    velocity: Any
+    impulse: Any
+    tangential: Any
+    status: Any
+
+    @classmethod
+    def of(cls, out: Impact) -> "Outcomes":
+        """What is compared of an impact."""
+        return cls(out.velocity, out.impulse, out.tangential_impulse, out.status)
+
+    @property
+    def failed(self) -> np.ndarray:
+        """Which of them (r,) have a status that is a failure."""
+        return np.array([STATUS[int(code)].failure for code in self.status], bool)
+
+    def where_usable(self) -> "Outcomes":
+        """The same, NaN where it failed."""
+        lost = self.failed[:, None]
+        v, p, side = jax.tree.map(lambda x: np.where(lost, np.nan, x), self[:3])
+        return Outcomes(v, p, side, self.status)
+
+
+class EnergyNorm(NamedTuple):
+    """`sqrt(dv^T M dv) / sqrt(v-^T M v-)`: a ratio that does not mix m/s and rad/s.
+
+    `mass` is that of the `watched` coordinates, `before` the norm of v- (of 1 at rest).
+    """
+
+    mass: np.ndarray
+    before: float
+    watched: np.ndarray
+
+    @classmethod
+    def of(cls, scene: Scene, velocity: np.ndarray, watched: Any = None) -> "EnergyNorm":
+        """For a scene at v- (n,); `watched`: indices of the coordinates that count, None: all."""
+        count = scene.size
+        index = np.arange(count) if watched is None else np.atleast_1d(np.asarray(watched))
+        whole = index.ndim == 1 and index.size > 0 and np.issubdtype(index.dtype, np.integer)
+        if not whole or index.min() < 0 or index.max() >= count:
+            raise ValueError(
+                f"Argument `watched` must be indices of coordinates from 0 to {count - 1}, but has "
+                f"value {watched!r}."
+            )
+        mass = dense_mass(scene)
+        before = float(np.sqrt(velocity @ mass @ velocity)) or 1.0
+        return cls(mass[np.ix_(index, index)], before, index)
+
+    def __call__(self, change: np.ndarray) -> np.ndarray:
+        """Of differences of velocities (..., n)."""
+        dv = change[..., self.watched]
+        return np.sqrt(np.sum((dv @ self.mass) * dv, axis=-1)) / self.before
+
+
+def in_batches(
+    run: Callable[[Any], Any],
+    rows: Any,
+    size: int,
+    advance: Callable[[int], Any] = lambda count: None,
+) -> Any:
+    """`run` of rows, arrays (r, ...) in whatever tree, so many at a time: one compiled program.
+
+    The last row is repeated where a batch is not full. `advance` is called with the rows of each.
+    """
+    count = len(jax.tree.leaves(rows)[0])
+    parts = []
+    for first in range(0, count, size):
+        chosen = np.minimum(np.arange(first, first + size), count - 1)
+        part = jax.tree.map(partial(np.take, indices=chosen, axis=0), rows)
+        parts.append(jax.device_get(run(part)))
+        advance(min(size, count - first))
+    return jax.tree.map(lambda *x: np.concatenate(x)[:count], *parts)
+
+
+def raised(error: Exception) -> str:
+    """What is said of a candidate that raised."""
+    return f"raised {type(error).__name__}: {str(error).splitlines()[0] if str(error) else '-'}"
+
+
+def seconds(run: Callable[[], Any], count: int = 1) -> float:
+    """Mean time [s] of `count` calls, results computed."""
+    begin = time.perf_counter()
+    for _ in range(count):
+        jax.block_until_ready(run())
+    return (time.perf_counter() - begin) / count
+
+
+def in_turns(
+    runs: Sequence[Callable[[], Any]], repeats: int, advance: Callable[[], Any] = lambda: None
+) -> list[np.ndarray]:
+    """`repeats` times [s] of each of `runs`, fewer of slow ones; `advance` is called after each.
+
+    In turns: a busy machine slows all alike.
+    """
+    warm = [min(seconds(run), seconds(run)) for run in runs]  # the first call may compile
+    counts = [int(np.clip(SHORT / max(t, 1e-9), 1, MOST_RUNS)) for t in warm]
+    times: list[list[float]] = [[] for _ in runs]
+    for _ in range(repeats):
+        for run, count, measured in zip(runs, counts, times):
+            if len(measured) < LEAST_REPEATS or count * sum(measured) < BUDGET:
+                measured.append(seconds(run, count))
+            advance()
+    return [np.array(measured) for measured in times]

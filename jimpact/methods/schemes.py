@@ -1,0 +1,487 @@
+"""Ways to integrate the LZB impact: jimpact's own, plain fixed steps, solvers of diffrax and scipy.
+
+All but the first work on the dimensionless flow of `events/contact_flow.py` in time form, with
+c_j = 1 in compression and 1/e_j^2 in expansion, and stored energy x_j^(eta_j + 1) / 2:
+
+    x_j' = -omega_j c_j gamma_j,   p_j' = F_j = (eta_j + 1)/2 omega_j x_j^eta_j
+    gamma = gamma- + G p + K_nt p_t,   u = u- + K_tn p + K_tt p_t
+    p_t,j' = -mu_j F_j u_j / sqrt(|u_j|^2 + s_j^2)        (friction, regularized below a slip s)
+
+None of them looks for events: x_j is only clamped at 0, or the step-size control has to find the
+changes of phase. A change of phase within a fixed step costs O(step^2), whatever the order of the
+formula. Explicit steps are stable while `step * sqrt(lambda) < 2.83` (Runge-Kutta 4) or 2 (Verlet)
+with lambda the largest eigenvalue of `omega G omega c` (exponent 1): small e is stiff.
+
+The published scheme steps in the impulse of the primary contact i, that with the largest force:
+
+    dp_j = F_j / F_i dp_i,   dE_j = -c_j gamma_j dp_j
+
+First order in the step; at E_j = 0 the rule is 0/0, and the implicit first step of a contact that
+is touched for the first time has a closed form. It has no time, so the duration is NaN.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact._checks import as_float_array, in_common_dtype
+from jimpact.compiling import precise_jit
+from jimpact.events.contact_flow import power
+from jimpact.events.impact_dynamics import Dynamics, evaluate, first_indentation
+from jimpact.events.implicit_steps import FORCES_A_STEP
+from jimpact.events.stepper import STAGES
+from jimpact.laws.lzb import LZB
+from jimpact.scene import Scene
+from jimpact.solvers.dense import unit
+from jimpact.solvers.sparse import Neighbours, Sparse
+from jimpact.solvers.tangential import per_tangent
+from jimpact.solvers.tridiagonal import Tridiagonal, as_matrix
+from jimpact.status import CODE
+
+UNCOUNTED = -1  # evaluations of a method that does not count them
+# Part of the largest energy below which that of a contact is rounding, and the contact unloaded.
+# Ten times more would unload contacts that still push.
+EMPTY = 1e-14
+FINEST = 100 * float(np.finfo(float).eps)  # scipy takes no smaller rtol
+GIVE_UP = 5000  # evaluations a contact: LSODA may creep without end at an opening
+FOREVER = 1e6  # in units of the impact's time scale: a contact alone lasts about pi
+
+
+class Solution(NamedTuple):
+    """Impulses (m,) [N s], status (), duration () [s], field evaluations (), impulses (t,) [N s].
+
+    NaN: a duration that is not known; `UNCOUNTED`: evaluations likewise; None: no friction.
+    """
+
+    impulse: Any
+    code: Any = CODE["ok"]
+    duration: Any = np.nan
+    evaluations: Any = UNCOUNTED
+    tangential: Any = None
+
+
+Solve = Callable[[LZB, Scene, Any, Any], Solution]
+
+
+class Scaled(NamedTuple):
+    """The dimensionless problem; where nothing `happens` it is a placeholder."""
+
+    dynamics: Dynamics
+    happens: jax.Array
+
+    def solution(self, p: Any, t: Any, evaluations: Any, code: Any, side: Any) -> Solution:
+        """In SI units; nothing where nothing happens, `not_finite` where it is not."""
+        units, tangential = self.dynamics.units, None
+        impulse = jnp.where(self.happens, p * units.momentum, 0.0)
+        finite = jnp.all(jnp.isfinite(impulse))
+        if self.dynamics.problem.sides is not None:
+            tangential = jnp.where(self.happens, side * per_tangent(units.momentum, side), 0.0)
+            finite = finite & jnp.all(jnp.isfinite(tangential))
+        code = jnp.where(self.happens, code, CODE["ok"])
+        return Solution(
+            impulse,
+            jnp.where(finite, code, CODE["not_finite"]).astype(jnp.int32),
+            jnp.where(self.happens, t * units.time, 0.0),
+            jnp.asarray(evaluations, jnp.int32),
+            tangential,
+        )
+
+
+def scaled(law: LZB, scene: Scene, velocity: Any, rtol: Any = 1.0) -> Scaled:
+    """The impact in dimensionless form, without open contacts."""
+    v = as_float_array("velocity", velocity)
+    law, scene, v = in_common_dtype(law, scene, v)
+    contact = law.contact(scene, v)
+    gamma, happens = contact.gap_velocity, contact.happens
+    harmless = jnp.where(happens, gamma, -jnp.ones_like(gamma))
+    contact = eqx.tree_at(lambda c: c.gap_velocity, contact, harmless)
+    return Scaled(law.dynamics(contact, jnp.asarray(rtol, v.dtype)), happens)
+
+
+def time_scale(law: LZB, scene: Scene, velocity: Any) -> jax.Array:
+    """Time [s] that 'step' settings are parts of: that of the fastest contact alone.
+
+    Equation: `min_j x_ref,j / (Q sqrt(W_jj))` (see `events/impact_dynamics.py`); a contact alone
+    with exponent 1 and e = 1 lasts pi of its own.
+
+    >>> import jimpact as ji
+    >>> from jimpact.methods.schemes import time_scale
+    >>> float(time_scale(ji.LZB(1.0, 4.0, exponent=1.0), ji.chain([1.0], wall=True), [1.0]))
+    0.5
+    """
+    return scaled(law, scene, velocity).dynamics.units.time
+
+
+# ------------------------------------------------------------------------------ the field
+
+
+class Field(NamedTuple):
+    """The flow in time form, of JAX arrays or of NumPy's."""
+
+    x: Any  # (m,) before the impact, as `gamma` and `slip`
+    gamma: Any
+    slip: Any
+    coupling: Any  # G
+    cross: Any  # K_nt
+    tangent: Any  # K_tt
+    friction: Any
+    omega: Any
+    restitution: Any
+    exponent: Any
+
+    @property
+    def start(self) -> tuple[Any, Any, Any]:
+        """Indentations, and impulses, normal and tangential ones."""
+        return self.x, 0.0 * self.gamma, 0.0 * self.slip
+
+    def gap_velocity(self, p: Any, side: Any) -> Any:
+        """gamma (m,)."""
+        return self.gamma + self.coupling @ p + self.cross @ side
+
+    def closing(self, now: Any) -> Any:
+        """x' (m,) at gap velocities."""
+        return -self.omega * _where(now > 0, 1 / self.restitution**2, 1.0) * now
+
+    def force(self, x: Any) -> Any:
+        """p' (m,) at indentations."""
+        if isinstance(x, np.ndarray):
+            eta = np.asarray(self.exponent, float)
+            return (eta + 1) / 2 * self.omega * np.maximum(x, 0.0) ** eta
+        return (jnp.asarray(self.exponent, x.dtype) + 1) / 2 * self.omega * power(x, self.exponent)
+
+    def drag(self, force: Any, p: Any, side: Any, slow: Any) -> Any:
+        """p_t' (t,), regularized below the slip `slow` (m,) or ()."""
+        u = (self.slip + self.cross.T @ p + self.tangent @ side).reshape(len(force), -1)
+        square = (u**2).sum(axis=1) + slow**2
+        moves = square > 0
+        drag = self.friction * force / _where(moves, square, 1.0) ** 0.5
+        return -(_where(moves, drag, 0.0)[:, None] * u).ravel()
+
+    def rates(self, x: Any, p: Any, side: Any, slow: Any) -> tuple[Any, Any, Any]:
+        """(x', p', p_t'); an open contact stays at its x <= 0, as solvers cannot clamp."""
+        closing, force = self.closing(self.gap_velocity(p, side)), self.force(x)
+        opened = (x <= 0) & (closing < 0)
+        return _where(opened, 0.0, closing), force, self.drag(force, p, side, slow)
+
+    def at_work(self, x: Any, p: Any, side: Any) -> Any:
+        """Positive while a contact is loaded or approaches."""
+        return (-self.gap_velocity(p, side)).max().clip(x.max())
+
+
+def _where(condition: Any, yes: Any, no: Any) -> Any:
+    """`where` of JAX or of NumPy."""
+    numpy = np if isinstance(condition, np.ndarray) else jnp
+    return numpy.where(condition, yes, no)
+
+
+def field_of(problem: Scaled) -> Field:
+    """The field of a problem."""
+    dynamics, inputs = problem.dynamics, problem.dynamics.problem
+    m, off, one = len(inputs.gamma), inputs.off_diagonal, jnp.ones_like(inputs.gamma)
+    coupling: Any = Tridiagonal(one, off)
+    if isinstance(dynamics.structure, Neighbours):
+        coupling = Sparse(one, off, dynamics.structure)
+    elif dynamics.structure is None:
+        upper = jnp.zeros((m, m), off.dtype).at[jnp.triu_indices(m, 1)].set(off)
+        coupling = unit(upper) + upper + upper.T
+    none = jnp.zeros((m, 0), off.dtype)
+    cross, tangent, slip, friction = none, none[:0], none[0], jnp.zeros_like(one)
+    if inputs.sides is not None:
+        block, friction = inputs.sides
+        cross, tangent, slip = block.normal_tangent, block.tangent, block.slip
+    eta: Any = dynamics.static_exponent if inputs.exponent is None else inputs.exponent
+    return Field(
+        first_indentation(inputs, dynamics.static_exponent),
+        *(inputs.gamma, slip, coupling, cross, tangent, friction),
+        *(inputs.omega, inputs.restitution, eta),
+    )
+
+
+# --------------------------------------------------------------------------- jimpact's own
+
+
+def aligned(law: LZB, scene: Scene, velocity: Any, setting: Any) -> Solution:
+    """What `impact` does: no step straddles a change of phase (`events/stepper.py`).
+
+    Impulses are of the run that ends an isolated contact in closed form; the duration takes a
+    second run, without it (which the compiler leaves out where the duration is not used).
+    """
+    problem = scaled(law, scene, velocity, setting)
+    dynamics = problem.dynamics._replace(method="time")
+    program, leaves = dynamics.program(), dynamics.columns()[0]
+    p, side, _, code, passes = evaluate(program, leaves)
+    _, _, t, _, _ = evaluate(dataclasses.replace(program, whole=True), leaves)
+    evaluations = (STAGES + 1) * passes[0, 0]  # of all passes, rejected ones included
+    return problem.solution(p[:, 0], t[0, 0], evaluations, code[0, 0], side[:, 0])
+
+
+def implicit(law: LZB, scene: Scene, velocity: Any, setting: Any) -> Solution:
+    """The law's own method without events."""
+    problem = scaled(law, scene, velocity, setting)
+    dynamics = problem.dynamics._replace(method="implicit")
+    p, side, t, code, passes = evaluate(dynamics.program(), dynamics.columns()[0])
+    forces = FORCES_A_STEP * passes[0, 0]
+    return problem.solution(p[:, 0], t[0, 0], forces, code[0, 0], side[:, 0])
+
+
+# ---------------------------------------------------------------------------- fixed steps
+
+
+class Walk(NamedTuple):
+    """Indentation, impulses (m,), (t,), gap velocity and force (m,), and the steps taken."""
+
+    x: jax.Array
+    p: jax.Array
+    side: jax.Array
+    gamma: jax.Array
+    force: jax.Array
+    steps: jax.Array
+
+
+# (field, h, walk) -> x (to be clamped), p, p_t, force
+Step = Callable[[Field, jax.Array, Walk], tuple[jax.Array, ...]]
+
+
+def in_time(step: Step, stages: int) -> Solve:
+    """Fixed steps in time of `stages` evaluations each, the setting their size."""
+
+    def solve(law: LZB, scene: Scene, velocity: Any, setting: Any) -> Solution:
+        """The impact with this time step."""
+        problem = scaled(law, scene, velocity)
+        field = field_of(problem)
+        h = jnp.asarray(setting, field.gamma.dtype)
+
+        def at_work(walk: Walk) -> jax.Array:
+            """Whether a contact is loaded or approaches."""
+            return jnp.any((walk.x > 0) | (walk.gamma < 0))
+
+        def advance(walk: Walk) -> Walk:
+            """One step."""
+            x, p, side, force = step(field, h, walk)
+            now = field.gap_velocity(p, side)
+            return Walk(jnp.maximum(x, 0.0), p, side, now, force, walk.steps + 1)
+
+        first = Walk(*field.start, field.gamma, field.force(field.x), jnp.zeros((), jnp.int32))
+        most = problem.dynamics.max_steps
+        end = jax.lax.while_loop(lambda x: at_work(x) & (x.steps < most), advance, first)
+        code = jnp.where(at_work(end), CODE["max_steps"], CODE["ok"])
+        time = h * end.steps.astype(h.dtype)
+        return problem.solution(end.p, time, stages * end.steps, code, end.side)
+
+    return solve
+
+
+def rk4(field: Field, h: jax.Array, walk: Walk) -> tuple[jax.Array, ...]:
+    """A classical Runge-Kutta step."""
+    now = walk.x, walk.p
+    change = total = jax.tree.map(jnp.zeros_like, now)
+    for node, weight in ((0.0, 1 / 6), (0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6)):
+        x, p = (a + node * h * b for a, b in zip(now, change))
+        change = field.closing(field.gap_velocity(p, walk.side)), field.force(x)
+        total = total[0] + weight * h * change[0], total[1] + weight * h * change[1]
+    return walk.x + total[0], walk.p + total[1], walk.side, walk.force
+
+
+def verlet(field: Field, h: jax.Array, walk: Walk) -> tuple[jax.Array, ...]:
+    """A step of velocity Verlet.
+
+    Friction is regularized below the slip that it stops within half a step, `mu F h/2 |K_tt|` with
+    the largest absolute row sum: stable for whatever step; what should stick creeps by O(step).
+    """
+    stiffest = jnp.max(jnp.sum(jnp.abs(field.tangent), axis=1), initial=0.0)
+
+    def dragged(force: jax.Array, p: jax.Array, side: jax.Array) -> jax.Array:
+        """Tangential impulses (t,) after friction has acted for half a step."""
+        slow = field.friction * force * 0.5 * h * stiffest
+        return side + 0.5 * h * field.drag(force, p, side, slow)
+
+    p = walk.p + 0.5 * h * walk.force
+    side = dragged(walk.force, p, walk.side)
+    x = jnp.maximum(walk.x + h * field.closing(field.gap_velocity(p, side)), 0.0)
+    force = field.force(x)
+    p = p + 0.5 * h * force
+    return x, p, dragged(force, p, side), force
+
+
+# ------------------------------------------------------------- steps in impulse (published)
+
+
+class ImpulseWalk(NamedTuple):
+    """Gap velocity, potential energy and impulse (m,), and the steps taken."""
+
+    gamma: jax.Array
+    energy: jax.Array
+    p: jax.Array
+    steps: jax.Array
+
+    @property
+    def at_work(self) -> jax.Array:
+        """Whether a contact is loaded or approaches."""
+        return jnp.any((self.energy > 0) | (self.gamma < 0))
+
+
+def impulse_euler(law: LZB, scene: Scene, velocity: Any, setting: Any) -> Solution:
+    """Explicit steps in the primary impulse; the setting is their size."""
+    problem = scaled(law, scene, velocity, setting)
+    inputs, field = problem.dynamics.problem, field_of(problem)
+    none, most = jnp.zeros_like(inputs.gamma), problem.dynamics.max_steps
+    end = jax.lax.while_loop(
+        lambda walk: walk.at_work & (walk.steps < most),
+        lambda walk: _impulse_step(field, inputs.step[0], walk),
+        ImpulseWalk(inputs.gamma, 0.5 * inputs.energy, none, jnp.zeros((), jnp.int32)),
+    )
+    code = jnp.where(end.at_work, CODE["max_steps"], CODE["ok"])
+    return problem.solution(end.p, jnp.nan, end.steps, code, field.slip)
+
+
+def _impulse_step(field: Field, dp: jax.Array, walk: ImpulseWalk) -> ImpulseWalk:
+    """One explicit step of `dp` in the primary impulse."""
+    gamma, energy = walk.gamma, walk.energy
+    eta = jnp.asarray(field.exponent, gamma.dtype)
+    approach = jnp.maximum(-gamma, 0.0)
+
+    def force(energy: jax.Array) -> jax.Array:
+        """Dimensionless contact force at potential energy E_j."""
+        positive = energy > 0
+        root = jnp.where(positive, jnp.where(positive, 2 * energy, 1.0) ** (eta / (eta + 1)), 0.0)
+        return (eta + 1) / 2 * field.omega * root
+
+    # at the first touch the energy is that of the step itself
+    f = force(energy)
+    f_start = jnp.where(jnp.any(energy > 0), f, force(approach * dp))
+    primary = jnp.argmax(f_start)
+    scale = dp / f_start[primary]
+    # implicit first step: dp_j = scale F_j(u_j dp_j)
+    first = (scale * force(approach)) * jnp.where(approach > 0, 1.0, 0.0)
+    increment = jnp.where(energy > 0, scale * f, power(first, eta + 1))
+    is_primary = jnp.arange(len(gamma)) == primary  # in batches faster than an index
+    increment = jnp.where(is_primary, dp, increment)
+    increment = increment * _emptying(field, walk, is_primary, increment)
+    after = gamma + field.coupling @ increment
+    # exact work of the step; its error is the first-order one of the distributing rule alone
+    middle = 0.5 * (gamma + after)
+    rate = jnp.where(middle > 0, 1 / field.restitution**2, 1.0)
+    left = jnp.maximum(energy - rate * middle * increment, 0.0)
+    left = jnp.where(left > EMPTY * jnp.max(energy + approach**2), left, 0.0)
+    return ImpulseWalk(after, left, walk.p + increment, walk.steps + 1)
+
+
+def _emptying(
+    field: Field, walk: ImpulseWalk, is_primary: jax.Array, increment: jax.Array
+) -> jax.Array:
+    """Fraction of the step at which the primary contact is unloaded; 1 if it is not.
+
+    Ending there, not on a fixed step, is what the derivative of the outcome depends on.
+    """
+    values = walk.gamma, walk.energy, increment, field.coupling @ increment, field.restitution
+    gamma, energy, dp, bend, e = (jnp.sum(jnp.where(is_primary, x, 0.0)) for x in values)
+    budget = energy * e**2 / dp
+    expands = (gamma + 0.5 * bend > 0) & (energy > 0)
+    root = jnp.sqrt(jnp.maximum(jnp.where(expands, gamma**2 + 2 * bend * budget, 1.0), 0.0))
+    denominator = jnp.where(expands, gamma + root, 1.0)
+    fraction = 2 * budget / jnp.where(denominator > 0, denominator, 1.0)
+    return jnp.where(expands & (denominator > 0) & (fraction < 1), fraction, 1.0)
+
+
+# ------------------------------------------------------------------------------- libraries
+
+
+def by_diffrax(solver: diffrax.AbstractSolver, stages: int | None) -> Solve:
+    """A solver of diffrax, ended by an event; `stages`: new ones a step (None: not known)."""
+
+    def solve(law: LZB, scene: Scene, velocity: Any, setting: Any) -> Solution:
+        """The impact at this rtol, to the end of the step in which it is over.
+
+        That changes no impulse, but the duration is not known. The event must be crossed downwards:
+        it begins at the approach itself.
+        """
+        problem = scaled(law, scene, velocity)
+        field = field_of(problem)
+        rtol = jnp.asarray(setting, field.gamma.dtype)
+        x, p, none = field.start  # no friction: each part more of a state costs time
+        result = diffrax.diffeqsolve(
+            diffrax.ODETerm(lambda t, y, args: args[0].rates(*y, none, 0.0)[:2]),
+            solver,
+            t0=jnp.zeros_like(rtol),
+            t1=jnp.full_like(rtol, jnp.inf),
+            dt0=None,
+            y0=(x, p),
+            args=(field, rtol),
+            stepsize_controller=diffrax.PIDController(rtol=rtol, atol=rtol),
+            event=diffrax.Event(
+                lambda t, y, args, **_: args[0].at_work(*y, none) - args[1], direction=False
+            ),
+            adjoint=diffrax.ForwardMode(),
+            max_steps=problem.dynamics.max_steps,
+            throw=False,
+        )
+        assert result.ys is not None
+        steps = result.stats["num_steps"]
+        evaluations = jnp.full_like(steps, UNCOUNTED) if stages is None else stages * steps + 1
+        ended = result.result == diffrax.RESULTS.event_occurred
+        code = jnp.where(ended, CODE["ok"], CODE["max_steps"])
+        return problem.solution(result.ys[1][-1], jnp.nan, evaluations, code, none)
+
+    return solve
+
+
+class _GaveUpError(Exception):
+    """There were more evaluations than the law allows steps."""
+
+
+def by_scipy(name: str) -> Solve:
+    """A solver of `scipy.integrate.solve_ivp`, ended by an event."""
+
+    def solve(law: LZB, scene: Scene, velocity: Any, setting: Any) -> Solution:
+        """The impact at this rtol, which is the slip below which friction is regularized, too."""
+        from scipy.integrate import solve_ivp  # late: scipy is slow to import
+
+        problem, traced = _on_host(law, scene, velocity)
+        field = Field(*(np.asarray(x, float) for x in traced))
+        m = len(field.gamma)
+        parts, rtol = np.cumsum([m, m]), max(float(setting), FINEST)
+        most = min(problem.dynamics.max_steps, GIVE_UP * m)
+        count, reached = 0, (0.0, np.concatenate(field.start))
+
+        def rates(t: float, y: np.ndarray) -> np.ndarray:
+            """The field, counted: `nfev` leaves out what the solver's own differences take."""
+            nonlocal count, reached
+            count, reached = count + 1, (t, y)
+            if count > most:
+                raise _GaveUpError
+            x, p, side = np.split(y, parts)
+            return np.concatenate(field.rates(x, p, side, rtol))
+
+        def at_work(_: float, y: np.ndarray) -> float:
+            """Positive while a contact is loaded or approaches."""
+            x, p, side = np.split(y, parts)
+            return field.at_work(x, p, side) - rtol
+
+        at_work.terminal, at_work.direction = True, -1.0  # type: ignore[attr-defined]
+        options = {"method": name, "rtol": rtol, "atol": rtol, "events": at_work}
+        try:
+            result = solve_ivp(rates, (0.0, FOREVER), reached[1], **options)
+        except _GaveUpError:
+            ended = False
+        else:
+            ended, reached = result.status == 1, (float(result.t[-1]), result.y[:, -1])
+        time, y = reached
+        _, p, side = (jnp.asarray(x, traced.gamma.dtype) for x in np.split(y, parts))
+        code = CODE["ok" if ended else "max_steps"]
+        return problem.solution(p, jnp.asarray(time), count, code, side)
+
+    return solve
+
+
+@precise_jit
+def _on_host(law: LZB, scene: Scene, velocity: Any) -> tuple[Scaled, Field]:
+    """The problem, and its field with a dense G."""
+    problem = scaled(law, scene, velocity)
+    field = field_of(problem)
+    return problem, field._replace(coupling=as_matrix(field.coupling))
