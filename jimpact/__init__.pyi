@@ -30,6 +30,7 @@ from .fits.fitting import (
 from .fits.posterior import posterior as posterior
 from .fits.problem import FitProblem as FitProblem
 from .fits.profiles import contour as contour, profile as profile
+from .fits.report import load_fit as load_fit
 from .fits.selection import (
     fit_laws as fit_laws,
     nested_test as nested_test,
@@ -89,9 +90,7 @@ from .methods.scene_advice import simplest_scene as simplest_scene
 from .methods.stability import stability_map as stability_map
 from .methods.validity import validity_map as validity_map
 from .montecarlo.distributions import Normal as Normal, RandomLaw as RandomLaw, Uniform as Uniform
-from .montecarlo.gaps import (
-    gap_scale as gap_scale,
-)
+from .montecarlo.gaps import gap_scale as gap_scale
 from .montecarlo.run import monte_carlo as monte_carlo
 from .montecarlo.store import read_samples as read_samples
 from .motion.fitting_motion import fit_motion as fit_motion

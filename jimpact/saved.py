@@ -4,7 +4,7 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
-from jimpact.fits.report import Fit, read_fit
+from jimpact.fits.report import Fit, load_fit
 from jimpact.motion.record import Motion, read_motion
 
 
@@ -40,4 +40,4 @@ def load(path: str | Path) -> Fit[Any] | Motion:
     """
     path = Path(path)
     is_motion = path.suffix == ".npz" or zipfile.is_zipfile(path)
-    return read_motion(path) if is_motion else read_fit(path)
+    return read_motion(path) if is_motion else load_fit(path)
