@@ -247,7 +247,7 @@ def shell():
     matplotlib.use(backend)
 
 
-RUNNING = ("01", "17")  # running takes most of their time
+RUNNING = ("01", "11", "17")  # running takes most of their time
 
 
 @pytest.mark.slow
