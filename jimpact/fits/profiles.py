@@ -5,7 +5,7 @@ bound, in a flat valley, with several minima), the profile gives the interval: o
 several pieces.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -355,30 +355,39 @@ class _Scans(Deviances):
         Where they jump over it, the minimum outside may have been missed: it is searched for again
         from the one inside.
         """
-        limit, again = np.sqrt(self.limit), set()
+        again = set()
         for turn in range(ROUNDS):
             trials = []
-            for i in self.which:
-                values, d = self.deviance(i)
-                height, inside = np.sqrt(d) - limit, values[d <= self.limit]
-                least = END * max(np.ptp(inside), END * abs(inside[0]))
-                for k in np.flatnonzero((height[:-1] <= 0) != (height[1:] <= 0)):
-                    a, b, p, q = values[k], values[k + 1], height[k], height[k + 1]
-                    if min(abs(p), abs(q)) <= END * limit:
-                        continue
-                    share = p / (p - q) if turn % 3 < 2 and np.isfinite(q - p) else 0.5
-                    y = a + np.clip(share, 0.02, 0.98) * (b - a)
-                    start, end = (self.known[i][x].y for x in (a, b))
-                    if a < y < b and b - a > least:
-                        at = start + (y - a) / (b - a) * (end - start)
-                        trials.append((i, with_entry(at, i, y)))
-                    elif (i, a, b) not in again:
-                        again.add((i, a, b))
-                        near, y = (start, b) if p <= 0 else (end, a)
-                        trials.append((i, with_entry(near, i, y)))
+            for i, (a, b), (p, q), least in self._crossings():
+                share = p / (p - q) if turn % 3 < 2 and np.isfinite(q - p) else 0.5
+                y = a + np.clip(share, 0.02, 0.98) * (b - a)
+                start, end = (self.known[i][x].y for x in (a, b))
+                if a < y < b and b - a > least:
+                    at = start + (y - a) / (b - a) * (end - start)
+                    trials.append((i, with_entry(at, i, y)))
+                elif (i, a, b) not in again:
+                    again.add((i, a, b))
+                    inside, outside = (start, b) if p <= 0 else (end, a)
+                    trials.append((i, with_entry(inside, i, outside)))
             if not trials:
                 return
             self.solve(trials)
+
+    def _crossings(self) -> Iterator[tuple[int, tuple[float, float], tuple[float, float], float]]:
+        """Ends that are not settled.
+
+        Each is a parameter, the fixed values to both sides, by how much the roots of their
+        deviances pass that of the limit, and the least distance of fixed values.
+        """
+        limit = np.sqrt(self.limit)
+        for i in self.which:
+            values, d = self.deviance(i)
+            height, inside = np.sqrt(d) - limit, values[d <= self.limit]
+            least = END * max(np.ptp(inside), END * abs(inside[0]))
+            for k in np.flatnonzero((height[:-1] <= 0) != (height[1:] <= 0)):
+                sides = height[k], height[k + 1]
+                if min(map(abs, sides)) > END * limit:
+                    yield i, (values[k], values[k + 1]), sides, least
 
     def fill_holes(self) -> bool:
         """Try again between two pieces, from straight lines: whether a hole was an artefact."""

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -23,7 +24,7 @@ from jimpact.laws.kinematic import Moreau, Newton
 from jimpact.laws.lzb import LZB, default_rtol
 from jimpact.laws.poisson import Poisson
 from jimpact.methods.advice_report import Advice, Candidate, ContactBlock, Unknown
-from jimpact.methods.points import EnergyNorm, Outcomes, in_batches, in_turns, raised
+from jimpact.methods.points import EnergyNorm, Outcomes, in_batches, in_turns, left_out_if_it_raises
 from jimpact.montecarlo.gaps import gap_scale
 from jimpact.progress import counting_bar
 from jimpact.registry import ADVISED, REGISTRY, simplest_first
@@ -233,14 +234,12 @@ def _advice(
 ) -> Advice:
     """Runs every law, chooses the reference and the simplest law near it."""
     v, k = situation.velocity, tried.stiffness
-    outcomes, left_out = {}, {}
+    outcomes: dict[str, Outcomes] = {}
+    left_out: dict[str, str] = {}
     for name, law in laws.items():
-        try:
+        is_reference = name in ("lzb", "compliant")  # one of them is; its error ends the advice
+        with nullcontext() if is_reference else left_out_if_it_raises(name, left_out):
             outcomes[name] = _outcomes(law, v, k, progress)
-        except Exception as error:
-            if name in ("lzb", "compliant"):  # one of them is the reference
-                raise
-            left_out[name] = raised(error)  # a user's law may fail in any way; the others stand
     laws = {name: laws[name] for name in outcomes}
     apart = _reclosing(situation, outcomes)
     follows_gaps = situation.gapped.any() or apart > tolerance / SMALL_PART

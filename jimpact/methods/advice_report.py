@@ -11,6 +11,7 @@ import numpy as np
 from jimpact.files.records import Column, Table, Tabular, as_data, fields_as_data
 from jimpact.law import Declared, Law, parameters_of
 from jimpact.laws import REGISTRY
+from jimpact.methods.points import left_out_notes
 from jimpact.montecarlo.gaps import NEARLY_TOUCHING, WIDE
 from jimpact.scene import Scene
 from jimpact.status import CODE, STATUS
@@ -187,7 +188,7 @@ class Advice(Tabular):
             for name, c in self.candidates.items()
         ]
         notes = ["", *textwrap.wrap(self._footnote(), _width())]
-        notes += [f"{name} is left out: it {why}" for name, why in self.left_out.items()]
+        notes += left_out_notes(self.left_out)
         return Table(columns, rows, [*head, ""], notes)
 
     def _footnote(self) -> str:

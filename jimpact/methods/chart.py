@@ -19,7 +19,7 @@ from jimpact.impacts import Impact, impact
 from jimpact.law import Law, check_law
 from jimpact.laws.lzb import LZB
 from jimpact.methods.contenders import CONTENDERS, Contender, outcome
-from jimpact.methods.points import in_turns, raised
+from jimpact.methods.points import in_turns, left_out_if_it_raises
 from jimpact.methods.schemes import UNCOUNTED
 from jimpact.progress import counting_bar
 from jimpact.registry import registered_laws
@@ -230,10 +230,8 @@ def work_precision(
     solutions: dict[str, list[Solved]] = {}
     with counting_bar(sum(map(len, ladders.values())), "errors", progress) as advance:
         for name, ladder in ladders.items():
-            try:
+            with left_out_if_it_raises(name, left_out):
                 solutions[name] = [programs[name].at(setting) for setting in ladder]
-            except Exception as error:  # a contender may fail in any way; the others stand
-                left_out[name] = raised(error)
             advance(len(ladder))
     rows = [(n, setting, s) for n, row in solutions.items() for setting, s in zip(ladders[n], row)]
     times = _times([(programs[name], setting) for name, setting, _ in rows], repeats, progress)

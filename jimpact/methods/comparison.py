@@ -13,7 +13,7 @@ from jimpact.audits import Audit, audit, nothing_approaches
 from jimpact.files.records import Column, Table, Tabular, as_data, fields_as_data, microseconds
 from jimpact.impacts import Impact, impact
 from jimpact.law import Law
-from jimpact.methods.points import in_turns, raised, seconds
+from jimpact.methods.points import in_turns, left_out_if_it_raises, left_out_notes, seconds
 from jimpact.registry import registered_laws
 from jimpact.scene import Scene, as_velocity
 from jimpact.status import STATUS
@@ -109,26 +109,26 @@ class Comparison(Tabular):
             Column("audit"),
         )
         rows = [
-            [name, *self._numbers(x.outcome.velocity), x.time, x.verdict]
+            [
+                *(name, *np.asarray(x.outcome.velocity).tolist()),
+                *(x.energy_ratio, x.dispersion_index, x.time, x.verdict),
+            ]
             for name, x in self.entries.items()
         ]
         if self.measured is not None:
-            rows.append(["measured", *self._numbers(self.measured), None, ""])
+            ratio = float(energy_ratio(self.scene, self.velocity, self.measured))
+            spread = float(dispersion_index(self.scene, self.measured))
+            rows.append(["measured", *self.measured.tolist(), ratio, spread, None, ""])
         notes = []
         if self.closest:
             rms = self.distances[self.closest[0]]
             named = ", ".join(self.closest)
             notes.append(f"closest to the measured velocities: {named} (rms {rms:.3g} m/s)")
-        notes += [f"{name} is left out: it {reason}" for name, reason in self.left_out.items()]
+        notes += left_out_notes(self.left_out)
         quiet = nothing_approaches(self.scene, self.velocity)
         if quiet is not None:
             notes.append(f"no impact: {quiet}")
         return Table(columns, rows, notes=notes)
-
-    def _numbers(self, after: Any) -> list[float]:
-        """Velocities [m/s], energy ratio and dispersion."""
-        ratio, spread = energy_ratio(self.scene, self.velocity, after), dispersion_index
-        return [*np.asarray(after).tolist(), float(ratio), float(spread(self.scene, after))]
 
 
 def compare(
@@ -171,11 +171,8 @@ def compare(
     runs, first = {}, {}
     for name, law in laws.items():
         run = partial(impact, law, scene, v)
-        try:
+        with left_out_if_it_raises(name, left_out):
             first[name] = seconds(run)
-        except Exception as error:  # a user's law may fail in any way; the others stand
-            left_out[name] = raised(error)
-        else:
             runs[name] = run
     each = dict(zip(runs, in_turns(list(runs.values()), _REPEATS)))
     times = {name: float(np.median(x)) for name, x in each.items()}

@@ -1,7 +1,8 @@
 """Candidates at points against a reference: outcomes in batches, their errors, and their times."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -94,9 +95,19 @@ def in_batches(
     return jax.tree.map(lambda *x: np.concatenate(x)[:count], *parts)
 
 
-def raised(error: Exception) -> str:
-    """What is said of a candidate that raised."""
-    return f"raised {type(error).__name__}: {str(error).splitlines()[0] if str(error) else '-'}"
+@contextmanager
+def left_out_if_it_raises(name: str, left_out: dict[str, str]) -> Iterator[None]:
+    """An error of this candidate is the reason why it is left out; the others stand."""
+    try:
+        yield
+    except Exception as error:  # a user's law or contender may fail in any way
+        reason = next(iter(str(error).splitlines()), "-")
+        left_out[name] = f"raised {type(error).__name__}: {reason}"
+
+
+def left_out_notes(left_out: Mapping[str, str]) -> list[str]:
+    """A line of a table's notes for each candidate that is left out."""
+    return [f"{name} is left out: it {why}" for name, why in left_out.items()]
 
 
 def seconds(run: Callable[[], Any], count: int = 1) -> float:

@@ -22,6 +22,7 @@ is touched for the first time has a closed form. It has no time, so the duration
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import diffrax
@@ -243,9 +244,20 @@ class Walk(NamedTuple):
     force: jax.Array
     steps: jax.Array
 
+    @property
+    def at_work(self) -> jax.Array:
+        """Whether a contact is loaded or approaches."""
+        return jnp.any((self.x > 0) | (self.gamma < 0))
+
 
 # (field, h, walk) -> x (to be clamped), p, p_t, force
 Step = Callable[[Field, jax.Array, Walk], tuple[jax.Array, ...]]
+
+
+def until_over(advance: Callable[[Any], Any], walk: Any, most: int) -> tuple[Any, jax.Array]:
+    """Where a walk ends that takes steps while it is `at_work`, `most` of them, and its status."""
+    end = jax.lax.while_loop(lambda x: x.at_work & (x.steps < most), advance, walk)
+    return end, jnp.where(end.at_work, CODE["max_steps"], CODE["ok"])
 
 
 def in_time(step: Step, stages: int) -> Solve:
@@ -257,10 +269,6 @@ def in_time(step: Step, stages: int) -> Solve:
         field = field_of(problem)
         h = jnp.asarray(setting, field.gamma.dtype)
 
-        def at_work(walk: Walk) -> jax.Array:
-            """Whether a contact is loaded or approaches."""
-            return jnp.any((walk.x > 0) | (walk.gamma < 0))
-
         def advance(walk: Walk) -> Walk:
             """One step."""
             x, p, side, force = step(field, h, walk)
@@ -268,9 +276,7 @@ def in_time(step: Step, stages: int) -> Solve:
             return Walk(jnp.maximum(x, 0.0), p, side, now, force, walk.steps + 1)
 
         first = Walk(*field.start, field.gamma, field.force(field.x), jnp.zeros((), jnp.int32))
-        most = problem.dynamics.max_steps
-        end = jax.lax.while_loop(lambda x: at_work(x) & (x.steps < most), advance, first)
-        code = jnp.where(at_work(end), CODE["max_steps"], CODE["ok"])
+        end, code = until_over(advance, first, problem.dynamics.max_steps)
         time = h * end.steps.astype(h.dtype)
         return problem.solution(end.p, time, stages * end.steps, code, end.side)
 
@@ -330,13 +336,10 @@ def impulse_euler(law: LZB, scene: Scene, velocity: Any, setting: Any) -> Soluti
     """Explicit steps in the primary impulse; the setting is their size."""
     problem = scaled(law, scene, velocity, setting)
     inputs, field = problem.dynamics.problem, field_of(problem)
-    none, most = jnp.zeros_like(inputs.gamma), problem.dynamics.max_steps
-    end = jax.lax.while_loop(
-        lambda walk: walk.at_work & (walk.steps < most),
-        lambda walk: _impulse_step(field, inputs.step[0], walk),
-        ImpulseWalk(inputs.gamma, 0.5 * inputs.energy, none, jnp.zeros((), jnp.int32)),
-    )
-    code = jnp.where(end.at_work, CODE["max_steps"], CODE["ok"])
+    none, zero = jnp.zeros_like(inputs.gamma), jnp.zeros((), jnp.int32)
+    first = ImpulseWalk(inputs.gamma, 0.5 * inputs.energy, none, zero)
+    advance = partial(_impulse_step, field, inputs.step[0])
+    end, code = until_over(advance, first, problem.dynamics.max_steps)
     return problem.solution(end.p, jnp.nan, end.steps, code, field.slip)
 
 

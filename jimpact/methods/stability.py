@@ -29,7 +29,7 @@ from jimpact.compiling import full_precision
 from jimpact.files.records import Column, Table, Tabular, as_data, fields_as_data
 from jimpact.laws.lzb import LZB
 from jimpact.methods.contenders import CONTENDERS, Contender, outcome
-from jimpact.methods.points import in_batches, raised
+from jimpact.methods.points import in_batches, left_out_if_it_raises, left_out_notes
 from jimpact.progress import counting_bar
 from jimpact.scene import Scene, as_velocity, chain
 from jimpact.status import CODE
@@ -182,8 +182,7 @@ class StabilityMap(Tabular):
         ]
         counts = [Column(name, lambda count: str(count or "")) for name in CLASSES]
         rows = [[name, *self.counts(name).values()] for name in self.methods]
-        notes = [f"{name} is left out: it {why}" for name, why in self.left_out.items()]
-        return Table([Column("method"), *counts], rows, head, notes)
+        return Table([Column("method"), *counts], rows, head, left_out_notes(self.left_out))
 
 
 @full_precision
@@ -264,12 +263,11 @@ def stability_map(
     total = len(points) * (len(chosen) + 1)
     with counting_bar(total, "impacts", progress) as advance:
         exact, confirmation = references(points, place, runners, advance)
-        results, left_out = {}, {}
+        results: dict[str, Any] = {}
+        left_out: dict[str, str] = {}
         for m in chosen:
-            try:
+            with left_out_if_it_raises(m.name, left_out):
                 results[m.name] = classes_of(m, points, place, exact, runners, advance)
-            except Exception as error:  # a contender may fail in any way; the others stand
-                left_out[m.name] = raised(error)
     ends = np.cumsum([part[..., 0].size for part in parts])
     by_slice, by_sample = {}, {}
     for name, columns in results.items():
