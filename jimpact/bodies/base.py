@@ -519,7 +519,8 @@ def as_planes(planes: Any, dimension: int) -> jax.Array:
         check_shape("planes", row, (d + 1,), f"a normal and a distance{angles}")
         check_values("planes", row)
         length, n = lengths(row[None, :d])
-        check_values("planes", length, low=0.0, open_low=True)
+        if not is_traced(length) and not float(length[0]) > 0:
+            raise ValueError(f"Argument `planes` must have normals that are not 0, but has {row}.")
         rows.append(jnp.concatenate([n[0], row[d:]]))
     return jnp.stack(rows) if rows else jnp.zeros((0, d + 1))
 
