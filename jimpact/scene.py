@@ -623,13 +623,10 @@ def _is_symmetric(mass: Any) -> Any:
 def is_allowed(scene: Scene) -> jax.Array:
     """Whether () the values of a traced scene are those that `Scene` allows on the host.
 
-    NaN is not looked for; a dense M that is not positive definite gives energies without a value.
+    NaN is not looked for; a dense M that is not positive definite gives energies without a value,
+    a normal that is zero gives a contact without a scale.
     """
     allowed = [jnp.all(scene.mass > 0) if scene.mass.ndim == 1 else _is_symmetric(scene.mass)]
-    if scene.pairs is not None:
-        allowed.append(jnp.all(jnp.any(scene.pairs.directions != 0, axis=(1, 2))))
-    elif scene.walls is None:
-        allowed.append(jnp.all(_has_body(scene.normals)))
     if scene.gaps is not None:
         allowed.append(jnp.all(scene.gaps >= 0))
     return jnp.all(jnp.asarray(allowed))

@@ -73,7 +73,7 @@ MUTATIONS = [
     Mutation("(eta + 1)/2 becomes eta/2", "ContactFlow.constants", "per_row(self.exponent, self.omega) + 1", "per_row(self.exponent, self.omega)", FLOW),
     Mutation("no recompression", "ContactFlow.switch", "after = jnp.where(by_g & (phase == EXPANSION), COMPRESSION, after)", "pass", FLOW),
     Mutation("no re-closing", "ContactFlow.switch", "by_x | by_g", "by_x", FLOW),
-    Mutation("gaps forgotten", "first_indentation", "-problem.gap", "-0.5 * problem.gap", FLOW),
+    Mutation("gaps forgotten", "first_indentation", "-problem.gap", "-0.5 * problem.gap", ("test_compliant.py",)),
     Mutation("crossings are missed", "_intentions", "-zero", "-1000.0 * zero", FLOW),
     Mutation("every step accepted", "advance", "error2 <= 1", "error2 <= 1000000.0", FLOW),
     Mutation("LCP: the least ratio becomes the first", "_leaving", "jnp.argmin(ratio)", "jnp.argmax(candidates)", KINEMATIC),
@@ -89,9 +89,6 @@ MUTATIONS = [
     Mutation("energies that no number holds pass", "Traced.status", "_has_scale(size, arguments[2])", "True", ("test_contract.py::test_energies_that_no_number_holds_are_out_of_range[moreau]",)),
     Mutation("gaps that are not known count as open", "Traced._refusal", "[jnp.any(jnp.isnan(x)) for x in numbers]", "[]", ("test_contract.py::test_what_the_host_refuses_has_a_status_inside_jit[moreau]",)),
     Mutation("an asymmetric mass passes inside jit", "is_allowed", "_is_symmetric(scene.mass)", "jnp.asarray(True)", ("test_contract.py::test_what_the_host_refuses_has_a_status_inside_jit[moreau]",)),
-    Mutation("a normal of zero passes inside jit", "is_allowed", """if scene.walls is None:
-    allowed.append(jnp.all(_has_body(scene.normals)))""", """if scene.walls is None:
-    pass""", ("test_contract.py::test_what_the_host_refuses_has_a_status_inside_jit[moreau]",)),
     Mutation("constraints may be broken inside jit", "Traced._refusal", """if self.constrained:
     allowed.append(jnp.all(_keeps_constraints(scene.constraints, v)))""", """if self.constrained:
     pass""", ("test_errors.py::test_what_the_host_refuses_has_a_status_inside_jit",)),
@@ -237,7 +234,9 @@ def run(mutation):
                 shutil.copy(ROOT / part, folder / part)
         (folder / path.relative_to(ROOT)).write_text(text, encoding="utf-8")
         command = [sys.executable, "-m", "pytest", "-p", "no:xdist", "-x", "-q", "--no-header"]
-        command += ["-o", "addopts=--import-mode=importlib -m 'not release'", "--tb=no", "-rfE"]
+        command += ["-o", "addopts=--import-mode=importlib", "--tb=no", "-rfE"]
+        if not any("::" in test for test in mutation.tests):  # a test that is named may be long
+            command += ["-m", "not release"]
         command += [f"tests/contract/{test}" for test in mutation.tests]
         environment = os.environ | {"PYTHONPATH": name, "JAX_PLATFORMS": "cpu"}
         options = {"cwd": folder, "env": environment, "capture_output": True, "text": True}

@@ -20,6 +20,24 @@ def written(tmp_path, text, encoding="utf-8"):
     return path
 
 
+@pytest.mark.parametrize(
+    ("unit", "factor"),
+    [
+        ("m/s", 1),
+        ("cm/s", 0.01),
+        ("mm/s", 0.001),
+        ("km/h", 1 / 3.6),
+        ("in/s", 0.0254),
+        ("ft/s", 0.3048),
+    ],
+)
+def test_units(tmp_path, unit, factor):
+    path = written(tmp_path, f"pre_1[m/s],post_1[{unit}],sigma_1[{unit}]\n1,-2,0.5\n")
+    data = ji.read_experiments(path)
+    np.testing.assert_allclose([data.pre[0, 0], data.post[0, 0]], [1, -2 * factor], rtol=1e-15)
+    np.testing.assert_allclose(data.sigma[0, 0], 0.5 * factor, rtol=1e-15)
+
+
 def test_bundled_data():
     balls = ji.read_experiments(DATA / "three_balls.csv")
     np.testing.assert_array_equal(balls.pre, [[1.0, 0.0, 0.0]])

@@ -91,6 +91,9 @@ def test_forces_gaps_and_exponents():
         out = ji.impact(ji.Compliant(force, method="implicit"), scene, [1.0, 0.0, 0.0])
         np.testing.assert_allclose(out.velocity, expected, atol=1.5 * DEFAULT_RTOL)
         assert out.status == 0
+    far = ji.chain([1.0, 1.0, 1.0], gaps=[0.0, 10.0])  # one pair after the other
+    out = ji.impact(ji.Compliant(ji.Hertz(1.0), method="implicit"), far, [1.0, 0.0, 0.0])
+    np.testing.assert_allclose(out.velocity, [0.0, 0.0, 1.0], atol=1.5 * DEFAULT_RTOL)
 
 
 def test_derivatives():

@@ -3,10 +3,8 @@
 from importlib.resources import files
 
 import numpy as np
-import pytest
 
 import jimpact as ji
-from jimpact.files.shots_file import UNITS
 from jimpact.fits.checks import data_defects
 
 DATA = files("jimpact") / "data"
@@ -19,25 +17,6 @@ def written(tmp_path, text, encoding="utf-8"):
     path = tmp_path / "shots.csv"
     path.write_bytes(text.encode(encoding))
     return path
-
-
-@pytest.mark.parametrize(
-    ("unit", "factor"),
-    [
-        ("m/s", 1),
-        ("cm/s", 0.01),
-        ("mm/s", 0.001),
-        ("km/h", 1 / 3.6),
-        ("in/s", 0.0254),
-        ("ft/s", 0.3048),
-    ],
-)
-def test_units(tmp_path, unit, factor):
-    path = written(tmp_path, f"pre_1[m/s],post_1[{unit}],sigma_1[{unit}]\n1,-2,0.5\n")
-    data = ji.read_experiments(path)
-    np.testing.assert_allclose([data.pre[0, 0], data.post[0, 0]], [1, -2 * factor], rtol=1e-15)
-    np.testing.assert_allclose(data.sigma[0, 0], 0.5 * factor, rtol=1e-15)
-    assert unit in UNITS
 
 
 def test_momentum_of_the_measured_balls():
