@@ -197,7 +197,7 @@ class _WithJacobian:
             outs, rates = along(unit)
             return *outs, *rates
         outs, rates = jax.lax.map(along, unit.reshape(count, size, -1))
-        joined = (x.reshape(-1, *x.shape[2:])[: sum(sizes)] for x in rates)
+        joined = (jnp.concatenate(x)[: sum(sizes)] for x in rates)
         return *(x[0] for x in outs), *joined
 
 

@@ -268,36 +268,75 @@ def _stages(flow: Any, s: Step, y: Any, ends: bool) -> tuple[Any, ...]:
     n, dtype, batch = state.shape[0], state.dtype, state.shape[1:]
     const, c0, frame = pushforward(lambda flow, y: _frame(flow, s, y), flow, y)
     count = STAGES + 1 if ends else STAGES  # the 13th evaluation, that of the end, has no weight
-    table = jnp.asarray(np.pad(_TABLE[:count], ((0, 0), (0, count - STAGES))), dtype)
-    weights = jnp.asarray(np.pad(_WEIGHTS, ((0, 0), (0, count - STAGES))), dtype)
     adds = sum(plain.adding)
     blocks = plain.driving or (n - adds,)
     ends_of = np.cumsum([0, *blocks, *plain.adding])
 
-    def stage(carry: Any, row: Any) -> tuple[Any, None]:
-        """One evaluation of the field."""
-        slopes, added, *margins = carry
-        i, a, node = row
-        change = jax.tree.map(lambda k: jnp.tensordot(a, k, axes=1), slopes)
-        new, (value, dc) = pushforward(
+    def evaluate(i: jax.Array, node: jax.Array, change: Any) -> Any:
+        """New rows of both tables of slopes; margins and their rates."""
+        new, margins = pushforward(
             lambda flow, const, frame, y, change: _slopes(
                 flow, const, frame, s, y, (i, node, change), ends_of
             ),
             *(flow, const, frame, y, change),
         )
-        slopes = _with_row(slopes, new[: len(blocks)], i)
-        added = _with_row(added, new[len(blocks) :], i)
-        if ends:
-            margins = [jnp.where(i == 0, dc, margins[0]), value, dc]
-        return (slopes, added, *margins), None
+        return (new[: len(blocks)], new[len(blocks) :]), margins
 
-    none = [jnp.zeros((count, k, *batch), dtype) for k in (n - adds, adds + 1)]
-    carry = [dual_like((flow, y), k) for k in none]
-    margins = [jnp.zeros_like(s.target, dtype)] * (3 if ends else 0)
-    rows = (jnp.arange(count, dtype=jnp.uint32), table, jnp.asarray(_NODES[:count], dtype))
-    (slopes, added, *margins), _ = scan(stage, (*carry, *margins), rows)
-    change, errors = _weighted([slopes, added], weights, frame.length)
+    row = [dual_like((flow, y), jnp.zeros((1, k, *batch), dtype)) for k in (n - adds, adds + 1)]
+    stages = _scanned if jax.default_backend() == "cpu" else _written_out
+    tables, margins = stages(evaluate, row, count, jnp.zeros_like(s.target, dtype))
+    weights = jnp.asarray(np.pad(_WEIGHTS, ((0, 0), (0, count - STAGES))), dtype)
+    change, errors = _weighted(tables, weights, frame.length)
     return change, errors[:, :n], c0, margins
+
+
+def _scanned(evaluate: Any, row: list[Any], count: int, none: jax.Array) -> tuple[Any, Any]:
+    """Slopes of all stages (count, k, B), two tables, from empty rows (1, k, B) of them; rates of
+    margins (k, B) in the first stage, margins and rates in the last, from `none`.
+
+    One kernel for all stages: it compiles quickly.
+    """
+    dtype = none.dtype
+    table = jnp.asarray(np.pad(_TABLE[:count], ((0, 0), (0, count - STAGES))), dtype)
+
+    def stage(carry: Any, at: Any) -> tuple[Any, None]:
+        """One evaluation of the field."""
+        slopes, added, first, *_ = carry
+        i, weights, node = at
+        change = jax.tree.map(lambda k: jnp.tensordot(weights, k, axes=1), slopes)
+        (new, new_added), (value, dc) = evaluate(i, node, change)
+        slopes, added = _with_row(slopes, new, i), _with_row(added, new_added, i)
+        return (slopes, added, jnp.where(i == 0, dc, first), value, dc), None
+
+    tables = jax.tree.map(lambda x: jnp.zeros((count, *x.shape[1:]), dtype), row)
+    each = (jnp.arange(count, dtype=jnp.uint32), table, jnp.asarray(_NODES[:count], dtype))
+    (slopes, added, *margins), _ = scan(stage, (*tables, none, none, none), each)
+    return [slopes, added], margins
+
+
+def _written_out(evaluate: Any, row: list[Any], count: int, none: jax.Array) -> tuple[Any, Any]:
+    """As `_scanned`, each stage with kernels of its own.
+
+    On a GPU the tables that a scan carries pass through memory in every stage, for twice the time
+    of an impact. On a CPU this is no faster, and compiles for two to four times as long.
+    """
+    tables: list[list[Any]] = [[], []]
+    margins = []
+    for i in range(count):
+        used = np.flatnonzero(_TABLE[i, :i])
+        change = jax.tree.map(lambda x: x[0], row[0])
+        if used.size:
+            change = jax.tree.map(
+                lambda *k, i=i, used=used: sum(float(_TABLE[i, j]) * x[0] for j, x in zip(used, k)),
+                *(tables[0][j] for j in used),
+            )
+        node = jnp.asarray(_NODES[i], none.dtype)
+        new, margin = evaluate(jnp.asarray(i, jnp.uint32), node, change)
+        for table, empty, part in zip(tables, row, new):
+            table.append(_with_row(empty, part, jnp.zeros((), jnp.uint32)))
+        margins.append(margin)
+    whole = [jax.tree.map(lambda *x: jnp.concatenate(x), *table) for table in tables]
+    return whole, (margins[0][1], *margins[-1])
 
 
 def _weighted(tables: list[Any], weights: jax.Array, length: Any) -> tuple[Any, jax.Array]:

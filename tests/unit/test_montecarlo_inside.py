@@ -283,7 +283,13 @@ def test_every_law_can_be_sampled(name):
         law = RandomLaw(law, restitution=Uniform(0.8, 0.9))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # some laws do not promise admissible outcomes
-        result = sampled(law=law, velocity=Normal([1.0, 0.0, -1.0], 0.1), samples=64, chunk=64)
+        result = sampled(
+            law=law,
+            velocity=Normal([1.0, 0.0, -1.0], 0.1),
+            gaps=GAPS if law.uses_gaps else None,
+            samples=64,
+            chunk=64,
+        )
     assert result.count > 0
     assert result.std.min() > 1e-3
     law, scene, velocity = result.replay(3)
