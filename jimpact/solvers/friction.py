@@ -429,7 +429,7 @@ def _most_at_rest(
     """
     rest = _at_rest(problem, x, jnp.asarray(problem.tolerance, x.dtype))
     both = jax.tree.map(lambda *leaf: jnp.stack(leaf), rest, modes)
-    inverted = jax.vmap(lambda modes: _inverted(problem, modes, x))(both)
+    inverted = jax.lax.map(lambda modes: _inverted(problem, modes, x), both)
     inverted = inverted._replace(held=jnp.array([False, True]))
     first = jax.tree.map(lambda leaf: leaf[0], inverted)
     shared = _on_modes(problem, rest, first, x)
