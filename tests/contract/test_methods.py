@@ -234,7 +234,7 @@ def test_right_or_flagged():
     ("n", "share"),
     [
         pytest.param(2, 0.99, marks=pytest.mark.slow),
-        pytest.param(3, 0.7, marks=pytest.mark.slow),
+        pytest.param(3, 0.7, marks=pytest.mark.release),
         pytest.param(6, 0.6, marks=pytest.mark.release),
         pytest.param(20, 0.15, marks=pytest.mark.release),
         pytest.param(100, 0.0, marks=pytest.mark.release),
@@ -257,15 +257,9 @@ def test_hard_points(point):
     check_right(point, STEPS)
 
 
+@pytest.mark.release
 @pytest.mark.long_run
-@pytest.mark.parametrize(
-    "point",
-    [  # twenty balls are a program that only those tests have
-        pytest.param(x, marks=pytest.mark.release if x == 4 else pytest.mark.slow)
-        for x in HARD_LATER
-    ],
-    ids=HARD_LATER.get,
-)
+@pytest.mark.parametrize("point", HARD_LATER, ids=HARD_LATER.get)
 def test_hard_points_after_many_steps(point):
     check_right(point, MANY_STEPS)
 

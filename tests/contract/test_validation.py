@@ -13,7 +13,12 @@ from rows import CASES
 TEXT = page.PAGE.read_text(encoding="utf-8") if page.PAGE.exists() else ""
 
 
-SLOW = ("solitary_wave", "vibrating_plate", "schroedinger", "spring_and_dashpot")
+MARKS = {
+    "solitary_wave": pytest.mark.release,
+    "vibrating_plate": pytest.mark.release,
+    "schroedinger": pytest.mark.slow,
+    "spring_and_dashpot": pytest.mark.slow,
+}
 
 
 @pytest.mark.parametrize(
@@ -22,7 +27,7 @@ SLOW = ("solitary_wave", "vibrating_plate", "schroedinger", "spring_and_dashpot"
         pytest.param(
             case,
             id=case.rows.__name__,
-            marks=[pytest.mark.slow] if case.rows.__name__ in SLOW else [],
+            marks=MARKS.get(case.rows.__name__, ()),
         )
         for case in CASES
     ],
