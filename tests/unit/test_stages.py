@@ -15,11 +15,11 @@ def test_stages_written_out_are_the_scanned_ones(monkeypatch):
 
     def outcomes():
         """Of a fresh function, which JAX has no compiled program of."""
-        impact = lambda e, k: (
-            ji.impact(  # noqa: E731
-                ji.LZB(e, [1.0, k], 1.5), ji.chain([1.0, 2.0, 1.0]), [1.0, 0.0, -0.5]
-            ).velocity
-        )
+
+        def impact(e, k):
+            law = ji.LZB(e, [1.0, k], 1.5)
+            return ji.impact(law, ji.chain([1.0, 2.0, 1.0]), [1.0, 0.0, -0.5]).velocity
+
         values = jax.vmap(lambda k: (impact(0.9, k), jax.jacfwd(impact)(0.9, k)))
         return jax.jit(values)(jnp.array([0.3, 2.0]))
 
