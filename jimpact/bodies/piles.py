@@ -167,7 +167,7 @@ class Pile(Body):
         Only normals of two bodies each are stored, and W has few entries in a row: an impact of
         `Moreau`, `Poisson`, `LZB` or `Compliant` costs what the contacts cost. (`scene` holds all
         pairs and every gap.) Which bodies touch is compiled in: every packing compiles anew.
-        `ji.pile_contacts` has friction.
+        `TimeStepping.contacts` has friction.
 
         Args:
             q: (n,), see `at`; not traced.
