@@ -9,21 +9,23 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
-from jimpact.bodies.base import (
-    PLANAR,
-    Body,
+from jimpact.bodies.base import OnGround, as_planes, lengths, number
+from jimpact.bodies.contacts import (
+    Assembly,
     ContactPoints,
-    LinearPotential,
-    OnGround,
-    as_planes,
-    dot,
-    floors_of,
-    lengths,
-    moving,
-    number,
-    numbered,
-    planar_directions,
-    planar_weight,
+    joined,
+    on_planes,
+    round_on_round,
+)
+from jimpact.bodies.polygon_contacts import (
+    PARALLEL,
+    FacingSides,
+    disc_on_polygon,
+    facing_now,
+    facing_sides,
+    outward,
+    placed,
+    side_of,
 )
 from jimpact.bodies.polygons import Cornered, Disc
 from jimpact.compiling import full_precision
@@ -35,10 +37,9 @@ _CUT = 2.0
 # less, and steps of a motion may pass over it.
 _NEAR_CUT = 1e-4
 _TOUCHING = 1e-6  # [m] gap from which they may pass it; ten times more would do
-_PARALLEL = 1e-9  # [m] more than rounding: between parallel sides it does not decide
 
 
-class PlanarBodies(Body):
+class PlanarBodies(Assembly):
     """Planar bodies on planes and on each other; q = (x, y, theta) of each centre of mass.
 
     Equation: on a plane with normal n = (-sin a, cos a), at offset d from the origin, each contact
@@ -120,51 +121,23 @@ class PlanarBodies(Body):
         return jnp.concatenate([body.mass for body in self.bodies])
 
     @property
-    def base_directions(self) -> jax.Array:
-        """All planes move in x and y (3 b, 2)."""
-        return planar_directions(self.mass)
+    def count(self) -> int:
+        """Number of bodies."""
+        return len(self.bodies)
 
-    def gravity(self, acceleration: Any) -> LinearPotential:
-        """`V = g sum m_i y_i`."""
-        return planar_weight(self.mass, acceleration)
-
-    @full_precision
     def contacts(self, q: jax.Array) -> ContactPoints:
         """Gaps, points and normals at q (3 b,); `between` says of which bodies."""
         places, parts = self._places(q), []
         if self.planes.shape[0]:
-            parts.append(self._on_planes(places))
+            parts.append(on_planes(self.planes, places.points, places.rim[places.owner]))
         if self.pairs.discs:
-            parts.append(_discs(places, np.array(self.pairs.discs)))
-        for polygon, discs in self.pairs.rolling:
-            parts.append(_disc_on_polygon(places, np.array(discs), polygon))
+            i, j = np.array(self.pairs.discs).T
+            middle, rim = places.middle, places.rim
+            parts.append(round_on_round(middle[i], middle[j], rim[i], rim[j]))
+        parts += [_on_polygon(places, *pairs) for pairs in self.pairs.rolling]
         if self.pairs.sides or self.pairs.polygons:
             parts.append(facing_sides(_all_sides(places, self.pairs)))
-        return ContactPoints(*(jnp.concatenate(rows) for rows in zip(*parts)))
-
-    def gap_function(self, q: jax.Array) -> jax.Array:
-        """Gaps f(q) (m,) [m]."""
-        return self.contacts(q).gap
-
-    def gaps_and_normals(self, q: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Gaps (m,) and N (n, m)."""
-        contacts = self.contacts(q)
-        return contacts.gap, self._along(q, contacts.point, contacts.normal)
-
-    def tangents(self, q: jax.Array) -> jax.Array:
-        """H_t (3 b, m): how fast body 1 slides along body 2, to the right of the normal."""
-        contacts = self.contacts(q)
-        right = jnp.stack([contacts.normal[:, 1], -contacts.normal[:, 0]], axis=1)
-        return self._along(q, contacts.point, right)
-
-    def _along(self, q: jax.Array, point: jax.Array, way: jax.Array) -> jax.Array:
-        """(3 b, m): speeds along directions (m, 2) of body 1 from body 2 at points (m, 2)."""
-        lever = point[:, None] - q.reshape(-1, 3)[None, :, :2]
-        turn = lever[..., 0] * way[:, 1:] - lever[..., 1] * way[:, :1]
-        still = jnp.broadcast_to(way[:, None], lever.shape)
-        rows = jnp.concatenate([still, turn[..., None]], axis=2)
-        moves = moving(self.between, len(self.bodies))[..., None]
-        return (jnp.asarray(moves, q.dtype) * rows).reshape(len(moves), -1).T
+        return joined(parts)
 
     @full_precision
     def valid(self, q: jax.Array) -> jax.Array:
@@ -174,7 +147,7 @@ class PlanarBodies(Body):
             i, j = np.array(self.pairs.discs).T
             margins.append(lengths(places.middle[i] - places.middle[j])[0])
         for polygon, discs in self.pairs.rolling:
-            contacts = _disc_on_polygon(places, np.array(discs), polygon)
+            contacts = _on_polygon(places, polygon, discs)
             margins.append(contacts.gap + places.rim[np.array(discs)])
         margins += [_overlap(places, *pair)[None] for pair in self.pairs.sides]
         margins += [_off_cut(places, *pair)[None] for pair in self.pairs.polygons]
@@ -190,26 +163,10 @@ class PlanarBodies(Body):
         place = [n_y * right + n_x * up, n_y * up - n_x * right, turn + jnp.arctan2(-n_x, n_y)]
         return jnp.stack(place)
 
-    def at(self, centres: Any) -> jax.Array:
-        """q (3 b,) with the bodies, not turned, at these centres (b, 2) [m]."""
-        places = as_float_array("centres", centres)
-        check_shape("centres", places, (len(self.bodies), 2), "one for each body")
-        return jnp.pad(places, ((0, 0), (0, 1))).reshape(-1)
-
     def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
         """Those of all bodies."""
         each = zip(self.bodies, np.reshape(q, (-1, 3)))
         return [curve for body, x in each for curve in body.outlines(x, point)]
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """x, y, angle of each body."""
-        return numbered(PLANAR, len(self.bodies))
-
-    @property
-    def floors(self) -> list[Any]:
-        """The planes."""
-        return floors_of(self.planes)
 
     def _places(self, q: jax.Array) -> "_Places":
         """Contact points and corners at q (3 b,)."""
@@ -224,14 +181,6 @@ class PlanarBodies(Body):
             if isinstance(body, Cornered)
         }
         return _Places(at[:, 2], owner, points, points[np.cumsum(counts) - counts], rim, polygons)
-
-    def _on_planes(self, places: "_Places") -> ContactPoints:
-        """Contacts of all points with all planes."""
-        n, offset = self.planes[:, None, :2], self.planes[:, 2]
-        height = jnp.sum(n * places.points[None], axis=2) - offset[:, None]
-        point = places.points[None] - height[..., None] * n
-        gap, normal = height - places.rim[places.owner][None], jnp.broadcast_to(n, point.shape)
-        return ContactPoints(gap.reshape(-1), point.reshape(-1, 2), normal.reshape(-1, 2))
 
 
 Side = tuple[int, int]  # of which body, and which
@@ -264,64 +213,10 @@ class _Places(NamedTuple):
     polygons: dict[int, jax.Array]  # corners (k, 2), counter-clockwise
 
 
-def placed(points: jax.Array, at: jax.Array) -> jax.Array:
-    """Points (p, 2) of bodies at (p or 1, 3)."""
-    c, s = jnp.cos(at[:, 2]), jnp.sin(at[:, 2])
-    x, y = points.T
-    return at[:, :2] + jnp.stack([c * x - s * y, s * x + c * y], axis=1)
-
-
-def _outward(side: jax.Array) -> jax.Array:
-    """Unit normals (.., 2) of counter-clockwise sides (.., 2); 0 of one without length."""
-    square = dot(side, side)[..., None]
-    turned = jnp.stack([side[..., 1], -side[..., 0]], axis=-1)
-    return turned / jnp.sqrt(jnp.where(square > 0, square, 1.0))
-
-
-def _discs(places: _Places, pairs: np.ndarray) -> ContactPoints:
-    """One contact for each pair (g, 2) of discs."""
-    i, j = pairs.T
-    length, n = lengths(places.middle[i] - places.middle[j])
-    gap = length - places.rim[i] - places.rim[j]
-    return ContactPoints(gap, places.middle[j] + (places.rim[j] + 0.5 * gap)[:, None] * n, n)
-
-
-def _disc_on_polygon(places: _Places, discs: np.ndarray, polygon: int) -> ContactPoints:
-    """Distances of discs from a polygon: from a side, or, beyond its ends, from a corner."""
-    middle = places.middle[discs]
-    away, n = from_polygon(middle, places.polygons[polygon])
-    return ContactPoints(away - places.rim[discs], middle - away[:, None] * n, n)
-
-
-def from_polygon(middle: jax.Array, begin: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Distances (g,) of points (g, 2) from a polygon of corners (k, 2), and unit vectors from it.
-
-    Sides without length do not count.
-    """
-    side = jnp.roll(begin, -1, axis=0) - begin
-    normals = _outward(side)
-    heights = _of_sides(jnp.sum((middle[:, None] - begin[None]) * normals[None], axis=2), normals)
-    nearest = jnp.argmax(heights, axis=1)  # outside, its side or one of its ends is the nearest
-    a, tangent, n = begin[nearest], side[nearest], normals[nearest]
-    share = dot(middle - a, tangent) / dot(tangent, tangent)
-    beyond = (share < 0) | (share > 1)
-    corner = a + jnp.where(share > 1, 1.0, 0.0)[:, None] * tangent
-    length, toward = lengths(middle - corner)
-    n = jnp.where(beyond[:, None], toward, n)
-    return jnp.where(beyond, length, jnp.max(heights, axis=1)), n
-
-
-def _of_sides(heights: jax.Array, normals: jax.Array) -> jax.Array:
-    """Heights (.., k) over sides of these normals (k, 2), -inf over those without length."""
-    return jnp.where(jnp.any(normals != 0, axis=1), heights, -jnp.inf)
-
-
-class FacingSides(NamedTuple):
-    """Sides in contact of pairs of polygons, each from its begin to its end (g, 2)."""
-
-    first: tuple[jax.Array, jax.Array]
-    second: tuple[jax.Array, jax.Array]
-    swapped: jax.Array  # (g,) whether the contact at the first side's end comes first
+def _on_polygon(places: _Places, polygon: int, discs: tuple[int, ...]) -> ContactPoints:
+    """Contacts of discs with a polygon."""
+    some = np.array(discs)
+    return disc_on_polygon(places.middle[some], places.rim[some], places.polygons[polygon])
 
 
 def _all_sides(places: _Places, pairs: _Pairs) -> FacingSides:
@@ -357,7 +252,7 @@ def _full_turns(
 
     `way` is that direction, n or -n; its angle goes on by the one of n, from `_CUT` to there again.
     """
-    own = _outward(jnp.roll(corners, -1, axis=0) - corners)
+    own = outward(jnp.roll(corners, -1, axis=0) - corners)
     own = jnp.arctan2(own[:, 1], own[:, 0])
     turned = jnp.arctan2(n[1], n[0])
     turned = _CUT + (turned - _CUT) % (2 * np.pi) + jnp.where(way @ n > 0, 0.0, np.pi)
@@ -377,67 +272,15 @@ def _off_cut(places: _Places, i: int, j: int) -> jax.Array:
     return jnp.maximum(off, apart - _TOUCHING)
 
 
-@full_precision
-def facing_now(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Sides () of two polygons that face each other, and the normal (2,) from a to b.
-
-    The line of one side keeps the polygons apart most. The other polygon's nearest corner to this
-    line is an end of its side that is most opposite.
-    """
-    n_a, n_b = (_outward(jnp.roll(x, -1, axis=0) - x) for x in (a, b))
-    beyond_a = _of_sides(jnp.min(jnp.sum((b[:, None] - a[None]) * n_a[None], axis=2), axis=0), n_a)
-    beyond_b = _of_sides(jnp.min(jnp.sum((a[:, None] - b[None]) * n_b[None], axis=2), axis=0), n_b)
-    side_a, side_b = jnp.argmax(beyond_a), jnp.argmax(beyond_b)
-    opposite = n_a @ n_b.T
-    by_b = jnp.max(beyond_b) > jnp.max(beyond_a) + _PARALLEL
-    side_a = jnp.where(by_b, jnp.argmin(opposite[:, side_b]), side_a)
-    side_b = jnp.where(by_b, side_b, jnp.argmin(opposite[side_a]))
-    return side_a, side_b, jnp.where(by_b, -n_b[side_b], n_a[side_a])
-
-
-def facing_sides(sides: FacingSides) -> ContactPoints:
-    """Two contacts a pair, at the begin and at the end of the first body's side."""
-    (a_begin, a_end), (b_begin, b_end) = sides.first, sides.second
-    n_a, n_b = _outward(a_end - a_begin), _outward(b_end - b_begin)
-
-    def at_end(a: jax.Array, other_a: jax.Array, b: jax.Array, other_b: jax.Array) -> ContactPoints:
-        """Contacts at the ends a (g, 2) of first sides, which face the ends b of second ones."""
-        side = other_a - a
-        share = dot(side, b - a) / dot(side, side)
-        over = dot(b - other_b, a - b) > 0  # a overhangs: b is under the side, or beyond it
-        past = dot(other_b - b, a - other_b) > 0  # the sides do not overlap
-        by_side = over & (share >= 0) & (share <= 1)
-        by_end = past | (over & ~by_side)
-        end = jnp.where((over & (share > 1))[:, None], other_a, a)
-        b = jnp.where(past[:, None], other_b, b)
-        apart, toward = lengths(end - b)
-        gap = jnp.where(by_end, apart, jnp.where(by_side, dot(n_a, b - a), dot(n_b, a - b)))
-        n = jnp.where(by_end[:, None], toward, jnp.where(by_side[:, None], -n_a, n_b))
-        point = jnp.where(by_end[:, None], 0.5 * (end + b), jnp.where(by_side[:, None], b, a))
-        return ContactPoints(gap, point, n)
-
-    both = (at_end(a_begin, a_end, b_end, b_begin), at_end(a_end, a_begin, b_begin, b_end))
-    gap, point, n = (jnp.stack(parts, axis=1) for parts in zip(*both))
-    swapped = sides.swapped[:, None]
-    gap = jnp.where(swapped, gap[:, ::-1], gap)
-    point, n = (jnp.where(swapped[..., None], x[:, ::-1], x) for x in (point, n))
-    return ContactPoints(gap.reshape(-1), point.reshape(-1, 2), n.reshape(-1, 2))
-
-
 def _side(places: _Places, side: Side) -> tuple[jax.Array, jax.Array]:
     """Its begin and its end (2,)."""
     return side_of(places.polygons[side[0]], side[1])
 
 
-def side_of(corners: jax.Array, side: Any) -> tuple[jax.Array, jax.Array]:
-    """Begin and end (2,) of a side of a polygon with these corners (k, 2)."""
-    return corners[side], corners[(side + 1) % corners.shape[0]]
-
-
 def _overlap(places: _Places, first: Side, second: Side) -> jax.Array:
     """Margin () [m] of the gaps of two sides, see `PlanarBodies`."""
     (a_begin, a_end), (b_begin, b_end) = _side(places, first), _side(places, second)
-    n = _outward(b_end - b_begin)
+    n = outward(b_end - b_begin)
     tangent = jnp.stack([-n[1], n[0]])  # from begin to end
     corners = places.polygons[first[0]]
     others = [
@@ -448,7 +291,7 @@ def _overlap(places: _Places, first: Side, second: Side) -> jax.Array:
     shared = jnp.minimum(tangent @ (a_begin - b_end), 0.0) + tangent @ (b_end - b_begin)
     shared = shared - jnp.maximum(tangent @ (a_end - b_begin), 0.0)
     above = jnp.minimum((a_begin - b_begin) @ n, (a_end - b_begin) @ n)
-    n_a = _outward(a_end - a_begin)
+    n_a = outward(a_end - a_begin)
     apart = jnp.maximum(above, jnp.minimum((b_begin - a_begin) @ n_a, (b_end - a_begin) @ n_a))
     return jnp.minimum(jnp.minimum(beyond, facing), jnp.maximum(shared, apart))
 
@@ -531,7 +374,7 @@ def _sides_of(
         """Corners of a body and outward normals of its sides (k, 2)."""
         body = _polygon(bodies, which)
         corners = placed(body.corners[np.array(body.ring)], q.reshape(-1, 3)[which][None])
-        return np.asarray(corners), np.asarray(_outward(jnp.roll(corners, -1, axis=0) - corners))
+        return np.asarray(corners), np.asarray(outward(jnp.roll(corners, -1, axis=0) - corners))
 
     best = []
     for first, second in ((i, j), (j, i)):
@@ -540,5 +383,5 @@ def _sides_of(
         widest = int(np.argmax(away))
         facing = int(np.argmin(normals_a @ normals_b[widest]))
         best.append((away[widest], (first, facing), (second, widest)))
-    _, first_side, second_side = best[int(best[1][0] > best[0][0] + _PARALLEL)]
+    _, first_side, second_side = best[int(best[1][0] > best[0][0] + PARALLEL)]
     return first_side, second_side

@@ -5,8 +5,7 @@ from typing import Any
 
 from jimpact.bodies.assemblies import PlanarBodies
 from jimpact.bodies.base import Body
-from jimpact.bodies.piles import Discs, Pile, Spheres
-from jimpact.bodies.planar_piles import PlanarPile
+from jimpact.bodies.piles import Pile
 from jimpact.bodies.polygons import Cornered, Disc
 from jimpact.bodies.solids import Solid, Sphere
 from jimpact.bodies.spatial_bodies import SpatialBodies
@@ -32,7 +31,7 @@ def Bodies(
     round bodies `f = |x_1 - x_2| - r_1 - r_2`; a disc or sphere has its distance from a polygon or
     box; two polygons have the two contacts of the sides that face each other. Few bodies have all
     their contacts (`jimpact.bodies.assemblies`, `.spatial_bodies`: q as of each body). Many discs,
-    polygons and spheres are a pile (`.piles`, `.planar_piles`): a grid finds closed contacts in
+    polygons and spheres are a pile (`.piles`): a grid finds closed contacts in
     `simulate(method="time_stepping")`, `touching(q)` is the scene of those at q, and spheres keep
     three turns [rad] in the place of a quaternion. `at(centres)` gives q, not turned.
 
@@ -78,9 +77,9 @@ def Bodies(
     if room is not None and named:
         raise ValueError("Argument `room` must be left out with `pairs`, `fixed` or `at`.")
     many = room is not None or (len(bodies) > FEW and not named)
-    kind: Any = _pile_of(bodies) if many else None
-    if kind is not None:
-        return kind(bodies, planes, room)
+    dimension = _pile_in(bodies) if many else 0
+    if dimension:
+        return Pile(bodies, dimension, planes, room)
     if room is not None:
         names = ", ".join(sorted({type(body).__name__ for body in bodies}))
         raise TypeError(f"Argument `bodies` must be discs, polygons or spheres, not {names}.")
@@ -93,10 +92,8 @@ def Bodies(
     return PlanarBodies(bodies, planes, pairs, at)  # type: ignore[arg-type]
 
 
-def _pile_of(bodies: tuple[Body, ...]) -> type[Pile] | None:
-    """The kind of pile that these bodies are, if they are one."""
+def _pile_in(bodies: tuple[Body, ...]) -> int:
+    """2 or 3: these bodies may be a pile in the plane or in space; 0: they may not."""
     if all(isinstance(body, Sphere) and body.is_round for body in bodies):
-        return Spheres
-    if all(isinstance(body, Disc) and body.is_round for body in bodies):
-        return Discs
-    return PlanarPile if all(isinstance(body, Cornered | Disc) for body in bodies) else None
+        return 3
+    return 2 if all(isinstance(body, Cornered | Disc) for body in bodies) else 0

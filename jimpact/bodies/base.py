@@ -99,14 +99,6 @@ def listed_pairs(pairs: ActivePairs, mass: Any) -> tuple[np.ndarray, np.ndarray,
     return order, bodies, directions, scene
 
 
-class ContactPoints(NamedTuple):
-    """Of m contacts: gap [m], where it is [m], and the unit normal from body 2 to body 1."""
-
-    gap: jax.Array  # (m,)
-    point: jax.Array  # (m, 2 or 3)
-    normal: jax.Array  # (m, 2 or 3)
-
-
 class Body(eqx.Module):
     """One or several bodies with contacts, as functions of their configuration q.
 
@@ -614,12 +606,6 @@ def wheel(radius: Any, q: np.ndarray, middle: Any = (0.0, 0.0)) -> np.ndarray:
     """A circle about `middle`, with the radius that shows how far it has turned."""
     spoke = np.concatenate([[[0.0, 0.0]], CIRCLE])
     return turned(float(radius) * spoke + np.asarray(middle), q)
-
-
-def moving(between: Sequence[tuple[int, int]], count: int) -> np.ndarray:
-    """(m, count) of contacts and moving bodies: 1 for the first body, -1 for the second, else 0."""
-    first, second = (np.array(side)[:, None] == np.arange(count) for side in zip(*between))
-    return first.astype(float) - second.astype(float)
 
 
 def lengths(vectors: jax.Array) -> tuple[jax.Array, jax.Array]:

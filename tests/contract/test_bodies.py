@@ -485,7 +485,7 @@ def test_every_body_can_be_drawn():
 
 
 def test_bodies_without_contacts_and_gaps_of_another_shape_are_refused():
-    with pytest.raises(ValueError, match=r"m >= 1 contacts of Discs, but it returns \(0,\)"):
+    with pytest.raises(ValueError, match=r"m >= 1 contacts of Pile, but it returns \(0,\)"):
         piles.discs(1.0, [0.1]).scene([0.0, 0.0, 0.0])
     with pytest.raises(ValueError, match=r"`gap_function` must return shape \(m,\).*\(1, 1\)"):
         ji.scene_from_gaps(lambda q: q[None], [1.0], [0.5])

@@ -383,5 +383,5 @@ def test_piles_by_events_are_refused_with_friction():
     at = pile.at([[0.0, 0.0], [0.3, 0.0]])
     law = ji.Compliant(ji.Hertz(1e6), friction=0.1)
     for method in ("events", "contact_forces"):
-        with pytest.raises(ValueError, match="`friction` must be 0 for the contacts of Discs"):
+        with pytest.raises(ValueError, match="`friction` must be 0 for the contacts of Pile"):
             ji.simulate(ji.System(pile), law, at, np.zeros(6), 1.0, method=method)
