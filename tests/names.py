@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 
 import jimpact as ji
-from jimpact.bodies.solids import Solid
+from jimpact.bodies.rigid import Solid
 from jimpact.fits.fitting import LOSSES
 from jimpact.fits.solve import DEFAULT_STEPS
 from jimpact.methods.contenders import CONTENDERS

@@ -9,12 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
-from jimpact.bodies.base import OnGround, as_planes, lengths, number
+from jimpact.bodies.base import as_planes, lengths, number
 from jimpact.bodies.contacts import (
     Assembly,
     ContactPoints,
     joined,
     on_planes,
+    placed,
     round_on_round,
 )
 from jimpact.bodies.polygon_contacts import (
@@ -24,10 +25,10 @@ from jimpact.bodies.polygon_contacts import (
     facing_now,
     facing_sides,
     outward,
-    placed,
     side_of,
 )
 from jimpact.bodies.polygons import Cornered, Disc
+from jimpact.bodies.rigid import OnGround
 from jimpact.compiling import full_precision
 
 # [rad] Direction between two polygons, of which one has an odd number of sides, at which their two

@@ -7,7 +7,8 @@ from jimpact.bodies.assemblies import PlanarBodies
 from jimpact.bodies.base import Body
 from jimpact.bodies.piles import Pile
 from jimpact.bodies.polygons import Cornered, Disc
-from jimpact.bodies.solids import Solid, Sphere
+from jimpact.bodies.rigid import Solid
+from jimpact.bodies.solids import Sphere
 from jimpact.bodies.spatial_bodies import SpatialBodies
 
 # Bodies above which a grid finds the closed contacts, unless their `pairs` are named. Ten times

@@ -18,12 +18,13 @@ from jimpact.bodies.base import (
     lengths,
     numbered,
 )
-from jimpact.bodies.solids import cross
 from jimpact.compiling import full_precision
 
 # Tangents in space begin with the direction nearest to this one. No axis: contacts with a normal
 # along it have no first tangent, and normals along axes are frequent.
 _ASIDE = (0.7, -0.6, 0.387)
+
+CROSS = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(2, 0, 1)  # of j and k, by i
 
 
 class ContactPoints(NamedTuple):
@@ -44,7 +45,9 @@ class Assembly(Body):
     """
 
     planes: eqx.AbstractVar[jax.Array]  # (w, d + 1) unit normal, distance
-    between: eqx.AbstractVar[Any]  # bodies (i, j) of each of m contacts; j of a plane is -1
+    between: eqx.AbstractVar[
+        Any
+    ]  # bodies (i, j) of each contact, j of a plane is -1; one row: of all
 
     @property
     def dimension(self) -> int:
@@ -84,18 +87,23 @@ class Assembly(Body):
     def tangents(self, q: jax.Array) -> jax.Array:
         """H_t (n, m), in space (n, 2 m): how fast body i slides along body j."""
         _, point, normal = self.contacts(q)
-        return self._of_all(q, point, tangents_of(normal))
+        return self._of_all(q, point, self.ways(normal))
 
     def directions(
         self, q: jax.Array, point: jax.Array, ways: jax.Array, i: Any, j: Any
     ) -> jax.Array:
         """(m, k, 2, velocities of a body): of bodies i, less those of j, along ways (m, k, d)."""
-        sides = []
-        for sign, body in ((1.0, i), (-1.0, j)):
-            lever = (point - self.of_bodies(q)[body, : self.dimension])[:, None]
-            around = self.in_axes(q, body, _around(lever, ways))
-            sides.append(sign * jnp.concatenate([ways, around], axis=2))
+        sides = self._speeds(q, point, ways, i), -self._speeds(q, point, ways, j)
         return jnp.stack(sides, axis=2)
+
+    def _speeds(self, q: jax.Array, point: jax.Array, ways: jax.Array, body: Any) -> jax.Array:
+        """(m, k, velocities of a body): of points (m, d) of these bodies along ways (m, k, d)."""
+        lever = (point - self.of_bodies(q)[body, : self.dimension])[:, None]
+        return jnp.concatenate([ways, self.in_axes(q, body, _around(lever, ways))], axis=2)
+
+    def ways(self, normal: jax.Array) -> jax.Array:
+        """Unit tangents (m, d - 1, d) of normals (m, d)."""
+        return tangents_of(normal)
 
     def in_axes(self, q: jax.Array, body: Any, around: jax.Array) -> jax.Array:
         """Vectors (m, k, turns) in the axes in which the angular velocities of these bodies are."""
@@ -103,16 +111,15 @@ class Assembly(Body):
 
     def _of_all(self, q: jax.Array, point: jax.Array, ways: jax.Array) -> jax.Array:
         """(n, m k): velocities along ways (m, k, d) of all bodies."""
-        between = np.array(self.between, np.int32)
-        directions = self.directions(q, point, ways, *between.T)  # a plane has the last body's
-        rows = jnp.zeros((), q.dtype)
-        for side in (0, 1):
-            own = (
-                jnp.asarray(between[:, side])[:, None]
-                == np.arange(self.count, dtype=np.int32)[None]
-            )
-            rows = rows + jnp.where(own[:, None, :, None], directions[:, :, side, None], 0.0)
-        return rows.reshape(-1, self.count * directions.shape[-1]).T
+        velocities = self.dimension + self.turns
+        rows = jnp.zeros((*ways.shape[:2], self.count, velocities), q.dtype)
+        between = np.broadcast_to(np.array(self.between, np.int32), (len(ways), 2))
+        for sign, body in zip((1.0, -1.0), between.T):
+            if (body >= 0).any():  # a plane does not move
+                own = jnp.asarray(body)[:, None] == np.arange(self.count, dtype=np.int32)[None]
+                speeds = sign * self._speeds(q, point, ways, body)[:, :, None]
+                rows = rows + jnp.where(own[:, None, :, None], speeds, 0.0)
+        return rows.reshape(-1, self.count * velocities).T
 
     @property
     def base_directions(self) -> jax.Array:
@@ -183,3 +190,16 @@ def round_on_round(a: jax.Array, b: jax.Array, r: jax.Array, s: jax.Array) -> Co
 def joined(parts: Sequence[ContactPoints]) -> ContactPoints:
     """The contacts of all parts."""
     return ContactPoints(*(jnp.concatenate(rows) for rows in zip(*parts)))
+
+
+def placed(points: jax.Array, at: jax.Array) -> jax.Array:
+    """Points (p, 2) of bodies at (p or 1, 3)."""
+    c, s = jnp.cos(at[:, 2]), jnp.sin(at[:, 2])
+    x, y = points.T
+    return at[:, :2] + jnp.stack([c * x - s * y, s * x + c * y], axis=1)
+
+
+@full_precision
+def cross(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Vector products (.., 3), in fewer operations to compile than `jnp.cross`."""
+    return jnp.sum(a[..., None, :] * jnp.tensordot(b, CROSS.astype(b.dtype), (-1, 2)), axis=-1)

@@ -30,14 +30,13 @@ from jimpact.bodies.base import (
     wheel,
     with_block,
 )
-from jimpact.bodies.contacts import Assembly, ContactPoints, round_on_round, tangents_of
+from jimpact.bodies.contacts import Assembly, ContactPoints, placed, round_on_round, tangents_of
 from jimpact.bodies.neighbours import Candidates, all_pairs, crowd_of, near_pairs
 from jimpact.bodies.polygon_contacts import (
     FacingSides,
     disc_on_polygon,
     facing_now,
     facing_sides,
-    placed,
     side_of,
 )
 from jimpact.bodies.polygons import Cornered

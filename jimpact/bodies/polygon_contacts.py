@@ -12,13 +12,6 @@ from jimpact.compiling import full_precision
 PARALLEL = 1e-9  # [m] more than rounding: between parallel sides it does not decide
 
 
-def placed(points: jax.Array, at: jax.Array) -> jax.Array:
-    """Points (p, 2) of bodies at (p or 1, 3)."""
-    c, s = jnp.cos(at[:, 2]), jnp.sin(at[:, 2])
-    x, y = points.T
-    return at[:, :2] + jnp.stack([c * x - s * y, s * x + c * y], axis=1)
-
-
 def outward(side: jax.Array) -> jax.Array:
     """Unit normals (.., 2) of counter-clockwise sides (.., 2); 0 of one without length."""
     square = dot(side, side)[..., None]

@@ -11,7 +11,8 @@ import numpy as np
 from jimpact._checks import as_float_array, check_shape, check_values
 from jimpact.bodies.base import LinearPotential, as_planes, lengths, numbered
 from jimpact.bodies.contacts import Assembly, ContactPoints, joined, on_planes, round_on_round
-from jimpact.bodies.solids import Box, Solid, Sphere, rotation
+from jimpact.bodies.rigid import Solid, rotation
+from jimpact.bodies.solids import Box, Sphere
 
 
 class SpatialBodies(Assembly):

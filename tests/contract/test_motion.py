@@ -317,14 +317,8 @@ def test_ball_leaves_a_vibrating_plate():
 
 def on_slope(angle, speed, mu, e=0.0, drop=0.0, tilt=0.0, corners="all"):
     weights = G * jnp.stack([-jnp.sin(angle), jnp.cos(angle), jnp.zeros_like(angle)])
-    block = ji.System(ji.Block(0.2, 0.4, corners=corners), gravity=True)
-    system = ji.System(
-        block.gap_function,
-        block.mass,
-        potential=type(ji.gravity([0.0]))(weights),
-        tangent_function=block.tangent_function,
-        friction=mu,
-    )
+    block = ji.Block(0.2, 0.4, corners=corners)
+    system = ji.System(block, potential=type(ji.gravity([0.0]))(weights), friction=mu)
     none = 0 * speed
     q0, v0 = jnp.stack([none, 0.2 + drop + none, tilt + none]), jnp.stack([speed, none, none])
     return ji.simulate(system, ji.Moreau(e), q0, v0, 1.0, samples=21)
