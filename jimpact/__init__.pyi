@@ -3,12 +3,13 @@
 from . import data as data, plot as plot, theory as theory
 from .audits import audit as audit, summary as summary
 from .bodies.assembly import Bodies as Bodies
-from .bodies.base import Body as Body, scene_from_gaps as scene_from_gaps
+from .bodies.base import Body as Body
 from .bodies.blocks import Block as Block
 from .bodies.dimers import (
     Dimer as Dimer,
     SpatialDimer as SpatialDimer,
 )
+from .bodies.given import scene_from_gaps as scene_from_gaps
 from .bodies.mujoco_scene import from_mujoco as from_mujoco
 from .bodies.particles import Column as Column, Corner as Corner
 from .bodies.pendulums import PendulumCradle as PendulumCradle

@@ -11,7 +11,6 @@ import numpy as np
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
 from jimpact.bodies.base import as_planes, lengths, number
 from jimpact.bodies.contacts import (
-    Assembly,
     ContactPoints,
     joined,
     on_planes,
@@ -28,7 +27,7 @@ from jimpact.bodies.polygon_contacts import (
     side_of,
 )
 from jimpact.bodies.polygons import Cornered, Disc
-from jimpact.bodies.rigid import OnGround
+from jimpact.bodies.rigid import FewBodies, OnGround
 from jimpact.compiling import full_precision
 
 # [rad] Direction between two polygons, of which one has an odd number of sides, at which their two
@@ -40,7 +39,7 @@ _NEAR_CUT = 1e-4
 _TOUCHING = 1e-6  # [m] gap from which they may pass it; ten times more would do
 
 
-class PlanarBodies(Assembly):
+class PlanarBodies(FewBodies):
     """Planar bodies on planes and on each other; q = (x, y, theta) of each centre of mass.
 
     Equation: on a plane with normal n = (-sin a, cos a), at offset d from the origin, each contact
@@ -109,22 +108,11 @@ class PlanarBodies(Assembly):
                     f"Argument `bodies` must hold planar bodies, but holds a {type(body).__name__}."
                 )
         self.planes = as_planes(planes, 2)
-        counts = [body.points.shape[0] for body in self.bodies]
-        on_each = [(b, -1) for b, count in enumerate(counts) for _ in range(count)]
+        on_each = [(b, -1) for b in self.owner.tolist()]
         self.pairs = _sorted_pairs(self.bodies, pairs, at)
         self.between = (*on_each * len(self.planes), *self.pairs.between)
         if not self.between:
             raise ValueError("Arguments `bodies`, `planes` and `pairs` must give a contact.")
-
-    @property
-    def mass(self) -> jax.Array:
-        """M, its diagonal (3 b,)."""
-        return jnp.concatenate([body.mass for body in self.bodies])
-
-    @property
-    def count(self) -> int:
-        """Number of bodies."""
-        return len(self.bodies)
 
     def contacts(self, q: jax.Array) -> ContactPoints:
         """Gaps, points and normals at q (3 b,); `between` says of which bodies."""
@@ -164,16 +152,10 @@ class PlanarBodies(Assembly):
         place = [n_y * right + n_x * up, n_y * up - n_x * right, turn + jnp.arctan2(-n_x, n_y)]
         return jnp.stack(place)
 
-    def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
-        """Those of all bodies."""
-        each = zip(self.bodies, np.reshape(q, (-1, 3)))
-        return [curve for body, x in each for curve in body.outlines(x, point)]
-
     def _places(self, q: jax.Array) -> "_Places":
         """Contact points and corners at q (3 b,)."""
         at = q.reshape(-1, 3)
-        counts = np.array([body.points.shape[0] for body in self.bodies])
-        owner = np.repeat(np.arange(len(counts)), counts)
+        owner = self.owner
         points = placed(jnp.concatenate([body.points for body in self.bodies]), at[owner])
         rim = jnp.stack([jnp.asarray(body.rim, q.dtype) for body in self.bodies])
         polygons = {
@@ -181,7 +163,9 @@ class PlanarBodies(Assembly):
             for b, body in enumerate(self.bodies)
             if isinstance(body, Cornered)
         }
-        return _Places(at[:, 2], owner, points, points[np.cumsum(counts) - counts], rim, polygons)
+        return _Places(
+            at[:, 2], owner, points, points[np.unique(owner, return_index=True)[1]], rim, polygons
+        )
 
 
 Side = tuple[int, int]  # of which body, and which

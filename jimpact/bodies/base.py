@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -10,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
+from jimpact.bodies.closed_pairs import ActivePairs
 from jimpact.compiling import full_precision, quick_jit
-from jimpact.scene import Scene, check_mass, sparse_scene
+from jimpact.scene import Scene
 
 STANDARD_GRAVITY = 9.80665  # m/s^2
 CLOSED_BELOW = 1e-12  # [m] gaps this small are rounding of f(q) = 0; ten times more are, too
@@ -45,58 +46,6 @@ def numbered(names: Sequence[str], count: int) -> tuple[str, ...]:
         return tuple(names)
     parts = [split_name(name) for name in names]
     return tuple(f"{word}{i + 1} [{unit}]" for i in range(count) for word, unit in parts)
-
-
-# Contacts of a pile that are computed at once; rows without contacts are left out in such blocks.
-# Ten times more: few contacts among many bodies take as long as all of them.
-BLOCK = 128
-
-
-def over_blocks(count: Any, one: Callable[[Any, Any], Any], start: Any) -> Any:
-    """`start` carried by `one(first_row, carry)` through the blocks that hold `count` () rows."""
-    blocks = (count + BLOCK - 1) // BLOCK
-    return jax.lax.fori_loop(jnp.int32(0), blocks, lambda i, carry: one(i * BLOCK, carry), start)
-
-
-def block(x: jax.Array, row: jax.Array) -> jax.Array:
-    """The rows of x (K, ...) from this one that are computed at once."""
-    return jax.lax.dynamic_slice_in_dim(x, row, BLOCK)
-
-
-def with_block(x: jax.Array, values: jax.Array, row: jax.Array) -> jax.Array:
-    """x (K, ...) with these values from this row on."""
-    return jax.lax.dynamic_update_slice_in_dim(x, values.astype(x.dtype), row, 0)
-
-
-class ActivePairs(NamedTuple):
-    """The closed contacts of many bodies in the first of K rows, a multiple of `BLOCK`.
-
-    Rows that are not used are 0.
-    """
-
-    number: jax.Array  # (K,) of the contact among all of them; `pair_count` in unused rows
-    closed: jax.Array  # (K,) whether the row is used
-    filled: jax.Array  # () how many are
-    bodies: jax.Array  # (K, 2); the number of bodies stands for a wall
-    # (K, d, 2, velocities): normal and tangents, of both bodies, by the velocities of each: x, y
-    # and turn in a plane, x, y, z and three turns in space
-    directions: jax.Array
-    overflows: jax.Array  # () whether more are closed than there are rows
-    reach: jax.Array  # () [m]: bodies that move farther in one step may pass each other
-
-
-def listed_pairs(pairs: ActivePairs, mass: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, Scene]:
-    """On the host: rows (m,) in order, bodies (m, 2) with -1 for walls, directions, the scene.
-
-    Contacts of two bodies come first; `mass` (n,). Walls do not move: their directions are 0.
-    """
-    size = pairs.directions.shape[3]
-    bodies = np.where(pairs.bodies == len(mass) // size, -1, pairs.bodies)[: int(pairs.filled)]
-    order = np.lexsort((pairs.number[: len(bodies)], bodies[:, 1] < 0))
-    bodies, directions = bodies[order], np.array(pairs.directions)[order]
-    directions[:, :, 1] *= (bodies[:, 1] >= 0)[:, None, None]
-    scene = sparse_scene(mass, jnp.asarray(directions[:, 0]), bodies, len(mass) // size)
-    return order, bodies, directions, scene
 
 
 class Body(eqx.Module):
@@ -329,16 +278,16 @@ class Body(eqx.Module):
             scenes.append(Scene(masses[k], normals[k][:, closed], closed_tangents))
         return scenes
 
-    def _parts(self, q: jax.Array) -> "_Parts":
+    def _parts(self, q: jax.Array) -> "Parts":
         """What a scene at q needs, by a compiled program."""
         return _compiled_parts(self, q)
 
 
 # mass, normals, tangents, gaps, margin of their range
-_Parts = tuple[jax.Array, jax.Array, jax.Array | None, jax.Array, jax.Array]
+Parts = tuple[jax.Array, jax.Array, jax.Array | None, jax.Array, jax.Array]
 
 
-def _parts(body: Body, q: jax.Array) -> _Parts:
+def parts_at(body: Body, q: jax.Array) -> Parts:
     """What a scene at q needs; normals are NaN out of the range of the gap function."""
     margin = body.valid(q)
     normals = jnp.where(margin >= 0, body.normals(q), jnp.nan)
@@ -346,15 +295,15 @@ def _parts(body: Body, q: jax.Array) -> _Parts:
 
 
 @quick_jit
-def _compiled_parts(body: Body, q: jax.Array) -> _Parts:
+def _compiled_parts(body: Body, q: jax.Array) -> Parts:
     """The same, compiled."""
-    return _parts(body, q)
+    return parts_at(body, q)
 
 
 @quick_jit
-def _many_parts(body: Body, q: jax.Array) -> _Parts:
+def _many_parts(body: Body, q: jax.Array) -> Parts:
     """The same at many q (K, d), compiled."""
-    return jax.vmap(partial(_parts, body))(q)
+    return jax.vmap(partial(parts_at, body))(q)
 
 
 def check_range(name: str, body: Body, margin: Any, where: str = "") -> None:
@@ -375,82 +324,6 @@ def check_penetration(name: str, f: jax.Array, closed_below: jax.Array) -> None:
         f"Argument `{name}` must have no penetration (f >= -{float(closed_below):g} m), "
         f"but gap {worst} has value {float(f[worst]):g} m."
     )
-
-
-class GivenBody(Body):
-    """A body given by functions, see `System` and `scene_from_gaps`."""
-
-    gaps: Callable[[jax.Array], jax.Array]
-    mass_argument: Any
-    sliding: Callable[[jax.Array], jax.Array | None] | None
-
-    def __init__(self, gap_function: Any, mass: Any, tangent_function: Any = None):
-        for name, function in (
-            ("gap_function", gap_function),
-            ("tangent_function", tangent_function),
-        ):
-            if not (callable(function) or (function is None and name != "gap_function")):
-                raise TypeError(f"Argument `{name}` must be a function, but is {function!r}.")
-        self.gaps, self.sliding = gap_function, tangent_function
-        if callable(mass):
-            self.mass_argument = mass
-        else:
-            self.mass_argument = as_float_array("mass", mass)
-            check_mass(self.mass_argument)
-
-    @property
-    def functions(self) -> tuple[Any, ...]:
-        """The gaps, the displacements and the mass."""
-        return self.gaps, self.sliding, self.mass_argument
-
-    @property
-    def mass(self) -> Any:
-        """M or q -> M(q), the argument `mass`."""
-        return self.mass_argument
-
-    def gap_function(self, q: jax.Array) -> jax.Array:
-        """Gaps f(q) (m,) [m]."""
-        return jnp.atleast_1d(self.gaps(q))
-
-    def tangent_function(self, q: jax.Array) -> jax.Array | None:
-        """Displacements (m,) [m] along the contact planes."""
-        displacements = None if self.sliding is None else self.sliding(q)
-        return None if displacements is None else jnp.atleast_1d(displacements)
-
-    def _parts(self, q: jax.Array) -> _Parts:
-        """What a scene at q needs."""
-        return _parts(self, q)  # each new lambda would be compiled anew
-
-
-@full_precision
-def scene_from_gaps(
-    gap_function: Callable[[jax.Array], jax.Array],
-    mass: Any,
-    q: Any,
-    closed_below: float = CLOSED_BELOW,
-) -> Scene:
-    """Scene of bodies at configuration `q`; the normals are the gradients of their gaps.
-
-    Equation: `N = grad f(q)`, `M = M(q)`, gaps `f(q)`.
-
-    Args:
-        gap_function: q (n,) -> gaps f(q) (m,) [m], written with jax.numpy.
-        mass: M (n,) or (n, n), or a function q -> M(q).
-        q: (n,) configuration.
-        closed_below: gaps with |f| up to this count as closed [m].
-
-    Returns:
-        `Scene` of n coordinates and m contacts, without tangents.
-
-    Raises:
-        ValueError: penetration (f < -closed_below), or what `Scene` refuses.
-
-    >>> import jax.numpy as jnp, jimpact as ji
-    >>> bouncing = ji.scene_from_gaps(lambda q: q[1:] - 0.5, [1.0, 1.0], [0.0, 0.5])
-    >>> bouncing.normals.tolist()
-    [[0.0], [1.0]]
-    """
-    return GivenBody(gap_function, mass).scene(q, closed_below)
 
 
 class LinearPotential(eqx.Module):

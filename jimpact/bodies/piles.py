@@ -18,27 +18,24 @@ from jimpact._checks import (
     is_traced,
 )
 from jimpact.bodies.base import (
-    BLOCK,
     CIRCLE,
-    ActivePairs,
     as_planes,
-    block,
-    listed_pairs,
     numbered,
-    over_blocks,
     turned,
     wheel,
+)
+from jimpact.bodies.closed_pairs import (
+    BLOCK,
+    ActivePairs,
+    block,
+    chosen_rows,
+    listed_pairs,
+    over_blocks,
     with_block,
 )
 from jimpact.bodies.contacts import Assembly, ContactPoints, placed, round_on_round, tangents_of
 from jimpact.bodies.neighbours import Candidates, all_pairs, crowd_of, near_pairs
-from jimpact.bodies.polygon_contacts import (
-    FacingSides,
-    disc_on_polygon,
-    facing_now,
-    facing_sides,
-    side_of,
-)
+from jimpact.bodies.polygon_contacts import mixed_pairs
 from jimpact.bodies.polygons import Cornered
 from jimpact.compiling import full_precision, precise_jit
 from jimpact.scene import Scene
@@ -191,27 +188,7 @@ class Pile(Assembly):
         apart = round_on_round(a[:, 0], b[:, 0], self.rims[i], self.rims[j])
         if self._slots == 1:
             return ContactPoints(*(x[:, None] for x in apart))
-        side_a, side_b, _ = jax.vmap(facing_now)(a, b)
-        ends = [jax.vmap(side_of)(x, side) for x, side in ((a, side_a), (b, side_b))]
-        of_sides = facing_sides(FacingSides(ends[0], ends[1], jnp.zeros(len(a), bool)))
-        first, second = self.rims[i] > 0, self.rims[j] > 0
-        swap = first[:, None, None]
-        disc, polygon = jnp.where(swap, a[:, :1], b[:, :1]), jnp.where(swap, b, a)
-        rim = jnp.where(first, self.rims[i], self.rims[j])[:, None]
-        on_side = ContactPoints(*(x[:, 0] for x in jax.vmap(disc_on_polygon)(disc, rim, polygon)))
-        on_side = on_side._replace(normal=jnp.where(swap[:, 0], 1.0, -1.0) * on_side.normal)
-
-        def chosen(discs: jax.Array, rolling: jax.Array, sides: jax.Array) -> jax.Array:
-            """What two discs have, a disc and a polygon, or two polygons."""
-            each = (-1, *[1] * rolling.ndim)
-            one = jnp.where((first & second).reshape(each[:-1]), discs, rolling)[:, None]
-            two = sides.reshape(len(a), self._slots, *sides.shape[1:])
-            return jnp.where((first | second).reshape(each), one, two)
-
-        gap, point, normal = (chosen(*x) for x in zip(apart, on_side, of_sides))
-        return ContactPoints(
-            gap.at[:, 1].set(jnp.where(first | second, jnp.inf, gap[:, 1])), point, normal
-        )
+        return mixed_pairs(a, b, self.rims[i], self.rims[j], apart)
 
     @full_precision
     def _wall_gaps(self, q: jax.Array) -> jax.Array:
@@ -342,7 +319,7 @@ class Pile(Assembly):
 
         def one(first: jax.Array, filled: Any) -> Any:
             """The next pairs."""
-            used, place = _chosen_rows(so_far, first, count)
+            used, place = chosen_rows(so_far, first, count)
             new = (jnp.where(used, x[place], 0) for x in (near.first, near.second))
             return tuple(with_block(x, part, first) for x, part in zip(filled, new))
 
@@ -398,7 +375,7 @@ class Pile(Assembly):
 
         def one(first: jax.Array, filled: Any) -> Any:
             """The next rows."""
-            used, chosen = _chosen_rows(so_far, first, count)
+            used, chosen = chosen_rows(so_far, first, count)
             chosen = jnp.where(used, numbers[chosen], 0)
             i, j, ways = self._of_contacts(q, chosen)
             new = (
@@ -499,15 +476,3 @@ def _polygons(bodies: Sequence[Any]) -> tuple[jax.Array, jax.Array, jax.Array]:
     ]
     radii = far.max(axis=1) + rims
     return jnp.asarray(corners), jnp.asarray(radii), jnp.asarray(np.array(inner, corners.dtype))
-
-
-def _chosen_rows(
-    so_far: jax.Array, first: jax.Array, count: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Of the next block of `count` () rows: which are used, and where they are found (BLOCK,).
-
-    `so_far` (C,) is how many have been found up to each place.
-    """
-    row = first + np.arange(BLOCK, dtype=np.int32)
-    place = jnp.minimum(jnp.searchsorted(so_far, row + 1), so_far.size - 1)
-    return row < count, place

@@ -106,3 +106,31 @@ def facing_sides(sides: FacingSides) -> ContactPoints:
 def side_of(corners: jax.Array, side: Any) -> tuple[jax.Array, jax.Array]:
     """Begin and end (2,) of a side of a polygon with these corners (k, 2)."""
     return corners[side], corners[(side + 1) % corners.shape[0]]
+
+
+def mixed_pairs(
+    a: jax.Array, b: jax.Array, r: jax.Array, s: jax.Array, discs: ContactPoints
+) -> ContactPoints:
+    """Two contacts (g, 2) of each pair of discs and polygons; with a disc the second one is open.
+
+    a, b (g, K, 2) are corners, or first the middle of a disc, r, s (g,) radii, 0 of polygons;
+    `discs` (g,) are the contacts where both are discs.
+    """
+    side_a, side_b, _ = jax.vmap(facing_now)(a, b)
+    first_side, second_side = (jax.vmap(side_of)(*x) for x in ((a, side_a), (b, side_b)))
+    sides = facing_sides(FacingSides(first_side, second_side, jnp.zeros(len(a), bool)))
+    first = r[:, None] > 0
+    disc = jnp.where(first, a[:, 0], b[:, 0])[:, None]
+    polygon = jnp.where(first[..., None], b, a)
+    rolling = jax.vmap(disc_on_polygon)(disc, jnp.maximum(r, s)[:, None], polygon)
+    one_disc, both_discs = (r > 0) | (s > 0), (r > 0) & (s > 0)
+    rolling = rolling._replace(normal=jnp.where(first, 1.0, -1.0)[..., None] * rolling.normal)
+
+    def chosen(of_discs: jax.Array, of_one: jax.Array, of_sides: jax.Array) -> jax.Array:
+        """What two discs have, a disc and a polygon, or two polygons."""
+        each = (-1, *[1] * of_discs.ndim)
+        one = jnp.where(both_discs.reshape(each), of_discs[:, None], of_one)
+        return jnp.where(one_disc.reshape(each), one, of_sides.reshape(len(a), 2, *one.shape[2:]))
+
+    gap, point, normal = (chosen(*x) for x in zip(discs, rolling, sides))
+    return ContactPoints(gap.at[:, 1].add(jnp.where(one_disc, jnp.inf, 0.0)), point, normal)

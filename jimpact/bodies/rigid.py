@@ -66,6 +66,36 @@ class RigidBody(Assembly):
         return on_planes(jnp.asarray(self.planes, points.dtype), points, rim)
 
 
+class FewBodies(Assembly):
+    """Rigid bodies with all their contacts."""
+
+    bodies: eqx.AbstractVar[tuple[Any, ...]]
+
+    @property
+    def count(self) -> int:
+        """Number of bodies that move."""
+        return len(self.bodies)
+
+    @property
+    def mass(self) -> jax.Array:
+        """M (n,), its diagonal, or (n, n)."""
+        each = [body.mass for body in self.bodies]
+        if all(mass.ndim == 1 for mass in each):
+            return jnp.concatenate(each)
+        return jax.scipy.linalg.block_diag(*(jnp.diag(m) if m.ndim == 1 else m for m in each))
+
+    @property
+    def owner(self) -> np.ndarray:
+        """Bodies (p,) of all contact points with planes."""
+        counts = [body.points.shape[0] for body in self.bodies]
+        return np.repeat(np.arange(len(counts)), counts)
+
+    def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
+        """Those of all bodies."""
+        each = zip(self.bodies, np.reshape(q, (self.count, -1)))
+        return [curve for body, x in each for curve in body.outlines(x, point)]
+
+
 class OnGround(RigidBody):
     """A rigid planar body above the ground y = 0; q = (x, y, theta) of its centre of mass.
 

@@ -10,12 +10,12 @@ import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values
 from jimpact.bodies.base import LinearPotential, as_planes, lengths, numbered
-from jimpact.bodies.contacts import Assembly, ContactPoints, joined, on_planes, round_on_round
-from jimpact.bodies.rigid import Solid, rotation
+from jimpact.bodies.contacts import ContactPoints, joined, on_planes, round_on_round
+from jimpact.bodies.rigid import FewBodies, Solid, rotation
 from jimpact.bodies.solids import Box, Sphere
 
 
-class SpatialBodies(Assembly):
+class SpatialBodies(FewBodies):
     """Boxes and spheres on planes and on each other; q = 7 numbers of each, as of a `Solid`.
 
     Equation: on a plane each contact point of a body has `f = n . (x + R c_i) - r - d`. Two spheres
@@ -78,28 +78,15 @@ class SpatialBodies(Assembly):
         check_shape("places", self.places, (len(self.fixed), 7), "one for each of `fixed`")
         check_values("places", self.places)
         self.pairs = _pairs((*self.bodies, *self.fixed), len(self.bodies), pairs)
-        on_each_plane = [(b, -1) for b in self._owner().tolist()]
+        on_each_plane = [(b, -1) for b in self.owner.tolist()]
         self.between = (*on_each_plane * len(self.planes), *self.pairs.spheres, *self.pairs.boxes)
         if not self.between:
             raise ValueError("Arguments `bodies`, `planes` and `pairs` must give a contact.")
 
     @property
-    def count(self) -> int:
-        """Number of bodies that move."""
-        return len(self.bodies)
-
-    @property
     def coordinates(self) -> int:
         """Seven of each body, with six velocities."""
         return 7 * len(self.bodies)
-
-    @property
-    def mass(self) -> jax.Array:
-        """M (n,), its diagonal, or (n, n)."""
-        each = [body.mass for body in self.bodies]
-        if all(mass.ndim == 1 for mass in each):
-            return jnp.concatenate(each)
-        return jax.scipy.linalg.block_diag(*(jnp.diag(m) if m.ndim == 1 else m for m in each))
 
     def valid(self, q: jax.Array) -> jax.Array:
         """How much farther from 1 the quaternions' lengths may be ()."""
@@ -141,7 +128,7 @@ class SpatialBodies(Assembly):
         """Gaps, points and normals at q (7 b,); `between` says of which bodies."""
         places, parts = self._placed(q), []
         if len(self.planes):
-            owner, middle = self._owner(), places.centre
+            owner, middle = self.owner, places.centre
             arm = jnp.concatenate([body.points for body in self.bodies])
             points = middle[owner] + _times(places.turns[owner], arm)
             parts.append(on_planes(self.planes, points, places.rim[owner]))
@@ -160,8 +147,9 @@ class SpatialBodies(Assembly):
 
     def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
         """Those of all bodies, the fixed ones last."""
-        every = zip((*self.bodies, *self.fixed), [*q.reshape(-1, 7), *np.asarray(self.places)])
-        return [curve for body, x in every for curve in body.outlines(x, point)]
+        still = zip(self.fixed, np.asarray(self.places))
+        curves = [curve for body, x in still for curve in body.outlines(x, point)]
+        return super().outlines(q, point) + curves
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -177,12 +165,6 @@ class SpatialBodies(Assembly):
     def floors(self) -> list[tuple[float, float]]:
         """None, as of a `Solid`."""
         return []
-
-    def _owner(self) -> np.ndarray:
-        """Bodies of all contact points with planes."""
-        return np.repeat(
-            np.arange(len(self.bodies)), [body.points.shape[0] for body in self.bodies]
-        )
 
     def _placed(self, q: jax.Array) -> "_Placed":
         """All bodies at q, the fixed ones last."""

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_concrete, check_kind, in_common_dtype
-from jimpact.bodies.base import listed_pairs
+from jimpact.bodies.closed_pairs import listed_pairs
 from jimpact.compiling import quick_jit
 from jimpact.law import Law
 from jimpact.motion.arguments import (

@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 
 from jimpact._checks import as_float_array, check_values, in_numbers
-from jimpact.bodies.base import STANDARD_GRAVITY, Body, GivenBody, LinearPotential, Potential
+from jimpact.bodies.base import STANDARD_GRAVITY, Body, LinearPotential, Potential
+from jimpact.bodies.given import GivenBody
 
 Base = Callable[[jax.Array], jax.Array]  # t () -> displacement y_b (d,) [m]
 
