@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_shape, check_values, is_traced
 from jimpact.bodies.base import as_planes, lengths, number
 from jimpact.bodies.contacts import (
     ContactPoints,
@@ -18,7 +17,6 @@ from jimpact.bodies.contacts import (
     round_on_round,
 )
 from jimpact.bodies.polygon_contacts import (
-    PARALLEL,
     FacingSides,
     disc_on_polygon,
     facing_now,
@@ -31,7 +29,7 @@ from jimpact.bodies.rigid import FewBodies, OnGround
 from jimpact.compiling import full_precision
 
 # [rad] Direction between two polygons, of which one has an odd number of sides, at which their two
-# contacts change places, see `_all_sides`: none of the usual slopes.
+# contacts change places, see `_facing`: none of the usual slopes.
 _CUT = 2.0
 # 1 - cos of the angle to that direction, within which they must not touch: .8 degrees. Ten times
 # less, and steps of a motion may pass over it.
@@ -51,25 +49,19 @@ class PlanarBodies(FewBodies):
     unit vectors n from the second body to the first, tangents (n_y, -n_x); both as rates of q.
 
     Contacts, in order: for each plane and body, its contact points; then the pairs of discs; discs
-    on polygons, polygon by polygon; polygons, two contacts a pair, pairs with fixed sides first.
+    on polygons, polygon by polygon; polygons, two contacts a pair.
     `between` names their bodies.
 
     Polygons choose their sides as they move, so that they may roll over their corners, slide off
     each other and meet again anywhere. Of two in touch, one with an odd number of sides, one with
-    an even number, the normal from the first to the second must not pass 2 rad (`valid`). Where
-    sides are fixed, by `at` or by their numbers, the gap functions hold (`valid`, [m]) while both
-    overlap or the line of one of them keeps them apart, turned by less than 90 degrees against each
-    other, with no other corner of the first body beyond the second side. Those of discs hold while
-    their centres are outside the other body. Bodies that are no pair do not feel each other.
+    an even number, the normal from the first to the second must not pass 2 rad (`valid`). Gaps of
+    discs hold while their centres are outside the other body. Bodies that are no pair do not feel
+    each other.
 
     Args:
         bodies: `Polygon`, `Block`, `Disc`; `Dimer` on planes only.
         planes: as of `as_planes`; angle 0: the ground, pi/2: a wall on the right.
-        pairs: (i, j) of bodies, counted from 0, in contact with each other; None: all. Two
-            polygons may be given as ((i, side), (j, side)), sides counted counter-clockwise: of a
-            `Block` 0 is the base, of a `Polygon` it begins at the first corner.
-        at: q (3 b,) at which the sides of two polygons are chosen that face each other, and which
-            is the first body, once and for all; None: as they move.
+        pairs: (i, j) of bodies, counted from 0, in contact with each other; None: all.
 
     Raises:
         ValueError: no bodies or contacts, planes that are not finite, pairs that do not exist or
@@ -87,7 +79,7 @@ class PlanarBodies(FewBodies):
     [0.0, 0.0]
     """
 
-    range_in_words = "see `PlanarBodies`: no centre in a body, fixed sides face each other"
+    range_in_words = "see `PlanarBodies`: no centre of a disc in another body"
 
     bodies: tuple[OnGround, ...]
     planes: jax.Array  # (k, 3) unit normal, distance
@@ -99,7 +91,6 @@ class PlanarBodies(FewBodies):
         bodies: Sequence[OnGround],
         planes: Any = None,
         pairs: Sequence[Any] | None = None,
-        at: Any = None,
     ):
         self.bodies = tuple(bodies)
         for body in self.bodies:
@@ -109,7 +100,7 @@ class PlanarBodies(FewBodies):
                 )
         self.planes = as_planes(planes, 2)
         on_each = [(b, -1) for b in self.owner.tolist()]
-        self.pairs = _sorted_pairs(self.bodies, pairs, at)
+        self.pairs = _sorted_pairs(self.bodies, pairs)
         self.between = (*on_each * len(self.planes), *self.pairs.between)
         if not self.between:
             raise ValueError("Arguments `bodies`, `planes` and `pairs` must give a contact.")
@@ -124,8 +115,8 @@ class PlanarBodies(FewBodies):
             middle, rim = places.middle, places.rim
             parts.append(round_on_round(middle[i], middle[j], rim[i], rim[j]))
         parts += [_on_polygon(places, *pairs) for pairs in self.pairs.rolling]
-        if self.pairs.sides or self.pairs.polygons:
-            parts.append(facing_sides(_all_sides(places, self.pairs)))
+        if self.pairs.polygons:
+            parts.append(facing_sides(_facing(places, self.pairs.polygons)))
         return joined(parts)
 
     @full_precision
@@ -138,7 +129,6 @@ class PlanarBodies(FewBodies):
         for polygon, discs in self.pairs.rolling:
             contacts = _on_polygon(places, polygon, discs)
             margins.append(contacts.gap + places.rim[np.array(discs)])
-        margins += [_overlap(places, *pair)[None] for pair in self.pairs.sides]
         margins += [_off_cut(places, *pair)[None] for pair in self.pairs.polygons]
         return jnp.min(jnp.concatenate(margins))
 
@@ -168,23 +158,18 @@ class PlanarBodies(FewBodies):
         )
 
 
-Side = tuple[int, int]  # of which body, and which
-
-
 class _Pairs(NamedTuple):
     """Pairs by what they are."""
 
     discs: tuple[tuple[int, int], ...]
     rolling: tuple[tuple[int, tuple[int, ...]], ...]  # a polygon and its discs
-    sides: tuple[tuple[Side, Side], ...]  # of polygons in contact there only
-    polygons: tuple[tuple[int, int], ...]  # in contact anywhere
+    polygons: tuple[tuple[int, int], ...]
 
     @property
     def between(self) -> list[tuple[int, int]]:
         """Bodies of each contact."""
         discs = [*self.discs, *((i, polygon) for polygon, some in self.rolling for i in some)]
-        polygons = [(first[0], second[0]) for first, second in self.sides] + list(self.polygons)
-        return discs + [pair for pair in polygons for _ in (0, 1)]
+        return discs + [pair for pair in self.polygons for _ in (0, 1)]
 
 
 class _Places(NamedTuple):
@@ -204,8 +189,8 @@ def _on_polygon(places: _Places, polygon: int, discs: tuple[int, ...]) -> Contac
     return disc_on_polygon(places.middle[some], places.rim[some], places.polygons[polygon])
 
 
-def _all_sides(places: _Places, pairs: _Pairs) -> FacingSides:
-    """Sides that were chosen at the beginning, then those that face each other now.
+def _facing(places: _Places, pairs: tuple[tuple[int, int], ...]) -> FacingSides:
+    """The sides of pairs of polygons that face each other now.
 
     Where a body rolls over a corner, one of the sides gives way to its neighbour, which has the
     corner at its other end. The contact there keeps its place among the two because they are
@@ -213,8 +198,8 @@ def _all_sides(places: _Places, pairs: _Pairs) -> FacingSides:
     through full turns, of the body and of the direction between the bodies; the latter begin anew
     at `_CUT`.
     """
-    rows: list[Any] = [(_side(places, a), _side(places, b), False) for a, b in pairs.sides]
-    for pair in pairs.polygons:
+    rows: list[Any] = []
+    for pair in pairs:
         *sides, n = facing_now(*(places.polygons[i] for i in pair))
         number = sides[0] + sides[1]
         for i, side, way in zip(pair, sides, (n, -n)):
@@ -257,41 +242,16 @@ def _off_cut(places: _Places, i: int, j: int) -> jax.Array:
     return jnp.maximum(off, apart - _TOUCHING)
 
 
-def _side(places: _Places, side: Side) -> tuple[jax.Array, jax.Array]:
-    """Its begin and its end (2,)."""
-    return side_of(places.polygons[side[0]], side[1])
-
-
-def _overlap(places: _Places, first: Side, second: Side) -> jax.Array:
-    """Margin () [m] of the gaps of two sides, see `PlanarBodies`."""
-    (a_begin, a_end), (b_begin, b_end) = _side(places, first), _side(places, second)
-    n = outward(b_end - b_begin)
-    tangent = jnp.stack([-n[1], n[0]])  # from begin to end
-    corners = places.polygons[first[0]]
-    others = [
-        c for c in range(corners.shape[0]) if c not in (first[1], (first[1] + 1) % len(corners))
-    ]
-    beyond = jnp.min((corners[np.array(others)] - b_begin[None]) @ n)
-    facing = tangent @ (a_begin - a_end)
-    shared = jnp.minimum(tangent @ (a_begin - b_end), 0.0) + tangent @ (b_end - b_begin)
-    shared = shared - jnp.maximum(tangent @ (a_end - b_begin), 0.0)
-    above = jnp.minimum((a_begin - b_begin) @ n, (a_end - b_begin) @ n)
-    n_a = outward(a_end - a_begin)
-    apart = jnp.maximum(above, jnp.minimum((b_begin - a_begin) @ n_a, (b_end - a_begin) @ n_a))
-    return jnp.minimum(jnp.minimum(beyond, facing), jnp.maximum(shared, apart))
-
-
 # ------------------------------------------------------------------------------ construction
 
 
-def _sorted_pairs(bodies: tuple[OnGround, ...], pairs: Sequence[Any] | None, at: Any) -> _Pairs:
+def _sorted_pairs(bodies: tuple[OnGround, ...], pairs: Sequence[Any] | None) -> _Pairs:
     """Pairs by the shapes of their bodies."""
     if pairs is None:
         shapes = [b for b, body in enumerate(bodies) if isinstance(body, Cornered | Disc)]
         pairs = [(i, j) for i in shapes for j in shapes if i > j]
     discs: list[tuple[int, int]] = []
     rolling: dict[int, list[int]] = {}
-    sides: list[tuple[Side, Side]] = []
     polygons: list[tuple[int, int]] = []
     for pair in pairs:
         i, j = (_body_of(x, bodies) for x in pair)
@@ -303,18 +263,15 @@ def _sorted_pairs(bodies: tuple[OnGround, ...], pairs: Sequence[Any] | None, at:
             rolling.setdefault(j, []).append(i)
         elif isinstance(bodies[j], Disc):
             rolling.setdefault(i, []).append(j)
-        elif at is None and not all(np.ndim(x) for x in pair):
-            polygons.append((i, j))
         else:
-            sides.append(_sides_of(pair, i, j, bodies, at))
+            polygons.append((i, j))
     grouped = tuple((polygon, tuple(some)) for polygon, some in rolling.items())
-    return _Pairs(tuple(discs), grouped, tuple(sides), tuple(polygons))
+    return _Pairs(tuple(discs), grouped, tuple(polygons))
 
 
-def _body_of(entry: Any, bodies: tuple[OnGround, ...]) -> int:
-    """The body of one half of a pair."""
-    body = entry if np.ndim(entry) == 0 else entry[0]
-    if not 0 <= body < len(bodies):
+def _body_of(body: Any, bodies: tuple[OnGround, ...]) -> int:
+    """The body of this number."""
+    if np.ndim(body) or not 0 <= body < len(bodies):
         raise ValueError(
             f"Argument `pairs` must hold bodies 0 to {len(bodies) - 1}, but holds {body!r}."
         )
@@ -324,49 +281,3 @@ def _body_of(entry: Any, bodies: tuple[OnGround, ...]) -> int:
             f"{type(bodies[body]).__name__}."
         )
     return int(body)
-
-
-def _polygon(bodies: tuple[OnGround, ...], which: int) -> Cornered:
-    """The body of this number, which has corners."""
-    body = bodies[which]
-    assert isinstance(body, Cornered)
-    return body
-
-
-def _sides_of(
-    pair: Any, i: int, j: int, bodies: tuple[OnGround, ...], at: Any
-) -> tuple[Side, Side]:
-    """The sides in contact of two polygons: as given, or those that face each other."""
-    if all(np.ndim(x) for x in pair):
-        for body, side in pair:
-            count = len(_polygon(bodies, body).ring)
-            if not 0 <= side < count:
-                raise ValueError(
-                    f"Argument `pairs` must hold sides 0 to {count - 1} of body {body}, but holds "
-                    f"{side!r}."
-                )
-        return (i, int(pair[0][1])), (j, int(pair[1][1]))
-    if is_traced((at, bodies)):
-        raise ValueError(
-            f"Argument `at` must not be traced for the polygons {i} and {j}: leave it out, or give "
-            "their sides."
-        )
-    q = as_float_array("at", at)
-    check_shape("at", q, (3 * len(bodies),), "x, y, theta of each body")
-    check_values("at", q)
-
-    def shape(which: int) -> tuple[np.ndarray, np.ndarray]:
-        """Corners of a body and outward normals of its sides (k, 2)."""
-        body = _polygon(bodies, which)
-        corners = placed(body.corners[np.array(body.ring)], q.reshape(-1, 3)[which][None])
-        return np.asarray(corners), np.asarray(outward(jnp.roll(corners, -1, axis=0) - corners))
-
-    best = []
-    for first, second in ((i, j), (j, i)):
-        (a, normals_a), (b, normals_b) = shape(first), shape(second)
-        away = np.min(np.sum((a[:, None] - b[None]) * normals_b, axis=2), axis=0)
-        widest = int(np.argmax(away))
-        facing = int(np.argmin(normals_a @ normals_b[widest]))
-        best.append((away[widest], (first, facing), (second, widest)))
-    _, first_side, second_side = best[int(best[1][0] > best[0][0] + PARALLEL)]
-    return first_side, second_side

@@ -22,7 +22,6 @@ def Bodies(
     pairs: Sequence[Any] | None = None,
     fixed: Sequence[Body] = (),
     places: Any = (),
-    at: Any = None,
     room: int | None = None,
 ) -> PlanarBodies | SpatialBodies | Pile:
     """Bodies on planes and on each other, in the plane or in space; q holds one after the other.
@@ -43,22 +42,20 @@ def Bodies(
             plane also an angle a [rad], or (a, c): 0 is level, pi/2 a wall on the right. None: the
             ground; (): none.
         pairs: (i, j) of bodies, counted from 0, in contact with each other; None: all but two
-            boxes. Two polygons also as ((i, side), (j, side)), see `PlanarBodies`.
+            boxes.
         fixed: in space, `Box`, `Sphere` that do not move: finite walls, tables; counted after the
             others.
         places: (f, 7) where the fixed ones are.
-        at: q at which the sides of two polygons are chosen that face each other, once and for all;
-            None: as they move.
         room: of many bodies, the largest number of closed contacts at once; given, bodies are many
             whatever their number. None: 4 a disc, 6 a polygon, 7 a sphere. Without it there are
-            many from 11 on, unless `pairs`, `fixed` or `at` are given.
+            many from 11 on, unless `pairs` or `fixed` are given.
 
     Returns:
         A `Body`; `between` names the bodies of its contacts where they are few.
 
     Raises:
         ValueError: no bodies or contacts, planes that are not finite or have no normal, pairs that
-            do not exist or of two boxes, `room` besides pairs, fixed bodies or `at`.
+            do not exist or of two boxes, `room` besides pairs or fixed bodies.
         TypeError: other bodies, or some in the plane and some in space.
 
     Source: Ericson, Real-Time Collision Detection (2005), ch. 5 and 7.
@@ -74,9 +71,9 @@ def Bodies(
     bodies = tuple(bodies)
     if not bodies:
         raise ValueError("Argument `bodies` must hold one or more, but is empty.")
-    named = pairs is not None or at is not None or len(fixed) > 0
+    named = pairs is not None or len(fixed) > 0
     if room is not None and named:
-        raise ValueError("Argument `room` must be left out with `pairs`, `fixed` or `at`.")
+        raise ValueError("Argument `room` must be left out with `pairs` or `fixed`.")
     many = room is not None or (len(bodies) > FEW and not named)
     dimension = _pile_in(bodies) if many else 0
     if dimension:
@@ -85,12 +82,10 @@ def Bodies(
         names = ", ".join(sorted({type(body).__name__ for body in bodies}))
         raise TypeError(f"Argument `bodies` must be discs, polygons or spheres, not {names}.")
     if isinstance(bodies[0], Solid):
-        if at is not None:
-            raise ValueError("Argument `at` must be left out in space.")
         return SpatialBodies(bodies, planes, pairs, fixed, places)  # type: ignore[arg-type]
     if len(fixed):
         raise ValueError("Argument `fixed` must be left out in the plane.")
-    return PlanarBodies(bodies, planes, pairs, at)  # type: ignore[arg-type]
+    return PlanarBodies(bodies, planes, pairs)  # type: ignore[arg-type]
 
 
 def _pile_in(bodies: tuple[Body, ...]) -> int:

@@ -111,11 +111,7 @@ SCENES = [
         lambda: ji.Bodies([ji.Disc(1.0), ji.Dimer(0.1, 1.0)], pairs=[(0, 1)]),
         r"body 1 is a Dimer",
     ),
-    (lambda: ji.Bodies([ji.Block(1, 1)] * 2, at=[0.0] * 3), r"`at` must have shape \(6,\)"),
-    (
-        lambda: ji.Bodies([ji.Block(1, 1)] * 2, pairs=[((0, 4), (1, 0))]),
-        r"sides 0 to 3 of body 0",
-    ),
+    (lambda: ji.Bodies([ji.Block(1, 1)] * 2, pairs=[((0, 2), (1, 0))]), r"bodies 0 to 1"),
     (lambda: ji.Box([1.0, 1.0, 0.0]), r"`sizes`"),
     (lambda: ji.Box([1.0, 1.0]), r"`sizes` must have shape \(3,\)"),
     (lambda: ji.Box([1.0, 1.0, 1.0], mass=0.0), r"`mass`"),
