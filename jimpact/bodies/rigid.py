@@ -185,7 +185,7 @@ class Solid(RigidBody):
     def ways(self, normal: jax.Array) -> jax.Array:
         """Two directions in the plane (m, 2, 3), the first one that of x."""
         x, y, z = normal.T
-        first = jnp.stack([z, 0 * y, -x], axis=1) / jnp.sqrt(x**2 + z**2)[:, None]
+        first = jnp.stack([z, 0 * y, 0 * y - x], axis=1) / jnp.sqrt(x**2 + z**2)[:, None]
         return jnp.stack([first, cross(normal, first)], axis=1)
 
     def in_axes(self, q: jax.Array, body: Any, around: jax.Array) -> jax.Array:
