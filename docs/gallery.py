@@ -145,7 +145,7 @@ def law_compliant():
     """A heavy ball, struck from both sides: a gap of a tenth of its scale is as good as closed."""
     law, before = ji.Compliant(ji.Hertz(1e9)), jnp.array([1.0, 0.0, -1.0])
     masses = [0.25, 1.0, 0.25]
-    scale = ji.gap_scale(ji.chain(masses), law, before).delta[1]
+    scale = ji.theory.gap_scale(ji.chain(masses), law, before).delta[1]
     return three_balls(
         lambda gap: (law, ji.chain(masses, gaps=jnp.stack([0.0, gap * scale])), before),
         np.geomspace(0.01, 10, 121),

@@ -3,12 +3,13 @@
 from . import data as data, plot as plot, theory as theory
 from .audits import audit as audit, summary as summary
 from .bodies.assembly import Bodies as Bodies
-from .bodies.base import Body as Body, scene_from_gaps as scene_from_gaps
+from .bodies.base import Body as Body
 from .bodies.blocks import Block as Block
 from .bodies.dimers import (
     Dimer as Dimer,
     SpatialDimer as SpatialDimer,
 )
+from .bodies.given import scene_from_gaps as scene_from_gaps
 from .bodies.mujoco_scene import from_mujoco as from_mujoco
 from .bodies.particles import Column as Column, Corner as Corner
 from .bodies.pendulums import PendulumCradle as PendulumCradle
@@ -73,7 +74,7 @@ from .laws.kinematic import (
 from .laws.lzb import (
     LZB as LZB,
 )
-from .laws.materials import hertz_stiffness as hertz_stiffness, sphere_mass as sphere_mass
+from .laws.materials import hertz_stiffness as hertz_stiffness
 from .laws.mujoco_contact import (
     mujoco_restitution as mujoco_restitution,
     mujoco_solref as mujoco_solref,
@@ -90,11 +91,14 @@ from .methods.scene_advice import simplest_scene as simplest_scene
 from .methods.stability import stability_map as stability_map
 from .methods.validity import validity_map as validity_map
 from .montecarlo.distributions import Normal as Normal, RandomLaw as RandomLaw, Uniform as Uniform
-from .montecarlo.gaps import gap_scale as gap_scale
 from .montecarlo.run import monte_carlo as monte_carlo
 from .montecarlo.store import read_samples as read_samples
 from .motion.fitting_motion import fit_motion as fit_motion
-from .motion.pile_contacts import pile_contacts as pile_contacts
+from .motion.methods import (
+    ContactForces as ContactForces,
+    EventDriven as EventDriven,
+    TimeStepping as TimeStepping,
+)
 from .motion.simulate import simulate as simulate
 from .motion.system import (
     HarmonicBase as HarmonicBase,

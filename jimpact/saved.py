@@ -34,7 +34,7 @@ def load(path: str | Path) -> Fit[Any] | Motion:
     >>> ball, law = ji.System(ji.Column([1.0]), gravity=True), ji.Newton(0.5)
     >>> motion = ji.simulate(ball, law, [1.0], [0.0], 1.0, samples=21)
     >>> loaded = ji.load(motion.save(folder / "ball.npz"))
-    >>> both = loaded.then(ji.simulate(ball, law, **loaded.end, t_end=2.0, samples=21))
+    >>> both = loaded.then(ji.simulate(ball, law, **loaded.restart(2.0), samples=21))
     >>> len(both.time), [round(float(t), 4) for t in both.event_times()[:3]]
     (41, [0.4516, 0.9032, 1.129])
     """

@@ -40,7 +40,7 @@ small, large = 0.0167, 0.0669  # kg: steel, radii 8 mm and half an inch
 balls = ji.chain([small, large, small], gaps=[0.0, 0.0])
 v = jnp.array([1.0, 0.0, -1.0])
 law = ji.Compliant(ji.Hertz(1.06e10))  # N/m^1.5
-scale = ji.gap_scale(balls, law, v)
+scale = ji.theory.gap_scale(balls, law, v)
 print(scale)
 ji.plot.system(ji.chain([small, large, small], gaps=[1e-5, 1e-5]), v, "Gaps not to scale")
 

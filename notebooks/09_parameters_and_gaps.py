@@ -52,7 +52,7 @@ mean = np.array([0.92, 1.2e10])
 error = np.array([0.01, 0.05e10])
 covariance = np.outer(error, error) * np.array([[1.0, -0.3], [-0.3, 1.0]])
 nominal = ji.Compliant(ji.Bistiffness(mean[1], 1.5, mean[0]))
-scale = ji.gap_scale(balls, nominal, before)
+scale = ji.theory.gap_scale(balls, nominal, before)
 print(scale)
 
 # %% [markdown]

@@ -56,9 +56,9 @@ def rock(tilt, acceleration):
     base = ji.HarmonicBase(amplitude, 2.0, jnp.pi / 2, "horizontal")
     height = 0.1 * jnp.sin(tilt) + 0.3 * jnp.cos(tilt)
     law = ji.RestitutionMatrix(ji.theory.rocking_matrix(e))
-    block = ji.System(ji.Block(0.2, 0.6, corners="base"), gravity=True, base=base)
+    block = ji.System(ji.Block(0.2, 0.6, corners="base"), gravity=True, base=base, friction=5.0)
     start = jnp.stack([amplitude, height, tilt])
-    return ji.simulate(block, law, start, jnp.zeros(3), 3.0, friction=5.0)
+    return ji.simulate(block, law, start, jnp.zeros(3), 3.0)
 
 
 levels = np.array([0.0, 0.3, 0.4, 0.6, 0.8, 1.0, 1.4])

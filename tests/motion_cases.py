@@ -17,7 +17,7 @@ def status(motion):
 def dropped(e, q0, slow):
     return ji.simulate(
         ji.System(ji.Column([1.0]), gravity=True), ji.Newton(e), q0[None], jnp.zeros(1), 5.0, samples=101, max_events=100,
-        slow=slow,
+        method=ji.EventDriven(slow=slow),
     )  # fmt: skip
 
 

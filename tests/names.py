@@ -5,11 +5,11 @@ import json
 from pathlib import Path
 
 import jimpact as ji
-from jimpact.bodies.solids import Solid
+from jimpact.bodies.rigid import Solid
 from jimpact.fits.fitting import LOSSES
 from jimpact.fits.solve import DEFAULT_STEPS
 from jimpact.methods.contenders import CONTENDERS
-from jimpact.motion.simulate import METHODS as MOTION_METHODS
+from jimpact.motion.methods import METHODS as MOTION_METHODS
 
 PATH = Path(ji.__file__).parent / "data" / "names.json"
 

@@ -37,7 +37,9 @@ def sliding(q):
     return jnp.stack([q[0] - jnp.cos(q[2])])
 
 
-ROD = ji.System(gap, INERTIA, potential=ji.gravity([0.0, 1.0, 0.0], G), tangent_function=sliding)
+ROD = ji.System(
+    gap, INERTIA, potential=ji.gravity([0.0, 1.0, 0.0], G), tangent_function=sliding, friction=MU
+)
 
 
 def directions(theta):
@@ -56,8 +58,7 @@ def moves(given, law=ji.LZB):
     e, friction, theta, rate, slip = given
     q = jnp.stack([jnp.zeros_like(theta), jnp.sin(theta), theta])
     v = jnp.stack([slip - jnp.sin(theta) * rate, jnp.cos(theta) * rate, rate])
-    law, mu = law(e, friction=friction), jnp.asarray(MU)
-    return ji.simulate(ROD, law, q, v, T_END, samples=2, friction=mu, max_events=30)
+    return ji.simulate(ROD, law(e, friction=friction), q, v, T_END, samples=2, max_events=30)
 
 
 @functools.cache

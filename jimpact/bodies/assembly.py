@@ -5,10 +5,10 @@ from typing import Any
 
 from jimpact.bodies.assemblies import PlanarBodies
 from jimpact.bodies.base import Body
-from jimpact.bodies.piles import Discs, Pile, Spheres
-from jimpact.bodies.planar_piles import PlanarPile
+from jimpact.bodies.piles import Pile
 from jimpact.bodies.polygons import Cornered, Disc
-from jimpact.bodies.solids import Solid, Sphere
+from jimpact.bodies.rigid import Solid
+from jimpact.bodies.solids import Sphere
 from jimpact.bodies.spatial_bodies import SpatialBodies
 
 # Bodies above which a grid finds the closed contacts, unless their `pairs` are named. Ten times
@@ -22,7 +22,6 @@ def Bodies(
     pairs: Sequence[Any] | None = None,
     fixed: Sequence[Body] = (),
     places: Any = (),
-    at: Any = None,
     room: int | None = None,
 ) -> PlanarBodies | SpatialBodies | Pile:
     """Bodies on planes and on each other, in the plane or in space; q holds one after the other.
@@ -32,7 +31,7 @@ def Bodies(
     round bodies `f = |x_1 - x_2| - r_1 - r_2`; a disc or sphere has its distance from a polygon or
     box; two polygons have the two contacts of the sides that face each other. Few bodies have all
     their contacts (`jimpact.bodies.assemblies`, `.spatial_bodies`: q as of each body). Many discs,
-    polygons and spheres are a pile (`.piles`, `.planar_piles`): a grid finds closed contacts in
+    polygons and spheres are a pile (`.piles`): a grid finds closed contacts in
     `simulate(method="time_stepping")`, `touching(q)` is the scene of those at q, and spheres keep
     three turns [rad] in the place of a quaternion. `at(centres)` gives q, not turned.
 
@@ -43,22 +42,20 @@ def Bodies(
             plane also an angle a [rad], or (a, c): 0 is level, pi/2 a wall on the right. None: the
             ground; (): none.
         pairs: (i, j) of bodies, counted from 0, in contact with each other; None: all but two
-            boxes. Two polygons also as ((i, side), (j, side)), see `PlanarBodies`.
+            boxes.
         fixed: in space, `Box`, `Sphere` that do not move: finite walls, tables; counted after the
             others.
         places: (f, 7) where the fixed ones are.
-        at: q at which the sides of two polygons are chosen that face each other, once and for all;
-            None: as they move.
         room: of many bodies, the largest number of closed contacts at once; given, bodies are many
             whatever their number. None: 4 a disc, 6 a polygon, 7 a sphere. Without it there are
-            many from 11 on, unless `pairs`, `fixed` or `at` are given.
+            many from 11 on, unless `pairs` or `fixed` are given.
 
     Returns:
         A `Body`; `between` names the bodies of its contacts where they are few.
 
     Raises:
         ValueError: no bodies or contacts, planes that are not finite or have no normal, pairs that
-            do not exist or of two boxes, `room` besides pairs, fixed bodies or `at`.
+            do not exist or of two boxes, `room` besides pairs or fixed bodies.
         TypeError: other bodies, or some in the plane and some in space.
 
     Source: Ericson, Real-Time Collision Detection (2005), ch. 5 and 7.
@@ -74,29 +71,25 @@ def Bodies(
     bodies = tuple(bodies)
     if not bodies:
         raise ValueError("Argument `bodies` must hold one or more, but is empty.")
-    named = pairs is not None or at is not None or len(fixed) > 0
+    named = pairs is not None or len(fixed) > 0
     if room is not None and named:
-        raise ValueError("Argument `room` must be left out with `pairs`, `fixed` or `at`.")
+        raise ValueError("Argument `room` must be left out with `pairs` or `fixed`.")
     many = room is not None or (len(bodies) > FEW and not named)
-    kind: Any = _pile_of(bodies) if many else None
-    if kind is not None:
-        return kind(bodies, planes, room)
+    dimension = _pile_in(bodies) if many else 0
+    if dimension:
+        return Pile(bodies, dimension, planes, room)
     if room is not None:
         names = ", ".join(sorted({type(body).__name__ for body in bodies}))
         raise TypeError(f"Argument `bodies` must be discs, polygons or spheres, not {names}.")
     if isinstance(bodies[0], Solid):
-        if at is not None:
-            raise ValueError("Argument `at` must be left out in space.")
         return SpatialBodies(bodies, planes, pairs, fixed, places)  # type: ignore[arg-type]
     if len(fixed):
         raise ValueError("Argument `fixed` must be left out in the plane.")
-    return PlanarBodies(bodies, planes, pairs, at)  # type: ignore[arg-type]
+    return PlanarBodies(bodies, planes, pairs)  # type: ignore[arg-type]
 
 
-def _pile_of(bodies: tuple[Body, ...]) -> type[Pile] | None:
-    """The kind of pile that these bodies are, if they are one."""
+def _pile_in(bodies: tuple[Body, ...]) -> int:
+    """2 or 3: these bodies may be a pile in the plane or in space; 0: they may not."""
     if all(isinstance(body, Sphere) and body.is_round for body in bodies):
-        return Spheres
-    if all(isinstance(body, Disc) and body.is_round for body in bodies):
-        return Discs
-    return PlanarPile if all(isinstance(body, Cornered | Disc) for body in bodies) else None
+        return 3
+    return 2 if all(isinstance(body, Cornered | Disc) for body in bodies) else 0

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -10,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
+from jimpact.bodies.closed_pairs import ActivePairs
 from jimpact.compiling import full_precision, quick_jit
-from jimpact.scene import Scene, check_mass, sparse_scene
+from jimpact.scene import Scene
 
 STANDARD_GRAVITY = 9.80665  # m/s^2
 CLOSED_BELOW = 1e-12  # [m] gaps this small are rounding of f(q) = 0; ten times more are, too
@@ -45,66 +46,6 @@ def numbered(names: Sequence[str], count: int) -> tuple[str, ...]:
         return tuple(names)
     parts = [split_name(name) for name in names]
     return tuple(f"{word}{i + 1} [{unit}]" for i in range(count) for word, unit in parts)
-
-
-# Contacts of a pile that are computed at once; rows without contacts are left out in such blocks.
-# Ten times more: few contacts among many bodies take as long as all of them.
-BLOCK = 128
-
-
-def over_blocks(count: Any, one: Callable[[Any, Any], Any], start: Any) -> Any:
-    """`start` carried by `one(first_row, carry)` through the blocks that hold `count` () rows."""
-    blocks = (count + BLOCK - 1) // BLOCK
-    return jax.lax.fori_loop(jnp.int32(0), blocks, lambda i, carry: one(i * BLOCK, carry), start)
-
-
-def block(x: jax.Array, row: jax.Array) -> jax.Array:
-    """The rows of x (K, ...) from this one that are computed at once."""
-    return jax.lax.dynamic_slice_in_dim(x, row, BLOCK)
-
-
-def with_block(x: jax.Array, values: jax.Array, row: jax.Array) -> jax.Array:
-    """x (K, ...) with these values from this row on."""
-    return jax.lax.dynamic_update_slice_in_dim(x, values.astype(x.dtype), row, 0)
-
-
-class ActivePairs(NamedTuple):
-    """The closed contacts of many bodies in the first of K rows, a multiple of `BLOCK`.
-
-    Rows that are not used are 0.
-    """
-
-    number: jax.Array  # (K,) of the contact among all of them; `pair_count` in unused rows
-    closed: jax.Array  # (K,) whether the row is used
-    filled: jax.Array  # () how many are
-    bodies: jax.Array  # (K, 2); the number of bodies stands for a wall
-    # (K, d, 2, velocities): normal and tangents, of both bodies, by the velocities of each: x, y
-    # and turn in a plane, x, y, z and three turns in space
-    directions: jax.Array
-    overflows: jax.Array  # () whether more are closed than there are rows
-    reach: jax.Array  # () [m]: bodies that move farther in one step may pass each other
-
-
-def listed_pairs(pairs: ActivePairs, mass: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, Scene]:
-    """On the host: rows (m,) in order, bodies (m, 2) with -1 for walls, directions, the scene.
-
-    Contacts of two bodies come first; `mass` (n,). Walls do not move: their directions are 0.
-    """
-    size = pairs.directions.shape[3]
-    bodies = np.where(pairs.bodies == len(mass) // size, -1, pairs.bodies)[: int(pairs.filled)]
-    order = np.lexsort((pairs.number[: len(bodies)], bodies[:, 1] < 0))
-    bodies, directions = bodies[order], np.array(pairs.directions)[order]
-    directions[:, :, 1] *= (bodies[:, 1] >= 0)[:, None, None]
-    scene = sparse_scene(mass, jnp.asarray(directions[:, 0]), bodies, len(mass) // size)
-    return order, bodies, directions, scene
-
-
-class ContactPoints(NamedTuple):
-    """Of m contacts: gap [m], where it is [m], and the unit normal from body 2 to body 1."""
-
-    gap: jax.Array  # (m,)
-    point: jax.Array  # (m, 2 or 3)
-    normal: jax.Array  # (m, 2 or 3)
 
 
 class Body(eqx.Module):
@@ -337,16 +278,16 @@ class Body(eqx.Module):
             scenes.append(Scene(masses[k], normals[k][:, closed], closed_tangents))
         return scenes
 
-    def _parts(self, q: jax.Array) -> "_Parts":
+    def _parts(self, q: jax.Array) -> "Parts":
         """What a scene at q needs, by a compiled program."""
         return _compiled_parts(self, q)
 
 
 # mass, normals, tangents, gaps, margin of their range
-_Parts = tuple[jax.Array, jax.Array, jax.Array | None, jax.Array, jax.Array]
+Parts = tuple[jax.Array, jax.Array, jax.Array | None, jax.Array, jax.Array]
 
 
-def _parts(body: Body, q: jax.Array) -> _Parts:
+def parts_at(body: Body, q: jax.Array) -> Parts:
     """What a scene at q needs; normals are NaN out of the range of the gap function."""
     margin = body.valid(q)
     normals = jnp.where(margin >= 0, body.normals(q), jnp.nan)
@@ -354,15 +295,15 @@ def _parts(body: Body, q: jax.Array) -> _Parts:
 
 
 @quick_jit
-def _compiled_parts(body: Body, q: jax.Array) -> _Parts:
+def _compiled_parts(body: Body, q: jax.Array) -> Parts:
     """The same, compiled."""
-    return _parts(body, q)
+    return parts_at(body, q)
 
 
 @quick_jit
-def _many_parts(body: Body, q: jax.Array) -> _Parts:
+def _many_parts(body: Body, q: jax.Array) -> Parts:
     """The same at many q (K, d), compiled."""
-    return jax.vmap(partial(_parts, body))(q)
+    return jax.vmap(partial(parts_at, body))(q)
 
 
 def check_range(name: str, body: Body, margin: Any, where: str = "") -> None:
@@ -383,82 +324,6 @@ def check_penetration(name: str, f: jax.Array, closed_below: jax.Array) -> None:
         f"Argument `{name}` must have no penetration (f >= -{float(closed_below):g} m), "
         f"but gap {worst} has value {float(f[worst]):g} m."
     )
-
-
-class GivenBody(Body):
-    """A body given by functions, see `System` and `scene_from_gaps`."""
-
-    gaps: Callable[[jax.Array], jax.Array]
-    mass_argument: Any
-    sliding: Callable[[jax.Array], jax.Array | None] | None
-
-    def __init__(self, gap_function: Any, mass: Any, tangent_function: Any = None):
-        for name, function in (
-            ("gap_function", gap_function),
-            ("tangent_function", tangent_function),
-        ):
-            if not (callable(function) or (function is None and name != "gap_function")):
-                raise TypeError(f"Argument `{name}` must be a function, but is {function!r}.")
-        self.gaps, self.sliding = gap_function, tangent_function
-        if callable(mass):
-            self.mass_argument = mass
-        else:
-            self.mass_argument = as_float_array("mass", mass)
-            check_mass(self.mass_argument)
-
-    @property
-    def functions(self) -> tuple[Any, ...]:
-        """The gaps, the displacements and the mass."""
-        return self.gaps, self.sliding, self.mass_argument
-
-    @property
-    def mass(self) -> Any:
-        """M or q -> M(q), the argument `mass`."""
-        return self.mass_argument
-
-    def gap_function(self, q: jax.Array) -> jax.Array:
-        """Gaps f(q) (m,) [m]."""
-        return jnp.atleast_1d(self.gaps(q))
-
-    def tangent_function(self, q: jax.Array) -> jax.Array | None:
-        """Displacements (m,) [m] along the contact planes."""
-        displacements = None if self.sliding is None else self.sliding(q)
-        return None if displacements is None else jnp.atleast_1d(displacements)
-
-    def _parts(self, q: jax.Array) -> _Parts:
-        """What a scene at q needs."""
-        return _parts(self, q)  # each new lambda would be compiled anew
-
-
-@full_precision
-def scene_from_gaps(
-    gap_function: Callable[[jax.Array], jax.Array],
-    mass: Any,
-    q: Any,
-    closed_below: float = CLOSED_BELOW,
-) -> Scene:
-    """Scene of bodies at configuration `q`; the normals are the gradients of their gaps.
-
-    Equation: `N = grad f(q)`, `M = M(q)`, gaps `f(q)`.
-
-    Args:
-        gap_function: q (n,) -> gaps f(q) (m,) [m], written with jax.numpy.
-        mass: M (n,) or (n, n), or a function q -> M(q).
-        q: (n,) configuration.
-        closed_below: gaps with |f| up to this count as closed [m].
-
-    Returns:
-        `Scene` of n coordinates and m contacts, without tangents.
-
-    Raises:
-        ValueError: penetration (f < -closed_below), or what `Scene` refuses.
-
-    >>> import jax.numpy as jnp, jimpact as ji
-    >>> bouncing = ji.scene_from_gaps(lambda q: q[1:] - 0.5, [1.0, 1.0], [0.0, 0.5])
-    >>> bouncing.normals.tolist()
-    [[0.0], [1.0]]
-    """
-    return GivenBody(gap_function, mass).scene(q, closed_below)
 
 
 class LinearPotential(eqx.Module):
@@ -530,80 +395,6 @@ def floors_of(planes: Any) -> list[tuple[float, float]]:
     return [(float(np.arctan2(-x, y)), float(c)) for x, y, c in np.asarray(planes)]
 
 
-def planar_directions(mass: jax.Array) -> jax.Array:
-    """Of a base that carries planar bodies of diagonal mass (n,) in x and y (n, 2)."""
-    return jnp.tile(jnp.eye(3, 2, dtype=mass.dtype), (mass.shape[0] // 3, 1))
-
-
-def planar_weight(mass: jax.Array, acceleration: Any) -> LinearPotential:
-    """`V = g sum m_i y_i` of planar bodies of diagonal mass (n,)."""
-    up = jnp.tile(jnp.array([0.0, 1.0, 0.0], mass.dtype), mass.shape[0] // 3)
-    return LinearPotential(mass * up * acceleration)
-
-
-class OnGround(Body):
-    """A rigid planar body above the ground y = 0; q = (x, y, theta) of its centre of mass.
-
-    Equation: contact i is a circle of radius r about the point c_i of the body,
-    `f_i = y + (R(theta) c_i)_y - r`, its lowest point slides at the rate of
-    `x + (R(theta) c_i)_x + r theta`. A body of this kind gives `points` (m, 2), `total_mass` [kg],
-    `inertia` [kg m^2] and, unless it is 0, `rim`.
-    """
-
-    total_mass: eqx.AbstractVar[jax.Array]
-    inertia: eqx.AbstractVar[jax.Array]
-
-    @property
-    def mass(self) -> jax.Array:
-        """M = diag(m, m, I)."""
-        return jnp.stack([self.total_mass, self.total_mass, self.inertia])
-
-    @property
-    def points(self) -> jax.Array:
-        """c_i (m, 2) from the centre of mass [m]."""
-        raise NotImplementedError(f"{type(self).__name__} must define `points`.")
-
-    @property
-    def rim(self) -> Any:
-        """r () of the circles about them [m]."""
-        return 0.0
-
-    def gap_function(self, q: jax.Array) -> jax.Array:
-        """Heights of the contact points over the ground."""
-        return heights(self.points, q) - self.rim
-
-    def tangent_function(self, q: jax.Array) -> jax.Array:
-        """Ways that the contact points slide along the ground."""
-        c = self.points
-        rolled = q[0] + self.rim * q[2]
-        return rolled + (jnp.cos(q[2]) * c[:, 0] - jnp.sin(q[2]) * c[:, 1])
-
-    @property
-    def base_directions(self) -> jax.Array:
-        """The ground moves in x and y (3, 2)."""
-        return planar_directions(self.mass)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """x, y, angle."""
-        return PLANAR
-
-    def gravity(self, acceleration: Any) -> LinearPotential:
-        """`V = m g y`."""
-        return planar_weight(self.mass, acceleration)
-
-    def touching(self, angle: Any = 0.0) -> jax.Array:
-        """q (3,) with x = 0, turned by `angle`, at which its lowest contacts touch the ground."""
-        turn = number("angle", angle)
-        zero = jnp.zeros_like(turn)
-        return jnp.stack([zero, -jnp.min(self.gap_function(jnp.stack([zero, zero, turn]))), turn])
-
-
-def heights(points: jax.Array, q: jax.Array) -> jax.Array:
-    """y (m,) of points (m, 2) of a planar body at q = (x, y, theta)."""
-    return q[1] + (jnp.sin(q[2]) * points[:, 0] + jnp.cos(q[2]) * points[:, 1])
-
-
 def turned(points: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Points (k, 2) of a planar body, in its own frame, at q = (x, y, theta)."""
     c, s = np.cos(q[2]), np.sin(q[2])
@@ -614,12 +405,6 @@ def wheel(radius: Any, q: np.ndarray, middle: Any = (0.0, 0.0)) -> np.ndarray:
     """A circle about `middle`, with the radius that shows how far it has turned."""
     spoke = np.concatenate([[[0.0, 0.0]], CIRCLE])
     return turned(float(radius) * spoke + np.asarray(middle), q)
-
-
-def moving(between: Sequence[tuple[int, int]], count: int) -> np.ndarray:
-    """(m, count) of contacts and moving bodies: 1 for the first body, -1 for the second, else 0."""
-    first, second = (np.array(side)[:, None] == np.arange(count) for side in zip(*between))
-    return first.astype(float) - second.astype(float)
 
 
 def lengths(vectors: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from jimpact._checks import check_choice
-from jimpact.bodies.base import heights, positive
+from jimpact.bodies.base import positive
+from jimpact.bodies.contacts import placed
 from jimpact.bodies.polygons import Cornered
 
 
@@ -43,7 +44,7 @@ class Block(Cornered):
     height: jax.Array
     total_mass: jax.Array
     inertia: jax.Array
-    contacts: str = eqx.field(static=True)
+    contact_corners: str = eqx.field(static=True)
     ring: tuple[int, ...] = eqx.field(static=True)
 
     def __init__(
@@ -60,7 +61,7 @@ class Block(Cornered):
             inertia = self.total_mass * (self.height**2 + self.width**2) / 12
         self.inertia = positive("inertia", inertia)
         check_choice("corners", corners, ("all", "base"))
-        self.contacts, self.ring = corners, (1, 0, 3, 2)
+        self.contact_corners, self.ring = corners, (1, 0, 3, 2)
 
     @property
     def corners(self) -> jax.Array:
@@ -71,10 +72,10 @@ class Block(Cornered):
     @property
     def points(self) -> jax.Array:
         """The corners that make contact."""
-        return self.corners if self.contacts == "all" else self.corners[:2]
+        return self.corners if self.contact_corners == "all" else self.corners[:2]
 
     def valid(self, q: jax.Array) -> jax.Array:
         """With the lower corners only: height () of the lower one of the upper corners [m]."""
-        if self.contacts == "all":
+        if self.contact_corners == "all":
             return super().valid(q)
-        return jnp.min(heights(self.corners[2:], q))
+        return jnp.min(placed(self.corners[2:], q[None])[:, 1])

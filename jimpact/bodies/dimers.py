@@ -9,11 +9,10 @@ import numpy as np
 from jimpact._checks import is_traced
 from jimpact.bodies.base import (
     CIRCLE,
-    OnGround,
     positive,
     turned,
 )
-from jimpact.bodies.solids import LEVEL, Solid
+from jimpact.bodies.rigid import LEVEL, OnGround, Solid
 
 
 class Dimer(OnGround):

@@ -1,6 +1,5 @@
-"""Piles: many discs or spheres between walls, each contact between two of them or with a wall."""
+"""Piles: many discs and polygons, or spheres, between flat walls; a grid finds what touches."""
 
-import abc
 import warnings
 from collections.abc import Sequence
 from typing import Any
@@ -19,27 +18,35 @@ from jimpact._checks import (
     is_traced,
 )
 from jimpact.bodies.base import (
-    BLOCK,
     CIRCLE,
-    PLANAR,
-    ActivePairs,
-    Body,
-    LinearPotential,
     as_planes,
-    floors_of,
-    listed_pairs,
     numbered,
-    over_blocks,
+    turned,
     wheel,
+)
+from jimpact.bodies.closed_pairs import (
+    BLOCK,
+    ActivePairs,
+    block,
+    chosen_rows,
+    listed_pairs,
+    over_blocks,
     with_block,
 )
+from jimpact.bodies.contacts import Assembly, ContactPoints, placed, round_on_round, tangents_of
 from jimpact.bodies.neighbours import Candidates, all_pairs, crowd_of, near_pairs
+from jimpact.bodies.polygon_contacts import mixed_pairs
+from jimpact.bodies.polygons import Cornered
 from jimpact.compiling import full_precision, precise_jit
 from jimpact.scene import Scene
 
-# Contacts per body that may be closed by default, by dimension: equal discs have 3, equal spheres
-# 6, and walls. Ten times more takes ten times the memory.
-ROOM = {2: 4, 3: 7}
+# Contacts per body that may be closed by default: equal discs have 3, equal spheres 6, and walls;
+# polygons two for each. Ten times more takes ten times the memory.
+ROOM = {"discs": 4, "polygons": 6, "spheres": 7}
+
+# Pairs of each body whose circles around them meet, of polygons. Ten times more takes ten times the
+# memory.
+NEAR = 8
 
 # Way of a body within half a step, over the least radius, up to which the grid finds all contacts:
 # what moves farther in a step than the least radius is a `coarse_step`. Ten times more makes cells
@@ -55,31 +62,55 @@ _OVERLAP = 0.1
 _TOUCHING = 1e-9
 
 
-class Pile(Body):
-    """Bodies between flat walls: d places and the turns of each, d = 2 or 3; here they are round.
+class Pile(Assembly):
+    """Many discs and convex polygons, or spheres, between walls; q = places and turns of each.
 
-    A kind of pile gives `dimension` and `tangents_of`.
+    Equation: gaps as of `PlanarBodies` and `SpatialBodies`; a sphere looks the same from all sides,
+    so that its turns are the integrals of the angular velocity in the axes of space. As a `Scene`
+    it has the contacts of every pair, those of body 1 first, then body by body and wall by wall.
+    With polygons there are two for each pair (with a disc the second one is always open), and one
+    a corner with each wall. `simulate(method="time_stepping")` finds closed contacts by a grid and
+    takes no others.
+
+    Source: Ericson, Real-Time Collision Detection (2005), ch. 5 and 7.
+
+    >>> import jimpact as ji
+    >>> discs = ji.Bodies([ji.Disc(0.1)] * 2, room=8)
+    >>> [round(float(f), 6) for f in discs.gap_function(discs.at([[0.0, 0.1], [0.5, 0.1]]))]
+    [0.3, 0.0, 0.0]
+    >>> pile = ji.Bodies([ji.Block(0.2, 0.1), ji.Disc(0.1)], room=8)
+    >>> pile.touching([0.0, 0.05, 0.0, 0.0, 0.2, 0.0], below=1e-6).contacts
+    3
     """
 
-    masses: jax.Array
-    radii: jax.Array
+    masses: jax.Array  # (k,)
     turning: jax.Array  # (k,) moments of inertia
+    # (k, K, d) from the centre of mass, counter-clockwise, the last one repeated; of round bodies
+    # their middle
+    corners: jax.Array
+    rims: jax.Array  # (k,) radii of round bodies, 0 of polygons
+    radii: jax.Array  # (k,) of discs or spheres about the centres of mass around the bodies
+    inner: jax.Array  # (k,) of those within them
     planes: jax.Array  # (w, d + 1) unit normal, distance
     room: int = eqx.field(static=True)
     crowd: int = eqx.field(static=True)  # see `near_pairs`; 0: every pair is looked at
 
-    dimension = 0  # d
-
-    def __init__(self, bodies: Sequence[Any], planes: Any = None, room: int | None = None):
-        self.masses = stacked([body.total_mass for body in bodies])
-        self.radii = stacked([body.rim for body in bodies])
-        self.turning = stacked([jnp.ravel(body.inertia)[0] for body in bodies])
-        self._have_planes(planes, room, ROOM[self.dimension])
-
-    def _have_planes(self, planes: Any, room: int | None, room_of_each: int) -> None:
-        """Set the planes, the room for contacts, and whether there is a grid."""
-        self.planes = as_planes(planes, self.dimension).astype(self.radii.dtype)
-        self.room = room_of_each * self.count if room is None else as_whole("room", room, 1)
+    def __init__(
+        self, bodies: Sequence[Any], dimension: int, planes: Any = None, room: int | None = None
+    ):
+        self.masses = _stacked([body.total_mass for body in bodies])
+        self.turning = _stacked([jnp.ravel(body.inertia)[0] for body in bodies])
+        self.rims = _stacked([body.rim for body in bodies]).astype(self.masses.dtype)
+        if all(not isinstance(body, Cornered) and body.is_round for body in bodies):
+            self.corners = jnp.zeros((len(bodies), 1, dimension), self.rims.dtype)
+            self.radii = self.inner = self.rims
+            kind = "discs" if dimension == 2 else "spheres"
+        else:
+            check_concrete("bodies", list(bodies))
+            self.corners, self.radii, self.inner = _polygons(bodies)
+            kind = "polygons"
+        self.planes = as_planes(planes, dimension).astype(self.radii.dtype)
+        self.room = ROOM[kind] * self.count if room is None else as_whole("room", room, 1)
         self.crowd = self._crowd()
 
     def _crowd(self) -> int:
@@ -94,70 +125,79 @@ class Pile(Body):
     @property
     def _least(self) -> jax.Array:
         """The least radius () of a disc or ball within a body."""
-        return jnp.min(self.radii)
+        return jnp.min(self.inner)
 
     @property
     def count(self) -> int:
         """Number of bodies."""
-        return self.radii.shape[0]
+        return self.masses.shape[0]
+
+    @property
+    def _slots(self) -> int:
+        """Contacts of a pair: at both ends of the sides of polygons that face each other."""
+        return min(2, self.corners.shape[1])
+
+    @property
+    def _stride(self) -> int:
+        """Partners of a body: the others, and each wall once for each corner."""
+        return self.count + len(self.planes) * self.corners.shape[1]
 
     @property
     def mass(self) -> jax.Array:
         """M, its diagonal (n,)."""
-        d = self.dimension
-        each = [self.masses] * d + [self.turning] * _turns(d)
+        each = [self.masses] * self.dimension + [self.turning] * self.turns
         return jnp.stack(each, axis=1).reshape(-1)
-
-    def at(self, centres: Any) -> jax.Array:
-        """q (n,) with the bodies, not turned, at these centres (k, d) [m]."""
-        places = as_float_array("centres", centres)
-        if places.shape != (self.count, self.dimension):
-            raise ValueError(
-                f"Argument `centres` must have shape ({self.count}, {self.dimension}), but has "
-                f"{places.shape}."
-            )
-        return jnp.pad(places, ((0, 0), (0, _turns(self.dimension)))).reshape(-1)
-
-    def gravity(self, acceleration: Any) -> LinearPotential:
-        """`V = g sum m_i h_i`, h the last place: y in a plane, z in space."""
-        return LinearPotential(self.mass * self.base_directions[:, -1] * acceleration)
-
-    @property
-    def base_directions(self) -> jax.Array:
-        """The walls move along each axis (n, d)."""
-        d, dtype = self.dimension, self.radii.dtype
-        return jnp.tile(jnp.eye(d + _turns(d), d, dtype=dtype), (self.count, 1))
-
-    def _of_bodies(self, q: jax.Array) -> jax.Array:
-        """Coordinates or velocities (k, d + turns) of each body."""
-        return q.reshape(self.count, -1)
 
     # ---- all contacts
 
-    def gap_function(self, q: jax.Array) -> jax.Array:
-        """Gaps of all pairs, then of each body with every wall."""
-        first, second = np.triu_indices(self.count, 1)
-        to_walls = self._wall_gaps(q).reshape(-1)
-        return jnp.concatenate([self._pair_gaps(q, first, second), to_walls])
+    @property  # type: ignore[misc]
+    def between(self) -> np.ndarray:
+        """Bodies i and j (m, 2) of all contacts; j of a wall is -1."""
+        pairs = np.repeat(np.stack(np.triu_indices(self.count, 1), axis=1), self._slots, axis=0)
+        body = np.repeat(np.arange(self.count), self._stride - self.count)
+        return np.concatenate([pairs, np.stack([body, np.full_like(body, -1)], axis=1)])
 
-    def _pair_gaps(self, q: jax.Array, first: Any, second: Any) -> jax.Array:
-        """Gaps of these pairs (C,)."""
-        columns = self._of_bodies(q)[:, : self.dimension].T  # one by one: five times faster
+    def contacts(self, q: jax.Array) -> ContactPoints:
+        """Those of all pairs, then those with walls."""
+        pairs = self._pairs(q, *np.triu_indices(self.count, 1))
+        gap = self._wall_gaps(q)
+        n = jnp.broadcast_to(self.planes[:, None, :-1], (*gap.shape, self.dimension))
+        point = self._placed(q)[:, None] - self.rims[:, None, None, None] * n
+        parts = zip(pairs, (gap, point, n), ((), (self.dimension,), (self.dimension,)))
+        return ContactPoints(
+            *(jnp.concatenate([x.reshape(-1, *d), y.reshape(-1, *d)]) for x, y, d in parts)
+        )
+
+    def _placed(self, q: jax.Array, which: Any = slice(None)) -> jax.Array:
+        """Corners or middles (g, K, d) of these bodies at q."""
+        at = self.of_bodies(q)[which]
+        if self._slots == 1:
+            return at[:, None, : self.dimension]
+        each = jax.vmap(lambda corners, at: placed(corners, at[None]))
+        return each(self.corners[which], at)
+
+    def _circle_gaps(self, q: jax.Array, first: Any, second: Any) -> jax.Array:
+        """Gaps (C,) of the discs or balls around these bodies."""
+        columns = self.of_bodies(q)[:, : self.dimension].T  # one by one: five times faster
         squares = sum((x[first] - x[second]) ** 2 for x in columns)
         return jnp.sqrt(squares) - self.radii[first] - self.radii[second]
 
+    def _pairs(self, q: jax.Array, i: Any, j: Any) -> ContactPoints:
+        """Contacts of each pair: gaps (g, slots), points (g, slots, d), normals from j to i."""
+        a, b = self._placed(q, i), self._placed(q, j)
+        apart = round_on_round(a[:, 0], b[:, 0], self.rims[i], self.rims[j])
+        if self._slots == 1:
+            return ContactPoints(*(x[:, None] for x in apart))
+        return mixed_pairs(a, b, self.rims[i], self.rims[j], apart)
+
     @full_precision
     def _wall_gaps(self, q: jax.Array) -> jax.Array:
-        """Gaps (k, w) of each body with every wall."""
-        d = self.dimension
-        centres = self._of_bodies(q)[:, :d]
-        return centres @ self.planes[:, :d].T - self.planes[None, :, d] - self.radii[:, None]
-
-    def _at_walls(self) -> tuple[np.ndarray, np.ndarray]:
-        """Bodies i and walls j of every contact with a wall; j counts walls after the bodies."""
-        walls = len(self.planes)
-        body, wall = np.divmod(np.arange(self.count * walls, dtype=np.int32), max(walls, 1))
-        return body, self.count + wall
+        """Gaps (k, w, K) of all corners; infinite of those that only fill a row."""
+        n, offset = self.planes[:, :-1], self.planes[:, -1]
+        height = jnp.einsum("kcx,wx->kwc", self._placed(q), n) - offset[None, :, None]
+        again = jnp.all(self.corners[:, 1:] == self.corners[:, :-1], axis=2)
+        again = jnp.pad(again, ((0, 0), (1, 0)))
+        return jnp.where(again[:, None], jnp.inf, height - self.rims[:, None, None])
 
     # ---- closed contacts only
 
@@ -167,7 +207,7 @@ class Pile(Body):
         Only normals of two bodies each are stored, and W has few entries in a row: an impact of
         `Moreau`, `Poisson`, `LZB` or `Compliant` costs what the contacts cost. (`scene` holds all
         pairs and every gap.) Which bodies touch is compiled in: every packing compiles anew.
-        `ji.pile_contacts` has friction.
+        `TimeStepping.contacts` has friction.
 
         Args:
             q: (n,), see `at`; not traced.
@@ -215,15 +255,15 @@ class Pile(Body):
 
     @property
     def pair_count(self) -> int:
-        """Every pair (i, j), in both orders, and every body with every wall."""
-        return self.count * (self.count + len(self.planes))
+        """The contacts of every pair (i, j), in both orders, and every corner with every wall."""
+        return self._slots * self.count * self._stride
 
     def _candidates(self, q: jax.Array, margin: jax.Array) -> Candidates:
         """Pairs of bodies, all those with gaps up to `margin` among them."""
         if self.crowd == 0:
             return all_pairs(self.count)
         distance = 2 * jnp.max(self.radii) + margin
-        return near_pairs(self._of_bodies(q)[:, : self.dimension], distance, self.crowd)
+        return near_pairs(self.of_bodies(q)[:, : self.dimension], distance, self.crowd)
 
     def least_gap(self, q: jax.Array) -> jax.Array:
         """The least gap () [m]; of bodies that are near each other if there are any."""
@@ -249,20 +289,55 @@ class Pile(Body):
 
     def _gaps_between(self, q: jax.Array, i: jax.Array, j: jax.Array) -> jax.Array:
         """Gaps (g,) of bodies i and j."""
-        return self._pair_gaps(q, i, j)
+        return jnp.min(self._pairs(q, i, j).gap, axis=1)
 
     def _least_of_near(self, q: jax.Array, margin: jax.Array) -> tuple[jax.Array, jax.Array]:
         """The least gap () of pairs with gaps up to `margin`; whether some are missing."""
-        near = self._candidates(q, margin)
-        gaps = jnp.where(near.used, self._pair_gaps(q, near.first, near.second), jnp.inf)
-        return jnp.min(gaps, initial=jnp.inf), near.overflows
+        if self._slots == 1:
+            near = self._candidates(q, margin)
+            gaps = jnp.where(near.used, self._circle_gaps(q, near.first, near.second), jnp.inf)
+            return jnp.min(gaps, initial=jnp.inf), near.overflows
+        i, j, count, overflows = self._near_rows(q, q, margin)
+        return jnp.min(self._gaps_of_rows([q], i, j, count)), overflows
 
     def _near(self, q: jax.Array, later: jax.Array, below: jax.Array) -> Candidates:
         """Pairs of bodies, all those with gaps up to `below` at q or `later` among them."""
-        way = jnp.abs(self._of_bodies(later - q)[:, : self.dimension])
+        way = jnp.abs(self.of_bodies(later - q)[:, : self.dimension])
         # each moves by half of its way from the middle; what moves farther is a `coarse_step`
         farther = jnp.minimum(jnp.max(jnp.sum(way, axis=1)), MARGIN * self._least)
         return self._candidates(0.5 * (q + later), below + farther)
+
+    def _near_rows(
+        self, q: jax.Array, later: jax.Array, below: jax.Array
+    ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+        """Bodies i and j (P,) whose circles are up to `below` apart, how many, and if some miss."""
+        near = self._near(q, later, below)
+        circles = [self._circle_gaps(x, near.first, near.second) for x in (q, later)]
+        so_far = jnp.cumsum(near.used & (jnp.minimum(*circles) <= below), dtype=jnp.int32)
+        rows = -(-NEAR * self.count // BLOCK) * BLOCK
+        count = jnp.minimum(so_far[-1], rows)
+
+        def one(first: jax.Array, filled: Any) -> Any:
+            """The next pairs."""
+            used, place = chosen_rows(so_far, first, count)
+            new = (jnp.where(used, x[place], 0) for x in (near.first, near.second))
+            return tuple(with_block(x, part, first) for x, part in zip(filled, new))
+
+        i, j = over_blocks(count, one, (jnp.zeros(rows, jnp.int32), jnp.zeros(rows, jnp.int32)))
+        return i, j, count, near.overflows | (so_far[-1] > rows)
+
+    def _gaps_of_rows(self, at: list[jax.Array], i: Any, j: Any, count: jax.Array) -> jax.Array:
+        """The least gaps (P, 2), at these q, of the first `count` pairs; infinite of the others."""
+        every = jnp.stack(at)
+
+        def one(first: jax.Array, gaps: jax.Array) -> jax.Array:
+            """Those of the next pairs."""
+            row = first + np.arange(BLOCK, dtype=np.int32)
+            pairs = block(i, first), block(j, first)
+            new = jnp.min(jax.vmap(lambda q: self._pairs(q, *pairs).gap)(every), axis=0)
+            return with_block(gaps, jnp.where((row < count)[:, None], new, jnp.inf), first)
+
+        return over_blocks(count, one, jnp.full((i.size, self._slots), jnp.inf, every.dtype))
 
     def _closed(
         self, q: jax.Array, later: jax.Array, below: jax.Array
@@ -271,14 +346,21 @@ class Pile(Body):
 
         A contact is closed whose gap is at most `below` at q or `later`.
         """
-        near = self._near(q, later, below)
-        gaps = [self._pair_gaps(x, near.first, near.second) for x in (q, later)]
-        closed = near.used & (jnp.minimum(*gaps) <= below)
+        if self._slots == 1:
+            i, j, used, overflows = self._near(q, later, below)
+            gaps = jnp.minimum(*(self._circle_gaps(x, i, j) for x in (q, later)))
+            gaps = jnp.where(used, gaps, jnp.inf)[:, None]
+        else:
+            i, j, count, overflows = self._near_rows(q, later, below)
+            gaps = self._gaps_of_rows([q, later], i, j, count)
         to_walls = jnp.minimum(self._wall_gaps(q), self._wall_gaps(later)).reshape(-1)
-        stride = self.count + len(self.planes)
-        body, wall = self._at_walls()
-        number = jnp.concatenate([near.first * stride + near.second, body * stride + wall])
-        return number, jnp.concatenate([closed, to_walls <= below]), near.overflows
+        slot = np.arange(self._slots, dtype=np.int32)[None]
+        number = self._slots * (i * self._stride + j)[:, None] + slot
+        partner = np.arange(self.count, self._stride, dtype=np.int32)
+        body = np.arange(self.count, dtype=np.int32)[:, None]
+        at_walls = (self._slots * (body * self._stride + partner)).reshape(-1)
+        numbers = jnp.concatenate([number.reshape(-1), at_walls])
+        return numbers, jnp.concatenate([gaps.reshape(-1), to_walls]) <= below, overflows
 
     def active_pairs(self, q: jax.Array, later: jax.Array, below: jax.Array) -> ActivePairs:
         """The contacts, at q, with gaps up to `below` at q or `later`."""
@@ -289,7 +371,7 @@ class Pile(Body):
         number = jnp.full(rows, self.pair_count, jnp.int32)
         bodies = jnp.zeros((rows, 2), jnp.int32)
         d = self.dimension
-        directions = jnp.zeros((rows, d, 2, d + _turns(d)), q.dtype)
+        directions = jnp.zeros((rows, d, 2, d + self.turns), q.dtype)
 
         def one(first: jax.Array, filled: Any) -> Any:
             """The next rows."""
@@ -317,57 +399,53 @@ class Pile(Body):
     def _of_contacts(
         self, q: jax.Array, number: jax.Array
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Bodies i and j (K,) of contacts of these numbers, j = `count` for walls; see `_along`."""
-        i, j = jnp.divmod(number, jnp.int32(self.count + len(self.planes)))
-        return i, jnp.minimum(j, self.count), self._along(q, i, j)
+        """Bodies i and j (K,) of contacts of these numbers, j = `count` for walls; directions."""
+        pair, slot = jnp.divmod(number, jnp.int32(self._slots))
+        i, partner = jnp.divmod(pair, jnp.int32(self._stride))
+        other, row = jnp.minimum(partner, self.count - 1), np.arange(len(number))
+        _, points, normals = self._pairs(q, i, other)
+        point, n = points[row, slot], normals[row, slot]
+        if len(self.planes):
+            at_wall = (partner >= self.count)[:, None]
+            wall, corner = jnp.divmod(
+                jnp.maximum(partner - self.count, 0), jnp.int32(self.corners.shape[1])
+            )
+            n = jnp.where(at_wall, self.planes[wall, :-1], n)
+            on_wall = self._placed(q, i)[row, corner] - self.rims[i][:, None] * n
+            point = jnp.where(at_wall, on_wall, point)
+        ways = jnp.concatenate([n[:, None], tangents_of(n)], axis=1)
+        directions = self.directions(q, point, ways, i, other)
+        return i, jnp.minimum(partner, self.count), directions
 
-    def _along(self, q: jax.Array, i: jax.Array, j: jax.Array) -> jax.Array:
-        """Normal and tangents (K, d, 2, d + turns) of contacts of body i with body or wall j."""
-        other, bodies = jnp.minimum(j, self.count - 1), j < self.count
-        # forces act at one point of both bodies, in the middle of a gap or an overlap: only so do
-        # they keep the angular momentum
-        half = jnp.where(bodies, 0.5 * self._pair_gaps(q, i, other), 0.0)
-        first, second = self.radii[i] + half, jnp.where(bodies, self.radii[other] + half, 0.0)
-        return self._directions(self._normals(q, i, other, j - self.count), first, second)
+    # ---- pictures
 
-    def _normals(self, q: jax.Array, i: Any, other: Any, wall: Any) -> jax.Array:
-        """Unit normals (K, d) towards body i, of a wall where its number is not negative."""
-        at, d = self._of_bodies(q)[:, : self.dimension], self.dimension
-        way = at[i] - at[other]
-        length = jnp.sqrt(jnp.sum(way**2, axis=1, keepdims=True))
-        normal = way / jnp.where(length > 0, length, 1.0)
-        if len(self.planes) == 0:
-            return normal
-        of_wall = self.planes[jnp.maximum(wall, 0), :d]
-        return jnp.where((wall >= 0)[:, None], of_wall, normal)
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Place and turns of each body."""
+        if self.dimension == 2:
+            return super().names
+        places = ("x [m]", "y [m]", "z [m]")
+        return numbered((*places, "turn x [rad]", "turn y [rad]", "turn z [rad]"), self.count)
 
-    def _directions(self, normal: jax.Array, first: jax.Array, second: jax.Array) -> jax.Array:
-        """Normal and tangents (K, d, 2, d + turns) of both bodies with these arms (K,) [m].
-
-        Equation: along a direction t the bodies slide at
-        `(v_i - v_j) . t - (R_i omega_i + R_j omega_j) . (n x t)`; of the normal that is 0.
-        """
-        ways, turns = self.tangents_of(normal)
-        along = jnp.concatenate([normal[:, None], ways], axis=1)
-        around = jnp.pad(turns, ((0, 0), (1, 0), (0, 0)))
-        both = [
-            jnp.concatenate([sign * along, -arm[:, None, None] * around], axis=2)
-            for sign, arm in ((1.0, first), (-1.0, second))
+    @property
+    def floors(self) -> list[tuple[float, float]]:
+        """The walls; in space those that are seen edge-on from the side, along y."""
+        if self.dimension == 2:
+            return super().floors
+        return [
+            (float(np.arctan2(-x, z)), float(d)) for x, y, z, d in np.asarray(self.planes) if y == 0
         ]
-        return jnp.stack(both, axis=2)
 
-    def _dense(self, directions: jax.Array, i: np.ndarray, j: np.ndarray) -> jax.Array:
-        """(n, m r): r directions (m, r, 2, ..) each of contacts of body i with body or wall j."""
-        (m, r), k, row = directions.shape[:2], self.count, np.arange(i.size)
-        still = (j >= k)[:, None, None]
-        every = jnp.zeros((m, r, k, directions.shape[3]), directions.dtype)
-        every = every.at[row, :, i].add(directions[:, :, 0])
-        other = jnp.where(still, 0.0, directions[:, :, 1])
-        return every.at[row, :, np.minimum(j, k - 1)].add(other).reshape(m * r, -1).T
-
-    @abc.abstractmethod
-    def tangents_of(self, normal: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Tangents t (K, d - 1, d) of normals n (K, d), and `n x t` (K, d - 1, turns)."""
+    def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
+        """Polygons, circles with the radius that shows how far they turned, spheres along y."""
+        bodies = np.reshape(q, (self.count, -1))
+        if self.dimension == 3:
+            return [r * CIRCLE + at[[0, 2]] for r, at in zip(self.radii, bodies)]
+        corners, rims = np.asarray(self.corners), np.asarray(self.rims)
+        return [
+            wheel(rim, at, own[0]) if rim > 0 else turned(np.concatenate([own, own[:1]]), at)
+            for own, rim, at in zip(corners, rims, bodies)
+        ]
 
 
 @precise_jit
@@ -376,136 +454,25 @@ def _active_pairs(pile: Pile, q: jax.Array, below: jax.Array) -> tuple[ActivePai
     return pile.active_pairs(q, q, below), pile.least_gap(q)
 
 
-def stacked(numbers: Sequence[jax.Array]) -> jax.Array:
+def _stacked(numbers: Sequence[jax.Array]) -> jax.Array:
     """Numbers (k,); on the host where they are known: JAX takes long to stack thousands."""
     return jnp.stack(numbers) if is_traced(numbers) else jnp.asarray(np.array(numbers))
 
 
-def _turns(d: int) -> int:
-    """Number of turns of a body in a plane (1) or in space (3)."""
-    return d * (d - 1) // 2
-
-
-def chosen_rows(
-    so_far: jax.Array, first: jax.Array, count: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Of the next block of `count` () rows: which are used, and where they are found (BLOCK,).
-
-    `so_far` (C,) is how many have been found up to each place.
-    """
-    row = first + np.arange(BLOCK, dtype=np.int32)
-    place = jnp.minimum(jnp.searchsorted(so_far, row + 1), so_far.size - 1)
-    return row < count, place
-
-
-class InPlane(Pile):
-    """A pile in a plane."""
-
-    dimension = 2
-
-    def tangents_of(self, normal: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """The normal turned by a quarter, and 1."""
-        x, y = normal.T
-        return jnp.stack([-y, x], axis=1)[:, None], jnp.ones_like(x)[:, None, None]
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """x, y, angle of each body."""
-        return numbered(PLANAR, self.count)
-
-    @property
-    def floors(self) -> list[tuple[float, float]]:
-        """The walls."""
-        return floors_of(self.planes)
-
-
-class Discs(InPlane):
-    """Discs in a plane between straight walls; q = (x, y, turn) of each in turn.
-
-    Equation: `f = |c_i - c_j| - R_i - R_j`, and `f = n_w . c_i - d_w - R_i` at wall w; sliding
-    `(v_i - v_j) . t - R_i omega_i - R_j omega_j`, t = n turned by a quarter counter-clockwise.
-    As a `Scene` it has a contact for every pair, those of disc 1 first, and
-    for each disc and wall, disc by disc. Motions of many discs are those of
-    `simulate(method="time_stepping")`, which finds closed contacts by a grid and takes no others.
-
-    >>> import jimpact as ji
-    >>> discs = ji.Bodies([ji.Disc(0.1)] * 2, room=8)
-    >>> [round(float(f), 6) for f in discs.gap_function(discs.at([[0.0, 0.1], [0.5, 0.1]]))]
-    [0.3, 0.0, 0.0]
-    """
-
-    @full_precision
-    def tangent_function(self, q: jax.Array) -> jax.Array:
-        """Ways that the discs slide on each other and along the walls."""
-        at = q.reshape(-1, 3)
-        first, second = np.triu_indices(self.count, 1)
-        way = at[first, :2] - at[second, :2]
-        rolled = self.radii * at[:, 2]
-        both = self.radii[first] + self.radii[second]
-        around = both * jnp.arctan2(way[:, 1], way[:, 0]) - rolled[first] - rolled[second]
-        slid = at[:, :2] @ jnp.stack([-self.planes[:, 1], self.planes[:, 0]]) - rolled[:, None]
-        return jnp.concatenate([around, slid.reshape(-1)])
-
-    def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
-        """Circles, each with the radius that shows how far it has turned."""
-        return [wheel(r, at) for r, at in zip(self.radii, q.reshape(-1, 3))]
-
-
-class Spheres(Pile):
-    """Spheres in space between flat walls; q = (x, y, z) and three turns of each.
-
-    Equation: `f = |c_i - c_j| - R_i - R_j`, and `f = n_w . c_i - d_w - R_i` at wall w; sliding
-    `v_i - v_j - (R_i omega_i + R_j omega_j) x n` along two tangents. A
-    sphere looks the same from all sides, so no orientation is kept: turns are the integrals of the
-    angular velocity omega (in the axes of space). As a `Scene` it has a contact for every pair,
-    those of sphere 1 first, and for each sphere and wall; `simulate(method="time_stepping")` finds
-    closed contacts by a grid and takes no others.
-
-    Source: Ericson, Real-Time Collision Detection (2005), ch. 7.1 (the grid).
-
-    >>> import jimpact as ji
-    >>> spheres = ji.Bodies([ji.Sphere(0.1)] * 2, room=8)
-    >>> q = spheres.at([[0.0, 0.0, 0.1], [0.0, 0.3, 0.5]])
-    >>> [round(float(f), 6) for f in spheres.gap_function(q)]
-    [0.3, 0.0, 0.4]
-    """
-
-    dimension = 3
-
-    def tangents(self, q: jax.Array) -> jax.Array:
-        """H_t (n, 2 m): two directions of sliding for each contact of the scene."""
-        k = self.count
-        pairs = np.triu_indices(k, 1), self._at_walls()
-        i, j = (np.concatenate(each) for each in zip(*pairs))
-        directions = self._along(q, jnp.asarray(i), jnp.asarray(j))[:, 1:]  # (m, 2, 2, 6)
-        return self._dense(directions, i, j)
-
-    def tangents_of(self, normal: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Two unit vectors at right angles to each normal, and to each other.
-
-        Source: Duff et al., Building an orthonormal basis, revisited, JCGT 6 (2017).
-        """
-        x, y, z = normal.T
-        sign = jnp.where(z >= 0, 1.0, -1.0)
-        a = -1 / (sign + z)
-        b = x * y * a
-        t1 = jnp.stack([1 + sign * x**2 * a, sign * b, -sign * x], axis=1)
-        t2 = jnp.stack([b, sign + y**2 * a, -y], axis=1)
-        return jnp.stack([t1, t2], axis=1), jnp.stack([t2, -t1], axis=1)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Place and turns of each sphere."""
-        places = ("x [m]", "y [m]", "z [m]")
-        return numbered((*places, "turn x [rad]", "turn y [rad]", "turn z [rad]"), self.count)
-
-    @property
-    def floors(self) -> list[tuple[float, float]]:
-        """The walls that are seen edge-on from the side, along y."""
-        return [
-            (float(np.arctan2(-x, z)), float(d)) for x, y, z, d in np.asarray(self.planes) if y == 0
-        ]
-
-    def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
-        """Circles, seen from the side, along y."""
-        return [r * CIRCLE + at[[0, 2]] for r, at in zip(self.radii, q.reshape(-1, 6))]
+def _polygons(bodies: Sequence[Any]) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Corners (k, K, 2) of polygons and middles of discs, radii (k,) around and within them."""
+    rings = [
+        np.asarray(x.corners)[np.array(x.ring)] if isinstance(x, Cornered) else np.asarray(x.points)
+        for x in bodies
+    ]
+    most = max(map(len, rings))
+    padded = [np.pad(ring, ((0, most - len(ring)), (0, 0)), mode="edge") for ring in rings]
+    corners = np.stack(padded)
+    far = np.linalg.norm(corners, axis=2)
+    rims = np.array([float(body.rim) for body in bodies], corners.dtype)
+    inner = [
+        float(body.inner_radius()) if isinstance(body, Cornered) else rim - r[0]
+        for body, rim, r in zip(bodies, rims, far)
+    ]
+    radii = far.max(axis=1) + rims
+    return jnp.asarray(corners), jnp.asarray(radii), jnp.asarray(np.array(inner, corners.dtype))

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
-from jimpact.bodies.base import OnGround, inertia_of, positive, turned, wheel
+from jimpact.bodies.base import inertia_of, positive, turned, wheel
+from jimpact.bodies.rigid import OnGround
 
 _CONVEX = "must be those of a convex polygon, in order around it"
 _FULL_TURN = 1e-6  # [rad] rounding of the angles of a polygon; ten times more would do as well

@@ -9,25 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values
-from jimpact.bodies.base import (
-    Body,
-    ContactPoints,
-    LinearPotential,
-    as_planes,
-    dot,
-    lengths,
-    moving,
-    numbered,
-)
-from jimpact.bodies.solids import Box, Solid, Sphere, cross, rotation
-from jimpact.compiling import full_precision
-
-# Tangents begin with the direction nearest to this one. No axis: contacts with a normal along it
-# have no first tangent, and normals along axes are frequent.
-_ASIDE = (0.7, -0.6, 0.387)
+from jimpact.bodies.base import LinearPotential, as_planes, lengths, numbered
+from jimpact.bodies.contacts import ContactPoints, joined, on_planes, round_on_round
+from jimpact.bodies.rigid import FewBodies, Solid, rotation
+from jimpact.bodies.solids import Box, Sphere
 
 
-class SpatialBodies(Body):
+class SpatialBodies(FewBodies):
     """Boxes and spheres on planes and on each other; q = 7 numbers of each, as of a `Solid`.
 
     Equation: on a plane each contact point of a body has `f = n . (x + R c_i) - r - d`. Two spheres
@@ -90,7 +78,7 @@ class SpatialBodies(Body):
         check_shape("places", self.places, (len(self.fixed), 7), "one for each of `fixed`")
         check_values("places", self.places)
         self.pairs = _pairs((*self.bodies, *self.fixed), len(self.bodies), pairs)
-        on_each_plane = [(b, -1) for b in self._owner().tolist()]
+        on_each_plane = [(b, -1) for b in self.owner.tolist()]
         self.between = (*on_each_plane * len(self.planes), *self.pairs.spheres, *self.pairs.boxes)
         if not self.between:
             raise ValueError("Arguments `bodies`, `planes` and `pairs` must give a contact.")
@@ -99,14 +87,6 @@ class SpatialBodies(Body):
     def coordinates(self) -> int:
         """Seven of each body, with six velocities."""
         return 7 * len(self.bodies)
-
-    @property
-    def mass(self) -> jax.Array:
-        """M (n,), its diagonal, or (n, n)."""
-        each = [body.mass for body in self.bodies]
-        if all(mass.ndim == 1 for mass in each):
-            return jnp.concatenate(each)
-        return jax.scipy.linalg.block_diag(*(jnp.diag(m) if m.ndim == 1 else m for m in each))
 
     def valid(self, q: jax.Array) -> jax.Array:
         """How much farther from 1 the quaternions' lengths may be ()."""
@@ -126,11 +106,6 @@ class SpatialBodies(Body):
         """Those of all bodies (n,)."""
         each = zip(self.bodies, q.reshape(-1, 7), v.reshape(-1, 6))
         return jnp.concatenate([body.inertial_force(*state) for body, *state in each])
-
-    @property
-    def base_directions(self) -> jax.Array:
-        """Planes and fixed bodies move in x, y and z (n, 3)."""
-        return jnp.tile(self.bodies[0].base_directions, (len(self.bodies), 1))
 
     def gravity(self, acceleration: Any) -> LinearPotential:
         """`V = g sum m_i z_i`."""
@@ -153,35 +128,28 @@ class SpatialBodies(Body):
         """Gaps, points and normals at q (7 b,); `between` says of which bodies."""
         places, parts = self._placed(q), []
         if len(self.planes):
-            parts.append(self._on_planes(places))
+            owner, middle = self.owner, places.centre
+            arm = jnp.concatenate([body.points for body in self.bodies])
+            points = middle[owner] + _times(places.turns[owner], arm)
+            parts.append(on_planes(self.planes, points, places.rim[owner]))
         if self.pairs.spheres:
-            parts.append(_sphere_on_sphere(places, *np.array(self.pairs.spheres).T))
+            i, j = np.array(self.pairs.spheres).T
+            middle, rim = places.middle, places.rim
+            parts.append(round_on_round(middle[i], middle[j], rim[i], rim[j]))
         if self.pairs.boxes:
             parts.append(_sphere_on_box(places, *np.array(self.pairs.boxes).T))
-        return ContactPoints(*(jnp.concatenate(rows) for rows in zip(*parts)))
+        return joined(parts)
 
-    @full_precision
-    def gap_function(self, q: jax.Array) -> jax.Array:
-        """Gaps f(q) (m,) [m]."""
-        return self.contacts(q).gap
-
-    @full_precision
-    def gaps_and_normals(self, q: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Gaps (m,) and N (n, m)."""
-        contacts = self.contacts(q)
-        return contacts.gap, self._along(q, contacts.point, contacts.normal[:, None])
-
-    def tangents(self, q: jax.Array) -> jax.Array:
-        """H_t (6 b, 2 m): how fast body 1 slides along body 2, in two directions a contact."""
-        contacts = self.contacts(q)
-        n, aside = contacts.normal, jnp.asarray(_ASIDE, q.dtype)[None]
-        _, first = lengths(aside - dot(aside, n)[:, None] * n)
-        return self._along(q, contacts.point, jnp.stack([first, cross(n, first)], axis=1))
+    def in_axes(self, q: jax.Array, body: Any, around: jax.Array) -> jax.Array:
+        """Those of the bodies."""
+        turns = jax.vmap(rotation)(self.of_bodies(q)[body])
+        return jnp.einsum("mkx,mxy->mky", around, turns)
 
     def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
         """Those of all bodies, the fixed ones last."""
-        every = zip((*self.bodies, *self.fixed), [*q.reshape(-1, 7), *np.asarray(self.places)])
-        return [curve for body, x in every for curve in body.outlines(x, point)]
+        still = zip(self.fixed, np.asarray(self.places))
+        curves = [curve for body, x in still for curve in body.outlines(x, point)]
+        return super().outlines(q, point) + curves
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -194,15 +162,9 @@ class SpatialBodies(Body):
         return numbered(self.bodies[0].velocity_names, len(self.bodies))
 
     @property
-    def floors(self) -> tuple[()]:
+    def floors(self) -> list[tuple[float, float]]:
         """None, as of a `Solid`."""
-        return ()
-
-    def _owner(self) -> np.ndarray:
-        """Bodies of all contact points with planes."""
-        return np.repeat(
-            np.arange(len(self.bodies)), [body.points.shape[0] for body in self.bodies]
-        )
+        return []
 
     def _placed(self, q: jax.Array) -> "_Placed":
         """All bodies at q, the fixed ones last."""
@@ -213,27 +175,6 @@ class SpatialBodies(Body):
         rim = jnp.stack([jnp.asarray(body.rim, q.dtype) for body in every])
         half = [0.5 * x.sizes - x.rim if isinstance(x, Box) else jnp.zeros(3) for x in every]
         return _Placed(at[:, :3], turns, middle, rim, jnp.stack(half).astype(q.dtype))
-
-    def _on_planes(self, places: "_Placed") -> ContactPoints:
-        """Contacts of all points with all planes."""
-        owner, n = self._owner(), self.planes[:, None, :3]
-        arm = jnp.concatenate([body.points for body in self.bodies])
-        points = (places.centre[owner] + _times(places.turns[owner], arm))[None]
-        height = dot(n, points) - self.planes[:, 3:]
-        point = points - height[..., None] * n
-        gap, normal = height - places.rim[owner][None], jnp.broadcast_to(n, point.shape)
-        return ContactPoints(gap.reshape(-1), point.reshape(-1, 3), normal.reshape(-1, 3))
-
-    @full_precision
-    def _along(self, q: jax.Array, point: jax.Array, ways: jax.Array) -> jax.Array:
-        """(6 b, m k): speeds along k directions (m, k, 3) of body 1 from body 2 at m points."""
-        at, moves = q.reshape(-1, 7), moving(self.between, len(self.bodies))
-        lever = (point[:, None] - at[None, :, :3])[:, None]
-        around = cross(lever, ways[:, :, None])  # (m, k, b, 3)
-        turn = jnp.einsum("mkbx,bxy->mkby", around, jax.vmap(rotation)(at))
-        rows = jnp.concatenate([jnp.broadcast_to(ways[:, :, None], turn.shape), turn], axis=3)
-        rows = jnp.asarray(moves, q.dtype)[:, None, :, None] * rows
-        return rows.reshape(-1, 6 * len(self.bodies)).T
 
 
 class _SpatialPairs(NamedTuple):
@@ -256,13 +197,6 @@ class _Placed(NamedTuple):
 def _times(matrices: jax.Array, vectors: jax.Array) -> jax.Array:
     """Matrices (.., 3, 3) times vectors (.., 3)."""
     return jnp.sum(matrices * vectors[..., None, :], axis=-1)
-
-
-def _sphere_on_sphere(places: _Placed, i: np.ndarray, j: np.ndarray) -> ContactPoints:
-    """One contact for each pair of spheres."""
-    length, n = lengths(places.middle[i] - places.middle[j])
-    gap = length - places.rim[i] - places.rim[j]
-    return ContactPoints(gap, places.middle[j] + (places.rim[j] + 0.5 * gap)[:, None] * n, n)
 
 
 def _sphere_on_box(places: _Placed, i: np.ndarray, j: np.ndarray) -> ContactPoints:

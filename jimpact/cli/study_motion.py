@@ -1,7 +1,7 @@
 """Studies of motions: system, base, law, initial state and data, of a checked TOML file."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from jimpact.files.shots_file import UNEVEN_STEPS, Positions, read_positions
 from jimpact.files.study_file import (
     BASE_KEYS,
     GRAVITY,
+    METHOD_KEYS,
     MOTION_KEYS,
     NO_DATA,
     CheckedStudy,
@@ -30,6 +31,7 @@ from jimpact.fits.parameters import default_free
 from jimpact.law import Law
 from jimpact.laws import REGISTRY
 from jimpact.motion.fitting_motion import fit_motion
+from jimpact.motion.methods import METHODS, Method, as_method
 from jimpact.motion.record import Motion
 from jimpact.motion.simulate import simulate
 from jimpact.motion.system import HarmonicBase, System, gravity
@@ -68,24 +70,29 @@ class MotionStudy:
         """`fit_motion` with the study's options, or with those that are passed and not None."""
         if self.measured is None:
             raise ValueError(NO_DATA)
-        start = float(self.arguments.get("t_start", 0.0))
+        start, _ = self.arguments["t_end"]
         times, q, sigma = self.measured
         if abs(times[0] - start) > UNEVEN_STEPS * (times[1] - times[0]):
             raise ValueError(
                 f"`t` in [data] must begin at {start:g} s, but begins at {times[0]:g} s."
             )
         arguments = {key: x for key, x in self.arguments.items() if key != "samples"}
-        arguments["t_end"] = float(times[-1])
-        # both `simulate` and the fit have an argument of this name
-        if "max_steps" in arguments:
-            raise ValueError("`max_steps` in [motion] must be left out where a motion is fitted.")
+        arguments["t_end"] = start, float(times[-1])
         arguments |= self.options | without_none(options)
         arguments |= {"free": self.free, "bounds": self.bounds, "priors": self.priors}
         return fit_motion(self.system, self.law, q, sigma=sigma, **arguments)
 
-    def run(self, **options: Any) -> Motion:
-        """`simulate` with the study's arguments, or with options that are passed and not None."""
-        return simulate(self.system, self.law, **(self.arguments | without_none(options)))
+    def run(
+        self, t_end: float | None = None, samples: int | None = None, progress: float | None = None
+    ) -> Motion:
+        """`simulate` with the study's arguments, or with those that are passed and not None."""
+        start, end = self.arguments["t_end"]
+        changes = {
+            "t_end": (start, end if t_end is None else t_end),
+            "samples": samples,
+            "method": replace(self.arguments["method"], progress=progress),
+        }
+        return simulate(self.system, self.law, **(self.arguments | without_none(changes)))
 
 
 def motion_study(path: str | Path, law: str | None = None) -> MotionStudy:
@@ -104,11 +111,15 @@ def _build(checked: CheckedStudy) -> MotionStudy:
     tables, free = checked.tables, checked.free
     values = with_exponent(checked.law.arguments, free)
     law = REGISTRY[checked.law.name].build(**values)
+    motion = tables["motion"]
+    arguments = {name: motion[key] for key, name in MOTION_KEYS.items() if key in motion}
+    arguments["t_end"] = float(motion.get("t_start_s", 0.0)), motion["t_end_s"]
+    arguments["method"] = _method(motion)
     return MotionStudy(
         checked.title,
-        _system(tables["system"], tables.get("base")),
+        _system(tables["system"], tables.get("base"), motion.get("friction")),
         law,
-        arguments={MOTION_KEYS[key]: value for key, value in tables["motion"].items()},
+        arguments=arguments,
         measured=read_positions(checked.data_file) if "data" in tables else None,
         free=free or dict.fromkeys(default_free(law)[:1], True),
         bounds=checked.law.bounds,
@@ -117,13 +128,26 @@ def _build(checked: CheckedStudy) -> MotionStudy:
     )
 
 
-def _system(table: Mapping[str, Any], base: Mapping[str, Any] | None) -> System:
+def _method(motion: Mapping[str, Any]) -> Method:
+    """The method of [motion] with its options."""
+    word = motion.get("method", "events")
+    known = {field.name for field in fields(METHODS[word])}
+    for key, name in METHOD_KEYS.items():
+        if key in motion and name not in known:
+            raise ValueError(f"`{key}` in [motion] must be left out for method {word!r}.")
+    options = {name: motion[key] for key, name in METHOD_KEYS.items() if key in motion}
+    return as_method(word, **options)
+
+
+def _system(
+    table: Mapping[str, Any], base: Mapping[str, Any] | None, friction: float | None
+) -> System:
     """The body under its weight, on a base that shakes if there is one."""
     body = body_of("[system]", table, (GRAVITY,))
     acceleration = table.get(GRAVITY, STANDARD_GRAVITY)
     weight = gravity(body, acceleration) if acceleration else None
     if base is None:
-        return System(body, potential=weight)
+        return System(body, potential=weight, friction=friction)
     directions = body.base_directions
     if directions is None:
         raise ValueError(f"[base] must be left out: a {type(body).__name__} has no base.")
@@ -136,7 +160,7 @@ def _system(table: Mapping[str, Any], base: Mapping[str, Any] | None) -> System:
         )
     motion = HarmonicBase(**{BASE_KEYS[key]: x for key, x in base.items() if key != "direction"})
     moved = directions[:, names.index(direction), None]
-    return System(body, potential=weight, base=motion, base_directions=moved)
+    return System(body, potential=weight, base=motion, base_directions=moved, friction=friction)
 
 
 def read_study(path: str | Path, law: str | None = None) -> Study | MotionStudy:
@@ -170,7 +194,8 @@ def read_study(path: str | Path, law: str | None = None) -> Study | MotionStudy:
       gravity_m_per_s2, 0 for none.
     - `[base]`: amplitude_m, frequency_hz, phase_rad, direction (vertical; in the plane also
       horizontal, in space x or y).
-    - `[motion]`: q0, v0, t_end_s and the options of `simulate`.
+    - `[motion]`: q0, v0, t_start_s, t_end_s, samples, method, max_events, options of the method
+      (step_s, closed_below_m, max_steps, rtol, slow), and friction of the system.
     - `[data]`: file, a CSV file with columns t[s] in equal steps, q_1[m], q_2[rad], ... and perhaps
       sigma_q_1[m], ...
 

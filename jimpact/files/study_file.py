@@ -52,18 +52,22 @@ MOTION_KEYS = {  # and the arguments of `simulate` that they give
     "q0": "q0",
     "v0": "v0",
     "t_end_s": "t_end",
-    "t_start_s": "t_start",
     "samples": "samples",
     "method": "method",
-    "step_s": "step",
-    "friction": "friction",
     "max_events": "max_events",
+}
+METHOD_KEYS = {  # and the options of a method that they give
+    "step_s": "step",
     "closed_below_m": "closed_below",
     "max_steps": "max_steps",
     "rtol": "rtol",
     "slow": "slow",
 }
-MOTION = TableKeys(tuple(MOTION_KEYS), ("q0", "v0", "t_end_s"), words={"method": "motion_methods"})
+MOTION = TableKeys(
+    (*MOTION_KEYS, *METHOD_KEYS, "t_start_s", "friction"),
+    ("q0", "v0", "t_end_s"),
+    words={"method": "motion_methods"},
+)
 BASE_KEYS = {"amplitude_m": "amplitude", "frequency_hz": "frequency", "phase_rad": "phase"}
 BASE = TableKeys((*BASE_KEYS, "direction"), ("amplitude_m", "frequency_hz"))
 # Tables of a study besides title, [law] and [scene] or [system], whose keys depend on their kind.

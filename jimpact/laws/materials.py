@@ -61,26 +61,3 @@ def hertz_stiffness(
     compliance = (1 - nu1**2) / e1 + (1 - nu2**2) / e2
     curvature = 1 / r1 + 1 / r2
     return 4 / 3 / (compliance * jnp.sqrt(curvature))
-
-
-def sphere_mass(density: Any, radius: Any) -> jax.Array:
-    """Mass of a sphere [kg] from its density [kg/m^3] and radius [m].
-
-    Args:
-        density: rho > 0 [kg/m^3].
-        radius: R > 0 [m].
-
-    Returns:
-        `4/3 pi rho R^3` [kg], of the common shape.
-
-    Raises:
-        ValueError: density or radius not positive.
-
-    >>> import jimpact as ji
-    >>> round(float(ji.sphere_mass(7650.0, 4e-3)), 7)
-    0.0020508
-    """
-    rho, r = as_float_array("density", density), as_float_array("radius", radius)
-    check_values("density", rho, low=0.0, open_low=True)
-    check_values("radius", r, low=0.0, open_low=True)
-    return 4 / 3 * jnp.pi * rho * r**3

@@ -106,7 +106,7 @@ class Advice(Tabular):
         unknown: the stiffnesses that are not known and what they do.
         rows: how many stiffnesses were tried.
         gap_ratio: gaps that can close while other contacts are loaded, in units of delta_c
-            (`ji.gap_scale`), or None.
+            (`ji.theory.gap_scale`), or None.
         far: open contacts (from 0) that cannot close during the impact and take no part.
         reclosing: largest difference between LZB and Compliant on contacts without gaps: LZB lets
             opened contacts close again at once.
@@ -202,7 +202,7 @@ class Advice(Tabular):
         if all(c.cost is not None for c in self.candidates.values()):
             words += "; cost of an impact in a batch, cheapest = 1"
         if self.gap_ratio is not None:
-            words += "; delta_c: the indentation scale of a contact, see ji.gap_scale"
+            words += "; delta_c: the indentation scale of a contact, see ji.theory.gap_scale"
         return f"{words}."
 
 

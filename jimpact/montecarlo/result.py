@@ -58,7 +58,7 @@ class MonteCarlo(Tabular):
         statuses: number of samples by status.
         bad: the first failed samples; `replay(sample.index)` gives one to run again.
         first: the first samples, for pictures: gaps, velocity_before, velocity, status.
-        gap_scale: delta_c (m,) [m], the indentation of a contact (`ji.gap_scale`), or None.
+        gap_scale: delta_c (m,) [m], the indentation of a contact (`ji.theory.gap_scale`), or None.
         rate: samples computed a second [1/s], without compiling.
         resumed: samples that were read from the folder.
         description: law, scene and distributions, in words.

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import (
-    as_float_array,
     check_per_contact,
     check_shape,
     check_values,
@@ -29,7 +28,26 @@ BASE_INSTANTS = 64
 # Contacts of a pile above which motions by events warn: 1 100 compile for more than two minutes.
 # Ten times more, and nobody is warned of that.
 MANY = 200
+# [m] Contacts with smaller gaps take part in an impact. Ten times more, and balls a few nanometres
+# apart are struck together.
+CLOSED_BELOW = 1e-9
+ROUNDING_GAP = 1e-5  # of the gap that counts as closed: smaller gaps are rounding, hops as well
+# Roundings that a gap may be off by, of the largest coordinate or gap at the start; what counts as
+# closed is MORE_CLOSED times more. In metres and double precision neither of them matters.
+GAP_ROUNDINGS, MORE_CLOSED = 8, 10
 DIFFERENTIATED = ("gap_function", "tangent_function", "potential", "base")
+
+
+def as_times(t_end: Any) -> tuple[Any, Any]:
+    """Start and end of a motion, which begins at 0 where only its end is said."""
+    if not isinstance(t_end, tuple | list) and np.ndim(t_end) == 0:
+        return 0.0, t_end
+    if len(t_end) != 2:
+        raise ValueError(
+            f"Argument `t_end` must be a time or a pair (t_start, t_end), but has value {t_end!r}."
+        )
+    start, end = t_end
+    return start, end
 
 
 def check_motion(
@@ -51,17 +69,28 @@ def check_motion(
         check_shape("v0", v, q.shape, "one velocity per coordinate of `q0`")
     elif not callable(mass):
         check_shape("v0", v, mass.shape[:1], "the velocities of the body, as many as its mass has")
-    for name, value in (("q0", q), ("v0", v), ("t_start", start), ("t_end", end)):
+    for time in (start, end):
+        check_shape("t_end", time, (), "a time, or a pair (t_start, t_end)")
+    for name, value in (("q0", q), ("v0", v), ("t_end", start), ("t_end", end)):
         check_values(name, value)
-    check_shape("t_start", start, (), "a time")
-    check_shape("t_end", end, (), "a time")
     if not is_traced((start, end)) and not float(end) > float(start):
         raise ValueError(
-            f"Argument `t_end` must be larger than `t_start` = {float(start):g}, "
+            f"Argument `t_end` must be after the start at {float(start):g} s, "
             f"but has value {float(end):g}."
         )
     _check_functions(system, q, v, start)
     return _check_system(system, q, v, start, end)
+
+
+def closed_gaps(
+    q: jax.Array, f: jax.Array, closed_below: float | None
+) -> tuple[jax.Array, jax.Array]:
+    """Gaps () [m] below which a contact is closed, and below which a gap is rounding."""
+    size = jax.lax.stop_gradient(jnp.maximum(jnp.abs(q).max(), jnp.abs(f).max()))
+    off = GAP_ROUNDINGS * float(jnp.finfo(q.dtype).eps) * size
+    default = jnp.maximum(CLOSED_BELOW, MORE_CLOSED * off)
+    below = default if closed_below is None else jnp.asarray(closed_below, q.dtype)
+    return below.astype(q.dtype), jnp.maximum(ROUNDING_GAP * below, off).astype(q.dtype)
 
 
 def _check_functions(system: System, q: jax.Array, v: jax.Array, t: jax.Array) -> None:
@@ -195,16 +224,16 @@ def friction_in_space(system: System, mu: jax.Array | None, q: jax.Array) -> boo
     return tangents is not None and tangents.shape[1] == 2 * contacts_of(system, q)
 
 
-def friction_of(system: System, law: Law, friction: Any, q: jax.Array) -> jax.Array | None:
-    """mu (m,), () of a pile: the argument, or that of the law; None without friction."""
-    mu = getattr(law, "friction", None) if friction is None else friction
+def friction_of(system: System, law: Law, q: jax.Array) -> jax.Array | None:
+    """mu (m,), () of a pile: that of the system, or of the law; None without friction."""
+    own = system.friction is not None
+    mu = system.friction if own else getattr(law, "friction", None)
     tangents = jax.eval_shape(system.body.tangents, q)
-    if mu is None or (tangents is None and friction is None):
+    if mu is None or (tangents is None and not own):
         return None
     if tangents is None:
-        raise ValueError("Argument `friction` needs a system with a `tangent_function`.")
-    mu = as_float_array("friction", mu)
-    check_values("friction", mu, low=0.0)
+        raise ValueError("Argument `system` must have a `tangent_function` for its `friction`.")
+    mu = jnp.asarray(mu)
     if is_traced(mu):
         mu = jnp.where(mu >= 0, mu, jnp.nan)  # the motion is `not_finite` then
     elif not np.asarray(mu).any():
@@ -289,11 +318,8 @@ def check_unbounded(name: str, force: Force) -> None:
 
 def substeps_of(step: Any, start: Any, end: Any, samples: int) -> jax.Array:
     """Steps () between two samples, none longer than `step`."""
-    if step is None or is_traced(step):
-        raise ValueError("Argument `step` must be given, a number, for method='time_stepping'.")
-    check_values("step", step, low=0.0, open_low=True)
     if is_traced((start, end)):
-        raise ValueError("Arguments `t_start`, `t_end` must not be traced in time stepping.")
+        raise ValueError("Argument `t_end` must not be traced in time stepping.")
     between = (float(end) - float(start)) / (samples - 1)
     count = max(1.0, np.ceil(between / float(step) * (1 - 1e-9)))
     if count * (samples - 1) > MOST_STEPS:

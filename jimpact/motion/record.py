@@ -153,14 +153,14 @@ class Motion(eqx.Module):
             raise ValueError(f"Argument `kind` must be one of {EVENT_KINDS}, but is {kind!r}.")
         return np.asarray(self.events.time)[np.asarray(self.events.kind) == KIND_CODE[kind]]
 
-    @property
-    def end(self) -> dict[str, Any]:
-        """`q0`, `v0`, `t_start` at the last sample that was reached, on the host, of one motion.
+    def restart(self, t_end: float) -> dict[str, Any]:
+        """Arguments `q0`, `v0`, `t_end` of `simulate` with which one motion goes on, on the host.
 
-        `simulate(system, law, **motion.end, t_end=...)` goes on from there.
+        `simulate(system, law, **motion.restart(2.0))` begins at the last sample that was reached.
         """
         last = self._reached() - 1
-        return {"q0": self.q[last], "v0": self.velocity[last], "t_start": float(self.time[last])}
+        times = (float(self.time[last]), t_end)
+        return {"q0": self.q[last], "v0": self.velocity[last], "t_end": times}
 
     def _reached(self) -> int:
         """How many samples were reached."""
@@ -169,17 +169,17 @@ class Motion(eqx.Module):
         return int(np.isfinite(np.asarray(self.q)).all(axis=-1).sum())
 
     def then(self, later: "Motion") -> "Motion":
-        """This motion and a `later` one, which goes on from its `end`, as one record.
+        """This motion and a `later` one, which goes on from its end (`restart`), as one record.
 
         Works add up, so that the ledger holds from the start of this motion on.
         """
-        last, begin = self.end["t_start"], float(later.time[0])
+        count = self._reached()
+        last, begin = float(self.time[count - 1]), float(later.time[0])
         if begin != last:
             raise ValueError(
                 f"Argument `later` must begin at {last:g} s, where this motion ends, but begins at "
                 f"{begin:g} s."
             )
-        count = self._reached()
         samples = {}
         for name in _SAMPLED:
             first, second = getattr(self, name)[:count], getattr(later, name)[1:]

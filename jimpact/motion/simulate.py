@@ -11,9 +11,7 @@ import numpy as np
 from jimpact._checks import (
     as_float_array,
     as_whole,
-    check_choice,
     check_kind,
-    check_values,
     in_common_dtype,
     is_traced,
 )
@@ -22,9 +20,11 @@ from jimpact.compiling import full_precision, is_top_level_call, quick_jit
 from jimpact.law import Law
 from jimpact.laws.forces import Force
 from jimpact.motion.arguments import (
+    as_times,
     check_motion,
     check_pile,
     check_stepped_law,
+    closed_gaps,
     contacts_of,
     force_of,
     friction_in_space,
@@ -35,7 +35,16 @@ from jimpact.motion.arguments import (
 from jimpact.motion.compliant_contact import compliant_motion
 from jimpact.motion.dynamics import is_pile, kinetic, potential, recorded_gaps
 from jimpact.motion.event_driven import empty_checkpoint, event_driven
-from jimpact.motion.flow import Settings, check_rtol
+from jimpact.motion.flow import Settings
+from jimpact.motion.methods import (
+    SLOW,
+    ContactForces,
+    Method,
+    TimeStepping,
+    as_method,
+    name_of,
+    tolerances,
+)
 from jimpact.motion.record import Events, Motion, joined
 from jimpact.motion.stepping import time_stepping
 from jimpact.motion.system import System
@@ -43,21 +52,8 @@ from jimpact.motion.tables import Course, MotionProblem, Past
 from jimpact.progress import progress_bar, waiting
 from jimpact.status import CODE
 
-# [m] Contacts with smaller gaps take part in an impact. Ten times more, and balls a few nanometres
-# apart are struck together.
-CLOSED_BELOW = 1e-9
-ROUNDING_GAP = 1e-5  # of the gap that counts as closed: smaller gaps are rounding, hops as well
-# Roundings that a gap may be off by, of the largest coordinate or gap at the start; what counts as
-# closed is MORE_CLOSED times more. In metres and double precision neither of them matters.
-GAP_ROUNDINGS, MORE_CLOSED = 8, 10
-TOLERANCES = {"float64": (1e-10, 1e-12), "float32": (1e-5, 1e-7)}  # rtol, atol of the flights
-# Share of the largest gap velocity: a slower contact that is pressed back remains closed. Ten times
-# more passes an accumulation a few impacts earlier, and loses a hundred times the energy there.
-SLOW = 1e-6
-MAX_STEPS = 100_000  # of the flights by default; ten times more only delays the status `max_steps`
 CHUNK = 500  # events of one run of the program; more take memory in short motions
 MOST_EVENTS = 100_000  # default `max_events` on the host; more only delays the status `max_events`
-METHODS = ("events", "time_stepping", "contact_forces")
 
 
 @full_precision
@@ -68,19 +64,10 @@ def simulate(
     v0: Any,
     t_end: Any,
     *,
-    t_start: Any = 0.0,
     samples: int = 201,
-    method: str = "events",
+    method: str | Method = "events",
     step: float | None = None,
-    friction: Any = None,
     max_events: int | None = None,
-    rtol: float | None = None,
-    atol: float | None = None,
-    closed_below: float | None = None,
-    slow: float = SLOW,
-    max_steps: int = MAX_STEPS,
-    until_apart: bool = False,
-    progress: float | None = None,
 ) -> Motion:
     """The whole motion of a system: flights, impacts by `law`, persistent contact.
 
@@ -90,36 +77,21 @@ def simulate(
     tangential impact stops the slip, provided that the law supports it.
 
     Args:
-        system: gaps, mass, forces, base.
+        system: gaps, mass, forces, base; its `friction` is that of persistent contacts, or else
+            the law's.
         law: any impact law.
         q0: (n,) [m, rad] at the start, without penetration.
         v0: (n,) [m/s, rad/s] at the start; of bodies in space `(x', omega)`.
-        t_end: [s] > t_start.
-        t_start: [s].
+        t_end: [s] > 0; or the pair of times (t_start, t_end) of a motion that does not begin at 0.
         samples: number of equally spaced instants in the record, both ends included.
-        method: 'events' (flights that land on each event), or 'time_stepping'
-            (Moreau-Jean, for many contacts; needs `step` [s]), or 'contact_forces' (the forces of
-            a `Compliant` law act throughout: contacts take time, and may start in penetration).
-        step: of the time stepping [s].
-        friction: coefficient mu of persistent contacts, scalar or (m,), for systems with a
-            `tangent_function` and for bodies with tangents, in the plane or in space; None: that
-            of the law, if it has a field `friction`.
+        method: 'events' (flights that land on each event), 'contact_forces' (the forces of a
+            `Compliant` law act throughout: contacts take time, and may start in penetration), or
+            'time_stepping' (Moreau-Jean, for many contacts; needs `step`). With tolerances and
+            other options of its own: `EventDriven`, `ContactForces`, `TimeStepping`.
+        step: of method 'time_stepping' [s].
         max_events: largest number of recorded events; the next one ends the motion with status
             `max_events` (time stepping goes on without recording). None: 500; for a direct call
             with method 'events' (outside jit, vmap, derivatives) 100 000, computed in runs of 500.
-        rtol: relative tolerance of the flights; None: 1e-10, in single precision 1e-5.
-        atol: absolute one [m, m/s, rad, ..]; None: 1e-12, in single precision 1e-7.
-        closed_below: contacts with smaller gaps [m] take part in an impact; None: 1e-9, or 80
-            roundings of the largest coordinate or gap at the start, if that is more.
-        slow: repeated impacts with decreasing speed (accumulations) are cut short: a contact that
-            leaves slower than this share of the largest gap velocity so far, and would be pressed
-            back, remains closed. For contacts that share a body the limit is `sqrt(slow)`
-            (docs/motions_reference.md). `events` estimates the skipped time.
-        max_steps: total integrator steps.
-        until_apart: by contact forces, end where all contacts are open and none closes, with status
-            `ok`: an impact whose geometry turns. Its outcome is that of the last event.
-        progress: bar on stderr with the share of the duration that is done, after each run; None:
-            on a terminal, for long motions.
 
     Returns:
         `Motion`. Pure: jit and vmap; a bad motion of a batch ends alone, with its status.
@@ -134,8 +106,6 @@ def simulate(
         ValueError: shapes, t_end <= t_start, penetration, NaN in base motion or mass, on the
             host; inside jit the status reports them (`raise_on_failure`).
 
-    Source: Brogliato, Nonsmooth Mechanics (2016), Remark 6.9 for the time stepping.
-
     >>> import jimpact as ji
     >>> ball = ji.System(ji.Column([1.0]), gravity=True)
     >>> motion = ji.simulate(ball, ji.Newton(0.8), [1.0], [0.0], 5.0, samples=21)
@@ -149,77 +119,41 @@ def simulate(
     q, v = as_float_array("q0", q0), as_float_array("v0", v0)
     system, law, q, v = in_common_dtype(system, law, q, v)
     dtype = q.dtype
-    start = as_float_array("t_start", t_start).astype(dtype)
-    end = as_float_array("t_end", t_end).astype(dtype)
+    times = as_times(t_end)
+    start, end = (as_float_array("t_end", t).astype(dtype) for t in times)
     f = check_motion(system, q, v, start, end)
     count = as_whole("samples", samples, 2)
     rows = CHUNK if max_events is None else as_whole("max_events", max_events, 1)
-    _check_options(method, until_apart, slow, max_steps)
-    rtol, atol = _tolerances(method, dtype, rtol, atol)
-    mu = friction_of(system, law, friction, q)
-    check_pile(system, q, mu, method)
+    method = as_method(method, step)
+    mu = friction_of(system, law, q)
+    check_pile(system, q, mu, name_of(method))
     system = without_closures(system, q, v, start)
+    closed_below = None if isinstance(method, ContactForces) else method.closed_below
     below, rounding = closed_gaps(q, f, closed_below)
-    if method != "contact_forces":
+    if not isinstance(method, ContactForces):
         check_penetration("q0", f, jnp.maximum(below, system.body.overlap))
-    share = jnp.asarray(slow, dtype)
-    settings = Settings(
-        rtol, atol, below, rounding, max_steps, mu is not None, friction_in_space(system, mu, q),
-        end - start, share,
-    )  # fmt: skip
     arguments: Any
-    if method == "time_stepping":
-        substeps = substeps_of(step, t_start, t_end, count)
-        joint = law.joins_step and friction is None
+    if isinstance(method, TimeStepping):
+        substeps = substeps_of(method.step, *times, count)
+        joint = law.joins_step and system.friction is None
         check_stepped_law(system, law, q, joint)
         arguments = system, law, mu, q, v, start, end, below, substeps, count, joint, rows
-        return _waited(_stepped, arguments, progress)
-    if method == "contact_forces":
+        return _waited(_stepped, arguments, method.progress)
+    slow = SLOW if isinstance(method, ContactForces) else method.slow
+    settings = Settings(
+        *tolerances(method, dtype), below, rounding, method.max_steps, mu is not None,
+        friction_in_space(system, mu, q), end - start,
+        jnp.asarray(slow, dtype),
+    )  # fmt: skip
+    if isinstance(method, ContactForces):
         force = force_of(law)
-        arguments = system, force, mu, settings, q, v, start, end, count, rows, until_apart
-        return _waited(_forced, arguments, progress)
+        arguments = system, force, mu, settings, q, v, start, end, count, rows, method.until_apart
+        return _waited(_forced, arguments, method.progress)
     arguments = system, law, mu, settings, q, v, start, end
     if _on_host(arguments):
         most = MOST_EVENTS if max_events is None else max_events
-        return _in_runs(arguments, count, most, progress)
+        return _in_runs(arguments, count, most, method.progress)
     return _events(*(*arguments, None, count, rows))[0]
-
-
-def _check_options(method: str, until_apart: bool, slow: float, max_steps: int) -> None:
-    """Raise a ValueError for options that a motion does not have."""
-    as_whole("max_steps", max_steps, 1)
-    check_values("slow", slow, low=0.0, high=1.0)
-    check_choice("method", method, METHODS)
-    if until_apart and method != "contact_forces":
-        raise ValueError(
-            "Argument `until_apart` must be False for motions by other methods than "
-            f"'contact_forces', but `method` has value {method!r}."
-        )
-
-
-def _tolerances(
-    method: str, dtype: jnp.dtype, rtol: float | None, atol: float | None
-) -> tuple[float, float]:
-    """Relative and absolute tolerance of the flights, those of the precision by default."""
-    check_values("rtol", rtol, low=0.0, open_low=True)
-    check_values("atol", atol, low=0.0, open_low=True)
-    default = TOLERANCES.get(str(dtype), TOLERANCES["float32"])
-    rtol, atol = default[0] if rtol is None else rtol, default[1] if atol is None else atol
-    if method == "events":
-        check_rtol(rtol, dtype)
-    return rtol, atol
-
-
-def closed_gaps(
-    q: jax.Array, f: jax.Array, closed_below: float | None
-) -> tuple[jax.Array, jax.Array]:
-    """Gaps () [m] below which a contact is closed, and below which a gap is rounding."""
-    check_values("closed_below", closed_below, low=0.0, open_low=True)
-    size = jax.lax.stop_gradient(jnp.maximum(jnp.abs(q).max(), jnp.abs(f).max()))
-    off = GAP_ROUNDINGS * float(jnp.finfo(q.dtype).eps) * size
-    default = jnp.maximum(CLOSED_BELOW, MORE_CLOSED * off)
-    below = default if closed_below is None else jnp.asarray(closed_below, q.dtype)
-    return below.astype(q.dtype), jnp.maximum(ROUNDING_GAP * below, off).astype(q.dtype)
 
 
 def _on_host(arguments: Any) -> bool:

@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jimpact.bodies.base import ActivePairs, block, over_blocks, with_block
+from jimpact.bodies.closed_pairs import ActivePairs, block, over_blocks, with_block
 from jimpact.derive import without_derivatives
 from jimpact.impacts import impact
 from jimpact.law import Law, within_domains

@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 
 from jimpact._checks import as_float_array, check_values, in_numbers
-from jimpact.bodies.base import STANDARD_GRAVITY, Body, GivenBody, LinearPotential, Potential
+from jimpact.bodies.base import STANDARD_GRAVITY, Body, LinearPotential, Potential
+from jimpact.bodies.given import GivenBody
 
 Base = Callable[[jax.Array], jax.Array]  # t () -> displacement y_b (d,) [m]
 
@@ -33,6 +34,8 @@ class System(eqx.Module):
         base: t -> displacement y_b (d,) [m] of a moving base, written with jax.numpy.
         base_directions: B (n, d): how q changes when everything moves with the base; None: those
             of the body.
+        friction: coefficient mu >= 0 of persistent contacts, scalar or (m,), where there are
+            tangents, in the plane or in space; None: that of the law, if it has a field `friction`.
 
     Functions that are `equinox.Module`s may hold arrays, and `simulate` is differentiable in these.
     JAX compiles again for each new lambda.
@@ -59,12 +62,15 @@ class System(eqx.Module):
     potential: Potential | None
     base: Base | None
     base_directions: jax.Array | None
+    friction: jax.Array | None
 
     def __str__(self) -> str:
         """The body, its mass, and the loads."""
         names = ("force", "potential", "base")
         loads = [name for name in names if getattr(self, name) is not None]
         lines = [f"system of a {type(self.body).__name__}"]
+        if self.friction is not None:
+            lines.append(f"friction {in_numbers(self.friction)}")
         if not callable(self.mass):
             lines.append(f"mass     {in_numbers(self.mass)}")
         return "\n".join([*lines, f"loads    {', '.join(loads) or 'none'}"])
@@ -79,6 +85,7 @@ class System(eqx.Module):
         base: Base | None = None,
         base_directions: Any = None,
         gravity: Any = False,
+        friction: Any = None,
     ):
         for name, function in {"force": force, "potential": potential, "base": base}.items():
             if not (callable(function) or function is None):
@@ -101,6 +108,8 @@ class System(eqx.Module):
             check_values("gravity", acceleration)
             potential = self.body.gravity(acceleration)
         self.force, self.potential, self.base = force, potential, base
+        self.friction = None if friction is None else as_float_array("friction", friction)
+        check_values("friction", self.friction, low=0.0)
         if base is not None and base_directions is None:
             base_directions = self.body.base_directions
         if (base is None) != (base_directions is None):

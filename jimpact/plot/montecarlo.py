@@ -23,9 +23,9 @@ _TITLE = 80  # letters of a line of the title
 def monte_carlo(result: MonteCarlo, title: str = "") -> Figure:
     """Histograms of every body, and the first samples over two gaps, coloured by the outcome.
 
-    Gaps are over the indentation of the contact (delta_c of `ji.gap_scale`), where it is known.
-    The map shows the two gaps that vary most and the most scattered velocity; with one random
-    gap, that velocity against it; without, no map.
+    Gaps are over the indentation of the contact (delta_c of `ji.theory.gap_scale`), where it is
+    known. The map shows the two gaps that vary most and the most scattered velocity; with one
+    random gap, that velocity against it; without, no map.
 
     Args:
         result: what `ji.monte_carlo` returned.

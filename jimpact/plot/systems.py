@@ -70,7 +70,7 @@ def force_chains(pile: Pile, q: Any, scene: Scene, impulse: Any, title: str = ""
     Args:
         pile: its bodies.
         q: where they are (n,), as for `pile.touching(q)`.
-        scene: `pile.touching(q)`, or the scene of `pile_contacts`.
+        scene: `pile.touching(q)`, or the scene of `TimeStepping.contacts`.
         impulse: p (m,) [N s] of an impact on this scene, or of a step.
         title: above the picture.
 

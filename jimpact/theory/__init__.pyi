@@ -21,7 +21,11 @@ from .friction import (
     friction_impulses as friction_impulses,
     restitution_inclusion as restitution_inclusion,
 )
-from .gaps import crossover as crossover, gap_sensitivity as gap_sensitivity
+from .gaps import (
+    crossover as crossover,
+    gap_scale as gap_scale,
+    gap_sensitivity as gap_sensitivity,
+)
 from .impulse_ratios import (
     correlation_interval as correlation_interval,
     distributing_rule as distributing_rule,

@@ -11,7 +11,7 @@ import numpy as np
 from jimpact._checks import as_float_array, check_shape, check_values
 from jimpact.impacts import impact
 from jimpact.law import Law
-from jimpact.montecarlo.gaps import gap_scale
+from jimpact.montecarlo.gaps import gap_scale as gap_scale
 from jimpact.montecarlo.result import MonteCarlo
 from jimpact.scene import Scene, with_gaps
 from jimpact.status import STATUS

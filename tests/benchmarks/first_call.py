@@ -49,7 +49,7 @@ def measure(row):
         ji.impact(ji.LZB(0.9), balls, v)
     ball, rocks = (
         ji.System(ji.Column([1.0]), gravity=True),
-        ji.System(ji.Block(0.2, 0.6, corners="base"), gravity=True),
+        ji.System(ji.Block(0.2, 0.6, corners="base"), gravity=True, friction=5.0),
     )
     matrix = ji.RestitutionMatrix(ji.theory.rocking_matrix(0.85))
     tilted = [0.0, 0.1 * math.sin(0.15) + 0.3 * math.cos(0.15), 0.15]
@@ -62,9 +62,7 @@ def measure(row):
         "friction": lambda: ji.impact(ji.LZB(0.9, friction=0.3), block, v).velocity,
         "fit": lambda: ji.fit(ji.LZB(0.9), balls, shots, free=("restitution",)).law.restitution,
         "motion": lambda: ji.simulate(ball, ji.Newton(0.8), [1.0], [0.0], 5.0).q,
-        "motion with friction": lambda: (
-            ji.simulate(rocks, matrix, tilted, [0.0] * 3, 4.0, friction=5.0).q
-        ),
+        "motion with friction": lambda: ji.simulate(rocks, matrix, tilted, [0.0] * 3, 4.0).q,
     }[row]
     begun = cpu()
     jax.block_until_ready(first())

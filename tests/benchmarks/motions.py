@@ -29,8 +29,8 @@ def block(e):
     """Released tilted, rocks to rest."""
     law = ji.RestitutionMatrix(ji.theory.rocking_matrix(e))
     q0 = [0.0, 0.1 * np.sin(0.15) + 0.3 * np.cos(0.15), 0.15]
-    start = (ji.System(ji.Block(0.2, 0.6, corners="base"), gravity=True), law, q0, [0.0] * 3, 4.0)
-    return ji.simulate(*start, friction=5.0, samples=11, max_events=200)
+    rocks = ji.System(ji.Block(0.2, 0.6, corners="base"), gravity=True, friction=5.0)
+    return ji.simulate(rocks, law, q0, [0.0] * 3, 4.0, samples=11, max_events=200)
 
 
 def main():

@@ -196,7 +196,12 @@ def test_a_body_under_loads_is_a_system():
     """The ready systems are bodies under gravity; functions make a body, too."""
     block = ji.Block(width=0.2, height=0.6, mass=2.0)
     system, q = ji.System(ji.Block(0.2, 0.6, 2.0), gravity=True), jnp.array([0.1, 0.7, 0.3])
-    given = ji.System(block.gap_function, block.mass, tangent_function=block.tangent_function)
+
+    def slid(q):
+        c = block.corners
+        return q[0] + jnp.cos(q[2]) * c[:, 0] - jnp.sin(q[2]) * c[:, 1]
+
+    given = ji.System(block.gap_function, block.mass, tangent_function=slid)
     for body in (system.body, given.body):
         scene = body.scene(q)
         for found, own in zip(jax.tree.leaves(scene), jax.tree.leaves(block.scene(q)), strict=True):

@@ -111,11 +111,7 @@ SCENES = [
         lambda: ji.Bodies([ji.Disc(1.0), ji.Dimer(0.1, 1.0)], pairs=[(0, 1)]),
         r"body 1 is a Dimer",
     ),
-    (lambda: ji.Bodies([ji.Block(1, 1)] * 2, at=[0.0] * 3), r"`at` must have shape \(6,\)"),
-    (
-        lambda: ji.Bodies([ji.Block(1, 1)] * 2, pairs=[((0, 4), (1, 0))]),
-        r"sides 0 to 3 of body 0",
-    ),
+    (lambda: ji.Bodies([ji.Block(1, 1)] * 2, pairs=[((0, 2), (1, 0))]), r"bodies 0 to 1"),
     (lambda: ji.Box([1.0, 1.0, 0.0]), r"`sizes`"),
     (lambda: ji.Box([1.0, 1.0]), r"`sizes` must have shape \(3,\)"),
     (lambda: ji.Box([1.0, 1.0, 1.0], mass=0.0), r"`mass`"),
@@ -215,8 +211,8 @@ CALLS = [
     (lambda: ji.hertz_stiffness(-1.0, 0.3, 1.0), r"`modulus"),
     (lambda: ji.hertz_stiffness(1.0, 0.6, 1.0), r"`poisson"),
     (lambda: ji.hertz_stiffness(1.0, 0.3, 1.0, radius2=0.0), r"`radius2"),
-    (lambda: ji.gap_scale(PAIR, ji.Newton(1.0), [1.0, 0.0]), r"`law`"),
-    (lambda: ji.gap_scale(PAIR, ji.LZB(1.0), [1.0]), r"`velocity`"),
+    (lambda: ji.theory.gap_scale(PAIR, ji.Newton(1.0), [1.0, 0.0]), r"`law`"),
+    (lambda: ji.theory.gap_scale(PAIR, ji.LZB(1.0), [1.0]), r"`velocity`"),
     (
         lambda: ji.theory.crossover(PAIR, ji.Compliant(ji.Hertz(1.0)), [1.0, 0.0], [0.0]),
         r"two contacts",
@@ -241,7 +237,10 @@ CALLS = [
     (lambda: ji.theory.restitution_inclusion([[np.nan]], [[1.0]], 0.5, [1.0]), r"`coupling`"),
 ]
 MOTIONS = [
-    ({"t_end": 0.0}, "`t_end` must be larger than `t_start` = 0"),
+    ({"t_end": 0.0}, "`t_end` must be after the start at 0 s"),
+    ({"t_end": (1.0, 0.5)}, "`t_end` must be after the start at 1 s, but has value 0.5"),
+    ({"t_end": [0.0, 1.0, 2.0]}, r"`t_end` must be a time or a pair \(t_start, t_end\)"),
+    ({"t_end": ([0.0], 1.0)}, r"`t_end` must have shape \(\) \(a time, or a pair"),
     ({"t_end": np.nan}, "`t_end` must be finite"),
     ({"q0": [-0.1]}, "no penetration"),
     ({"q0": [np.nan]}, "`q0` must be finite"),
@@ -251,9 +250,8 @@ MOTIONS = [
     ({"samples": 1}, "`samples` must be an int >= 2"),
     ({"max_events": 0}, "`max_events` must be an int >= 1"),
     ({"method": "euler"}, "`method` must be one of"),
-    ({"method": "time_stepping"}, "`step` must be given"),
-    ({"rtol": 0.0}, r"`rtol` must lie in \(0"),
-    ({"friction": 0.3}, "needs a system with a `tangent_function`"),
+    ({"method": "time_stepping"}, "`step` must be a number"),
+    ({"method": ji.EventDriven(rtol=1e-17)}, "`rtol` must be at least"),
 ]
 SYSTEMS = [
     (
@@ -273,14 +271,13 @@ SYSTEMS = [
     (lambda: ji.System(None, [1.0]), "`gap_function` must be a function"),
     (
         lambda: ji.simulate(
-            ji.System(ji.Block(1.0, 1.0), gravity=True),
+            ji.System(ji.Block(1.0, 1.0), gravity=True, friction=[0.1, 0.2]),
             ji.Moreau(0.5),
             [0, 1, 0],
             [0] * 3,
             1.0,
-            friction=-0.1,
         ),
-        "`friction` must lie in",
+        r"`friction` must have shape \(\) or \(4,\)",
     ),
     (
         lambda: ji.fit_motion(

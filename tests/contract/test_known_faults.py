@@ -212,7 +212,7 @@ def test_a_domino_reaches_the_next_one():
     v = np.array([2 * height, 2 * width, -4.0, 0.0, 0.0, 0.0])
     motion = ji.simulate(
         ji.System(bodies, gravity=True), ji.Moreau(0.0, friction=0.2), q, v, 0.12,
-        samples=24, max_events=200, max_steps=2000,
+        samples=24, max_events=200, method=ji.EventDriven(max_steps=2000),
     )  # fmt: skip
     assert status_of(motion) == "ok"
     times = np.asarray(motion.event_times("impact"))

@@ -18,7 +18,6 @@ from jimpact import (
     RandomLaw,
     Uniform,
     chain,
-    gap_scale,
     impact,
     monte_carlo,
     read_samples,
@@ -286,7 +285,7 @@ def test_the_linearization_beside_monte_carlo():
     close = gap_sensitivity(law, BALLS, BEFORE, narrow.gap_mean, narrow)
     np.testing.assert_allclose(close.explained, 1.0, atol=0.02)
     assert "nearly linear" in str(close)
-    scale = gap_scale(BALLS, law, BEFORE).delta  # the report has gaps in units of it
+    scale = ji.theory.gap_scale(BALLS, law, BEFORE).delta  # the report has gaps in units of it
     np.testing.assert_array_equal(narrow.gap_scale, scale)
     ratio = narrow.gap_mean[0] / scale[0]
     assert f"in units of delta_c = {scale[0]:.3g} m: {ratio:.3g} and " in str(narrow)

@@ -87,16 +87,16 @@ def test_hops_below_the_rounding_of_gaps_are_passed(balls):
 def test_contacts_that_share_bodies_come_to_rest_together():
     """What is passed lies within its estimates: in time, and in the gaps meanwhile."""
     dropped = 0.9, [0.1, 0.101, 0.102], [0.0] * 3
-    fine = stack(*dropped, 2.0, slow=1e-12)
+    fine = stack(*dropped, 2.0, method=ji.EventDriven(slow=1e-12))
     rest = fine.events.accumulation_end[int(fine.events.count) - 1]
     for slow in (1e-8, 1e-6, 1e-4):
-        motion = stack(*dropped, 2.0, slow=slow)
+        motion = stack(*dropped, 2.0, method=ji.EventDriven(slow=slow))
         last = int(motion.events.count) - 1
         assert kinds(motion)[last] == "accumulation"
         begin, gap = motion.events.time[last], motion.events.accumulation_gap[last]
         assert begin < rest < motion.events.accumulation_end[last] < rest + 5 * (rest - begin)
         assert gap < 10 * slow * 0.1  # about that share of the first fall
-        meanwhile = stack(*dropped, (begin + rest) / 2, slow=1e-12).gaps[-1]
+        meanwhile = stack(*dropped, (begin + rest) / 2, method=ji.EventDriven(slow=1e-12)).gaps[-1]
         assert 0 < np.max(meanwhile) <= gap
         np.testing.assert_array_less(np.abs(motion.q[-1]), 1e-12)
         np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-13)
@@ -317,16 +317,11 @@ def test_ball_leaves_a_vibrating_plate():
 
 def on_slope(angle, speed, mu, e=0.0, drop=0.0, tilt=0.0, corners="all"):
     weights = G * jnp.stack([-jnp.sin(angle), jnp.cos(angle), jnp.zeros_like(angle)])
-    block = ji.System(ji.Block(0.2, 0.4, corners=corners), gravity=True)
-    system = ji.System(
-        block.gap_function,
-        block.mass,
-        potential=type(ji.gravity([0.0]))(weights),
-        tangent_function=block.tangent_function,
-    )
+    block = ji.Block(0.2, 0.4, corners=corners)
+    system = ji.System(block, potential=type(ji.gravity([0.0]))(weights), friction=mu)
     none = 0 * speed
     q0, v0 = jnp.stack([none, 0.2 + drop + none, tilt + none]), jnp.stack([speed, none, none])
-    return ji.simulate(system, ji.Moreau(e), q0, v0, 1.0, samples=21, friction=mu)
+    return ji.simulate(system, ji.Moreau(e), q0, v0, 1.0, samples=21)
 
 
 @pytest.fixture(scope="module")

@@ -168,7 +168,7 @@ def test_a_spinning_brick_comes_to_rest_on_a_face():
 
 
 def stepped(system, law, q0, v0):
-    options = {"samples": 3, "method": "time_stepping", "step": 1e-3, "closed_below": 1e-4}
+    options = {"samples": 3, "method": ji.TimeStepping(1e-3, closed_below=1e-4)}
     return ji.simulate(system, law, q0, v0, 0.01, **options)
 
 

@@ -61,12 +61,11 @@ def test_free_rocking_to_rest():
     """Each impact keeps e of the angular velocity; swings last as Housner's quadrature says."""
     e = float(ji.theory.housner_restitution(3.0))
     motion = ji.simulate(
-        ji.System(ji.Block(0.2, 0.6, corners="base"), gravity=True),
+        ji.System(ji.Block(0.2, 0.6, corners="base"), gravity=True, friction=5.0),
         ji.RestitutionMatrix(ji.theory.rocking_matrix(e)),
         upright(0.15),
         [0.0] * 3,
         4.0,
-        friction=5.0,
         samples=81,
     )
     assert ended(motion) == ["ok"]
@@ -128,7 +127,7 @@ def test_three_touching_beads_come_to_rest():
             beads,
             [0.0] * 3,
             2.0,
-            slow=slow,
+            method=ji.EventDriven(slow=slow),
         )
 
     motion, fine = drop(1e-6), drop(1e-10)
@@ -174,11 +173,9 @@ def test_an_overturned_block_lies_on_its_side():
 def test_a_body_on_a_tilted_plane_slides():
     """By its tangents alone, no displacements: s'' = g (sin a - mu cos a)."""
     slope = ji.Bodies([ji.Block(0.2, 0.1)], planes=[0.3])
-    system = ji.System(slope, gravity=True)
+    system = ji.System(slope, gravity=True, friction=0.25)
     rest = [0.0] * 3
-    motion = ji.simulate(
-        system, ji.Moreau(0.0), slope.touching(), rest, 1.0, samples=11, friction=0.25
-    )
+    motion = ji.simulate(system, ji.Moreau(0.0), slope.touching(), rest, 1.0, samples=11)
     assert ended(motion) == ["ok"]
     way = np.linalg.norm(np.asarray(motion.q[-1] - motion.q[0])[:2])
     assert way == pytest.approx(0.5 * G * (np.sin(0.3) - 0.25 * np.cos(0.3)), rel=1e-12)
@@ -196,12 +193,11 @@ def test_overturning_on_a_harmonic_base():
         start = base(jnp.zeros(()))[0]
         q0 = jnp.stack([start, jnp.full((), 0.3), jnp.zeros(())])
         return ji.simulate(
-            ji.System(ji.Block(0.2, 0.6, corners="base"), gravity=True, base=base),
+            ji.System(ji.Block(0.2, 0.6, corners="base"), gravity=True, base=base, friction=5.0),
             law,
             q0,
             jnp.zeros(3),
             2.0,
-            friction=5.0,
         )
 
     motion = shake(jnp.array([0.33, 0.36, 0.4, 0.6]))
@@ -243,12 +239,12 @@ def collides(x):
     system = ji.System(ji.PendulumCradle([0.1] * 3, 0.1, 0.01), gravity=True)
     start = jnp.stack([-x[1], 0 * x[1], 0 * x[1]])
     law = ji.LZB(x[0], rtol=1e-11)  # differences see the tolerance of the law, too
-    return system, law, start, jnp.zeros(3).at[0].set(x[2]), 0.6, None
+    return system, law, start, jnp.zeros(3).at[0].set(x[2]), 0.6
 
 
 def shaken(x):
     system = ji.System(ji.Column([1.0]), gravity=True, base=ji.HarmonicBase(x[0], x[1]))
-    return system, ji.Newton(x[2]), [0.2], [0.0], 1.0, None
+    return system, ji.Newton(x[2]), [0.2], [0.0], 1.0
 
 
 @pytest.mark.parametrize(
@@ -263,10 +259,8 @@ def test_derivatives_of_a_motion_against_differences(given, at, events, step, al
     """Of the end, event times and the ledger; differences at a finer tolerance."""
 
     def run(x, rtol=1e-10):
-        *start, friction = given(x)
-        motion = ji.simulate(
-            *start, friction=friction, samples=4, max_events=60, rtol=rtol, atol=rtol / 100
-        )
+        method = ji.EventDriven(rtol=rtol, atol=rtol / 100)
+        motion = ji.simulate(*given(x), samples=4, max_events=60, method=method)
         assert motion.events.time.shape == (60,)
         end = [motion.q[-1], motion.velocity[-1], motion.contact_work[-1].ravel()]
         return jnp.concatenate([*end, motion.base_work[-1:], motion.events.time[:events]])

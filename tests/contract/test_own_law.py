@@ -118,12 +118,12 @@ def test_it_has_a_history_and_a_gap_scale():
     slower = ji.VelocityDependent(ji.LZB(0.9, 1.0), speed_exponent=0.0)
     got, held = (ji.history(x, BALLS, V, samples=8) for x in (slower, ji.LZB(0.9, 1.0)))
     np.testing.assert_allclose(got.energy, held.energy, atol=1e-12)
-    deep = [ji.gap_scale(BALLS, x, V).delta for x in (law, same, ji.VelocityDependent(same))]
+    deep = [ji.theory.gap_scale(BALLS, x, V).delta for x in (law, same, ji.VelocityDependent(same))]
     np.testing.assert_allclose(deep, np.broadcast_to(deep[1], (3, 2)), rtol=1e-12)
     with pytest.raises(TypeError, match="must have a history"):
         ji.history(Blended(0.8, 0.25), BALLS, V)
     with pytest.raises(TypeError, match="must have a `contact_force`"):
-        ji.gap_scale(BALLS, Blended(0.8, 0.25), V)
+        ji.theory.gap_scale(BALLS, Blended(0.8, 0.25), V)
     hard = ji.Compliant(Steel(0.5), initial_energy=0.1)
     out = ji.impact(hard, BALLS, V)
     np.testing.assert_allclose(

@@ -263,9 +263,9 @@ def test_a_mixed_pile_comes_to_rest_and_goes_on():
     assert motion.kinetic_energy[-1] < 1e-9
     np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-10)
     assert -2e-3 < float(motion.gaps.min()) < -1e-9  # steps leave overlaps, with which it goes on
-    later = ji.simulate(system, law, **motion.end, t_end=1.7, **options)
+    later = ji.simulate(system, law, **motion.restart(1.7), **options)
     np.testing.assert_allclose(later.q[-1], motion.q[-1], atol=1e-6)
-    at = ji.pile_contacts(system, law, motion.q[-1], motion.velocity[-1], step=1e-3)
+    at = ji.TimeStepping(1e-3).contacts(system, law, motion.q[-1], motion.velocity[-1])
     # everything that the walls give carries the weight
     push = at.impulse[:, None] * at.normals + at.tangential
     np.testing.assert_allclose(push[at.bodies[:, 1] < 0].sum(axis=0) / 1e-3, [0, 80], atol=1e-2)
@@ -330,7 +330,8 @@ def test_a_step_of_a_packing_is_an_impact(struck):
     spheres, q, v = struck
     system, scene = ji.System(spheres), spheres.touching(q)
     smooth = ji.impact(ji.Moreau(0.5), scene, v)
-    step = ji.pile_contacts(system, ji.Moreau(0.5, friction=1e-12), q, v, step=1e-9)
+    steps = ji.TimeStepping(1e-9)
+    step = steps.contacts(system, ji.Moreau(0.5, friction=1e-12), q, v)
     np.testing.assert_allclose(step.velocity, smooth.velocity, atol=1e-6)
     np.testing.assert_array_equal(step.bodies[:4], [[0, 1], [0, 2], [1, 2], [0, -1]])
     np.testing.assert_allclose(step.impulse, smooth.impulse, atol=1e-6)
@@ -338,17 +339,16 @@ def test_a_step_of_a_packing_is_an_impact(struck):
     v = v.copy()
     v[[0, 1, 20]] = 0.0, 2.0, -3.0  # past the others; and ball 4 falls
     v[18] = 9.0
-    rough = ji.pile_contacts(system, ji.Moreau(0.5, friction=0.1), q, v, step=1e-9)
+    rough = steps.contacts(system, ji.Moreau(0.5, friction=0.1), q, v)
     falls = rough.bodies.tolist().index([3, -1])
     assert rough.impulse[falls] == pytest.approx(2 * 1.5 * 3, abs=1e-5)
     np.testing.assert_allclose(rough.tangential[falls], [-0.9, 0, 0], atol=1e-5)
     np.testing.assert_allclose(rough.velocity[[18, 20]], [9 - 0.45, 1.5], atol=1e-5)
+    column = ji.System(ji.Column([1.0]), gravity=True)
     with pytest.raises(ValueError, match=r"must be of a body with many contacts .* of Column"):
-        ji.pile_contacts(
-            ji.System(ji.Column([1.0]), gravity=True), ji.Moreau(0.5), [0.0], [-1.0], step=1e-3
-        )
+        steps.contacts(column, ji.Moreau(0.5), [0.0], [-1.0])
     with pytest.raises(ValueError, match="must lead to a contact within the step"):
-        ji.pile_contacts(system, ji.Moreau(0.5, friction=0.1), 9 * q, 0 * v, step=1e-9)
+        steps.contacts(system, ji.Moreau(0.5, friction=0.1), 9 * q, 0 * v)
 
 
 def test_bad_packings_are_named(struck):
@@ -383,5 +383,5 @@ def test_piles_by_events_are_refused_with_friction():
     at = pile.at([[0.0, 0.0], [0.3, 0.0]])
     law = ji.Compliant(ji.Hertz(1e6), friction=0.1)
     for method in ("events", "contact_forces"):
-        with pytest.raises(ValueError, match="`friction` must be 0 for the contacts of Discs"):
+        with pytest.raises(ValueError, match="`friction` must be 0 for the contacts of Pile"):
             ji.simulate(ji.System(pile), law, at, np.zeros(6), 1.0, method=method)

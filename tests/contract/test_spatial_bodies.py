@@ -176,7 +176,6 @@ def test_a_sphere_falls_over_the_edge_of_a_finite_wall_in_steps():
         (lambda: ji.Bodies([ji.Disc(1.0)], pairs=[], room=9), ValueError, "`room`"),
         (lambda: ji.Bodies([ji.Dimer(0.1, 1.0)], room=9), TypeError, "not Dimer"),
         (lambda: ji.Bodies([ji.Disc(1.0)], fixed=[ji.Disc(1.0)]), ValueError, "`fixed`"),
-        (lambda: ji.Bodies([ji.Sphere(1.0)], at=[0.0] * 7), ValueError, "`at`"),
         (
             lambda: ji.Bodies([ji.Box([1, 1, 1])] * 2),
             ValueError,

@@ -92,6 +92,7 @@ def test_unwritable_places_are_refused_before_anything_is_computed(
     ("arguments", "function"),
     [
         (study_file.MOTION_KEYS.values(), ji.simulate),
+        (set(study_file.METHOD_KEYS.values()) - {"step"}, ji.EventDriven),
         (study_file.FIT.allowed, ji.fit),
         (study_file.MOTION_TABLES["fit"].allowed, ji.fit_motion),
         (study_file.BASE_KEYS.values(), HarmonicBase),

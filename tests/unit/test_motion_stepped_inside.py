@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jimpact as ji
-from jimpact.bodies.solids import rotation
+from jimpact.bodies.rigid import rotation
 
 pytestmark = pytest.mark.release  # they compile programs of their own
 

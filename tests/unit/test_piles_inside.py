@@ -9,7 +9,6 @@ import pytest
 
 import jimpact as ji
 from jimpact.bodies.neighbours import crowd_of, near_pairs
-from jimpact.bodies.planar_piles import PlanarPile
 from jimpact.motion.arguments import check_pile
 
 
@@ -63,8 +62,8 @@ def test_a_crowd_holds_the_densest_packing():
 
 
 def test_piles_of_many_contacts_warn_by_events():
-    for count, warns in ((14, False), (15, True)):  # 182 and 210 contacts, two for each pair
-        pile = PlanarPile([ji.Disc(0.1)] * count, ())
+    for count, warns in ((20, False), (21, True)):  # 190 and 210 contacts
+        pile = ji.Bodies([ji.Disc(0.1)] * count, (), room=4 * count)
         at = pile.at(np.stack([0.3 * np.arange(count), np.zeros(count)], axis=1))
         arguments = ji.System(pile), jnp.asarray(at), None
         check_pile(*arguments, "time_stepping")

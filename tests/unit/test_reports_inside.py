@@ -181,8 +181,8 @@ def test_a_motion_goes_on():
     late = replace(late, kind=late.kind.at[1].set(KIND_CODE["impact"]))
     # it ended after the sample at .4 s and an impact at .45 s, which comes again later
     ended = replace(found, q=np.where(np.arange(6)[:, None] < 5, found.q, np.nan), events=late)
-    end = ended.end
-    assert end["t_start"] == 0.4
+    end = ended.restart(2.0)
+    assert end["t_end"] == (0.4, 2.0)
     np.testing.assert_array_equal(end["q0"], found.q[4])
     np.testing.assert_array_equal(end["v0"], found.velocity[4])
     later = replace(

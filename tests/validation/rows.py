@@ -302,8 +302,8 @@ def vibrating_plate():
         base = ji.HarmonicBase(amplitude, frequency)
         start = base(x[0])
         motion = ji.simulate(
-            ji.System(ji.Column([1.0]), gravity=True, base=base), ji.Newton(e), start, x[1:], x[0] + 1.5 * period,
-            t_start=x[0], samples=2, max_events=2,
+            ji.System(ji.Column([1.0]), gravity=True, base=base), ji.Newton(e), start, x[1:],
+            (x[0], x[0] + 1.5 * period), samples=2, max_events=2,
         )  # fmt: skip
         events = motion.events
         return jnp.stack([events.time[0], events.velocity_after[0, 0]])

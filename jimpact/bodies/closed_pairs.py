@@ -1,0 +1,73 @@
+"""The closed contacts of many bodies: in the first of so many rows, computed in blocks."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact.scene import Scene, sparse_scene
+
+# Contacts of a pile that are computed at once; rows without contacts are left out in such blocks.
+# Ten times more: few contacts among many bodies take as long as all of them.
+BLOCK = 128
+
+
+def over_blocks(count: Any, one: Callable[[Any, Any], Any], start: Any) -> Any:
+    """`start` carried by `one(first_row, carry)` through the blocks that hold `count` () rows."""
+    blocks = (count + BLOCK - 1) // BLOCK
+    return jax.lax.fori_loop(jnp.int32(0), blocks, lambda i, carry: one(i * BLOCK, carry), start)
+
+
+def block(x: jax.Array, row: jax.Array) -> jax.Array:
+    """The rows of x (K, ...) from this one that are computed at once."""
+    return jax.lax.dynamic_slice_in_dim(x, row, BLOCK)
+
+
+def with_block(x: jax.Array, values: jax.Array, row: jax.Array) -> jax.Array:
+    """x (K, ...) with these values from this row on."""
+    return jax.lax.dynamic_update_slice_in_dim(x, values.astype(x.dtype), row, 0)
+
+
+class ActivePairs(NamedTuple):
+    """The closed contacts of many bodies in the first of K rows, a multiple of `BLOCK`.
+
+    Rows that are not used are 0.
+    """
+
+    number: jax.Array  # (K,) of the contact among all of them; `pair_count` in unused rows
+    closed: jax.Array  # (K,) whether the row is used
+    filled: jax.Array  # () how many are
+    bodies: jax.Array  # (K, 2); the number of bodies stands for a wall
+    # (K, d, 2, velocities): normal and tangents, of both bodies, by the velocities of each: x, y
+    # and turn in a plane, x, y, z and three turns in space
+    directions: jax.Array
+    overflows: jax.Array  # () whether more are closed than there are rows
+    reach: jax.Array  # () [m]: bodies that move farther in one step may pass each other
+
+
+def listed_pairs(pairs: ActivePairs, mass: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, Scene]:
+    """On the host: rows (m,) in order, bodies (m, 2) with -1 for walls, directions, the scene.
+
+    Contacts of two bodies come first; `mass` (n,). Walls do not move: their directions are 0.
+    """
+    size = pairs.directions.shape[3]
+    bodies = np.where(pairs.bodies == len(mass) // size, -1, pairs.bodies)[: int(pairs.filled)]
+    order = np.lexsort((pairs.number[: len(bodies)], bodies[:, 1] < 0))
+    bodies, directions = bodies[order], np.array(pairs.directions)[order]
+    directions[:, :, 1] *= (bodies[:, 1] >= 0)[:, None, None]
+    scene = sparse_scene(mass, jnp.asarray(directions[:, 0]), bodies, len(mass) // size)
+    return order, bodies, directions, scene
+
+
+def chosen_rows(
+    so_far: jax.Array, first: jax.Array, count: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Of the next block of `count` () rows: which are used, and where they are found (BLOCK,).
+
+    `so_far` (C,) is how many have been found up to each place.
+    """
+    row = first + np.arange(BLOCK, dtype=np.int32)
+    place = jnp.minimum(jnp.searchsorted(so_far, row + 1), so_far.size - 1)
+    return row < count, place

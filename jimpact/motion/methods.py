@@ -1,0 +1,215 @@
+"""How a motion is computed: the methods of `simulate`, and the options of each."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+
+from jimpact._checks import as_whole, check_choice, check_values, is_traced, short_repr
+from jimpact.law import Law
+from jimpact.motion.flow import check_rtol
+from jimpact.motion.pile_contacts import PileContacts, contacts_of_step
+from jimpact.motion.system import System
+
+TOLERANCES = {"float64": (1e-10, 1e-12), "float32": (1e-5, 1e-7)}  # rtol, atol of the flights
+# Share of the largest gap velocity: a slower contact that is pressed back remains closed. Ten times
+# more passes an accumulation a few impacts earlier, and loses a hundred times the energy there.
+SLOW = 1e-6
+MAX_STEPS = 100_000  # of the flights by default; ten times more only delays the status `max_steps`
+
+
+@dataclass(frozen=True)
+class EventDriven:
+    """Flights that land on each event, impacts in no time; 'events' is this with its defaults.
+
+    Equation: between events that of `System`, with `0 <= lambda_n _|_ f'' >= 0` at contacts that
+    are closed and at rest.
+
+    Args:
+        rtol: relative tolerance of the flights; None: 1e-10, in single precision 1e-5.
+        atol: absolute one [m, m/s, rad, ..]; None: 1e-12, in single precision 1e-7.
+        closed_below: contacts with smaller gaps [m] take part in an impact; None: 1e-9, or 80
+            roundings of the largest coordinate or gap at the start, if that is more.
+        slow: repeated impacts with decreasing speed (accumulations) are cut short: a contact that
+            leaves slower than this share of the largest gap velocity so far, and would be pressed
+            back, remains closed. For contacts that share a body the limit is `sqrt(slow)`
+            (docs/motions_reference.md). `Motion.events` estimates the skipped time.
+        max_steps: total integrator steps.
+        progress: seconds after which a bar on stderr shows the share of the duration that is done,
+            after each run of 500 events; True: at once, False: never, None: after two seconds, and
+            only on a terminal.
+
+    Raises:
+        ValueError: values out of range.
+
+    >>> import jimpact as ji
+    >>> ball, coarse = ji.System(ji.Column([1.0]), gravity=True), ji.EventDriven(slow=0.1)
+    >>> motion = ji.simulate(ball, ji.Newton(0.8), [1.0], [0.0], 5.0, method=coarse, samples=3)
+    >>> int(motion.events.count)
+    11
+    """
+
+    rtol: float | None = None
+    atol: float | None = None
+    closed_below: Any = None
+    slow: Any = SLOW
+    max_steps: int = MAX_STEPS
+    progress: float | None = None
+
+    def __post_init__(self) -> None:
+        _check_flights(self)
+        check_values("closed_below", self.closed_below, low=0.0, open_low=True)
+        check_values("slow", self.slow, low=0.0, high=1.0)
+
+
+@dataclass(frozen=True)
+class ContactForces:
+    """The forces of a `Compliant` law act throughout: contacts take time, and may be penetrated.
+
+    Equation: `M v' = h + N F(f, f')`, the force F of the law at every gap f below zero.
+
+    Args:
+        rtol, atol, max_steps, progress: as of `EventDriven`.
+        until_apart: end where all contacts are open and none closes, with status `ok`: an impact
+            whose geometry turns. Its outcome is that of the last event.
+
+    Raises:
+        ValueError: values out of range.
+
+    >>> import jimpact as ji
+    >>> ball, law = ji.System(ji.Column([1.0])), ji.Compliant(ji.Hertz(1e6))
+    >>> impact = ji.ContactForces(until_apart=True)
+    >>> motion = ji.simulate(ball, law, [0.0], [-1.0], 1.0, method=impact, max_events=9)
+    >>> round(float(motion.events.velocity_after[motion.events.count - 1, 0]), 6)
+    1.0
+    """
+
+    rtol: float | None = None
+    atol: float | None = None
+    max_steps: int = MAX_STEPS
+    until_apart: bool = False
+    progress: float | None = None
+
+    def __post_init__(self) -> None:
+        _check_flights(self)
+
+
+@dataclass(frozen=True)
+class TimeStepping:
+    """Moreau-Jean steps of equal length, for many contacts.
+
+    Equation: `M (v+ - v-) = h dt + N p`, p that of the law at the contacts that are closed in the
+    middle of the step.
+
+    Args:
+        step: [s]; those between two samples are equal, none is longer.
+        closed_below: as of `EventDriven`.
+        progress: seconds after which stderr says that the motion runs, see `EventDriven`.
+
+    Raises:
+        ValueError: values out of range.
+
+    Source: Brogliato, Nonsmooth Mechanics (2016), Remark 6.9.
+
+    >>> import jimpact as ji
+    >>> ball, steps = ji.System(ji.Column([1.0]), gravity=True), ji.TimeStepping(1e-3)
+    >>> motion = ji.simulate(ball, ji.Moreau(0.0), [0.1], [0.0], 1.0, method=steps, samples=2)
+    >>> abs(float(motion.velocity[-1, 0])) < 1e-12
+    True
+    """
+
+    step: float
+    closed_below: Any = None
+    progress: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.step is None or is_traced(self.step):
+            raise ValueError("Argument `step` must be a number, for method 'time_stepping'.")
+        check_values("step", self.step, low=0.0, open_low=True)
+        check_values("closed_below", self.closed_below, low=0.0, open_low=True)
+
+    def contacts(self, system: System, law: Law, q: Any, v: Any, t: Any = 0.0) -> PileContacts:
+        """The contacts of a pile, and their impulses, in the step that begins at q, v.
+
+        Equation: `0 <= p _|_ gamma' + w >= 0`, `|p_t| <= mu p`, as in a motion. In a heap at rest
+        `impulse / step` are the contact forces; without forces of the system, and with a step in
+        which nothing moves far, it is an impact by Moreau's law, with friction, on a packing of any
+        size.
+
+        Args:
+            system: of a body with many contacts (`Bodies`).
+            law: `Moreau`.
+            q: (n,), for example a sample of a motion.
+            v: (n,) [m/s, rad/s].
+            t: time at the start of the step [s].
+
+        Returns:
+            `PileContacts`: bodies, normals, impulses, velocity after the step. Not differentiable,
+            not inside jit.
+
+        Raises:
+            ValueError: as of `simulate`; a system without many contacts, no contact in this step.
+
+        >>> import jimpact as ji
+        >>> discs = ji.Bodies([ji.Disc(0.1, 1.0), ji.Disc(0.1, 2.0)], room=8)
+        >>> system, q = ji.System(discs, gravity=10.0), discs.at([[0.0, 0.3], [0.0, 0.1]])
+        >>> found = ji.TimeStepping(1e-3).contacts(system, ji.Moreau(0.0), q, [0.0] * 6)
+        >>> found.bodies.tolist(), [round(float(p) / 1e-3, 3) for p in found.impulse]
+        ([[0, 1], [1, -1]], [10.0, 30.0])
+        """
+        return contacts_of_step(system, law, q, v, t, self.step, self.closed_below)
+
+
+Method = EventDriven | ContactForces | TimeStepping
+METHODS: dict[str, type[Any]] = {
+    "events": EventDriven,
+    "time_stepping": TimeStepping,
+    "contact_forces": ContactForces,
+}
+
+
+def as_method(method: str | Method, step: float | None = None, **options: Any) -> Method:
+    """The method that `simulate` is asked for; a word is one with its defaults, or `options`."""
+    if isinstance(method, Method):
+        if step is not None:
+            raise ValueError(
+                "Argument `step` must be left out where `method` is an object: a `TimeStepping` "
+                f"has its own, and others take none, but `method` has value {short_repr(method)}."
+            )
+        return method
+    if not isinstance(method, str):
+        raise TypeError(
+            f"Argument `method` must be one of {', '.join(METHODS)} or an object of `EventDriven`, "
+            f"`TimeStepping` or `ContactForces`, but has value {short_repr(method)}."
+        )
+    check_choice("method", method, tuple(METHODS))
+    if method == "time_stepping":
+        options["step"] = step
+    elif step is not None:
+        raise ValueError(
+            "Argument `step` must be left out but for method='time_stepping', which it belongs to; "
+            f"`method` has value {method!r}."
+        )
+    made: Method = METHODS[method](**options)
+    return made
+
+
+def name_of(method: Method) -> str:
+    """The word for a method."""
+    return next(name for name, kind in METHODS.items() if isinstance(method, kind))
+
+
+def tolerances(method: EventDriven | ContactForces, dtype: jnp.dtype) -> tuple[float, float]:
+    """Relative and absolute tolerance of the flights, those of the precision by default."""
+    rtol, atol = TOLERANCES.get(str(dtype), TOLERANCES["float32"])
+    rtol = rtol if method.rtol is None else method.rtol
+    if isinstance(method, EventDriven):
+        check_rtol(rtol, dtype)
+    return rtol, atol if method.atol is None else method.atol
+
+
+def _check_flights(method: EventDriven | ContactForces) -> None:
+    """Raise a ValueError for options that flights do not have."""
+    check_values("rtol", method.rtol, low=0.0, open_low=True)
+    check_values("atol", method.atol, low=0.0, open_low=True)
+    as_whole("max_steps", method.max_steps, 1)
