@@ -20,8 +20,8 @@ from jimpact.fits.report import Fit
 from jimpact.fits.solve import (
     DEFAULT_STEPS,
     Ends,
+    FitMinimum,
     Method,
-    Minimum,
     Search,
     Solution,
     check_method,
@@ -35,7 +35,6 @@ from jimpact.fits.solve import (
     start_points,
 )
 from jimpact.fits.uncertainty import (
-    FitMinimum,
     Profile,
     Uncertainty,
     check_level,
@@ -167,7 +166,7 @@ def fit(
         if found.slopes is not None:
             points = problem.point(np.array([minimum.value for minimum in found.minima]))
             (problem,), ends = settled([problem], points, search, slopes=[found.slopes])
-            counts = np.array([minimum.starts for minimum in found.minima])
+            counts = np.array([minimum.count for minimum in found.minima])
             found = solution(problem, ends, counts, found.lost)
         robust = None
         if loss != "squares":
@@ -242,7 +241,7 @@ def as_fit(
     undetermined = numbers.pop("undetermined")
     slope = found.jacobian.reshape((*residual.shape, len(problem.names)))
     starts = [
-        FitMinimum(x.squares, x.value, x.starts, _standard_error(problem, found, x, errors))
+        replace(x, standard_error=_standard_error(problem, found, x, errors), jacobian=None)
         for x in found.minima
     ]
     return Fit(
@@ -285,12 +284,13 @@ def _errors(
 
 
 def _standard_error(
-    problem: FitProblem, found: Solution, minimum: Minimum, best: Uncertainty
+    problem: FitProblem, found: Solution, minimum: FitMinimum, best: Uncertainty
 ) -> np.ndarray | None:
     """Standard errors (P,) at a minimum that fits hardly worse than the best; else None."""
     if minimum is found.minima[0]:
         return best.standard_error
-    if not minimum.squares - found.minima[0].squares <= (HARDLY_WORSE * best.noise) ** 2:
+    more = minimum.sum_of_squares - found.minima[0].sum_of_squares
+    if not more <= (HARDLY_WORSE * best.noise) ** 2:
         return None
     return uncertainty(problem, minimum, best.noise).standard_error
 
@@ -341,7 +341,8 @@ def _robust(
     residual = problem.independent(problem.measured - found.predicted)
     from_priors, _ = problem.prior_errors(found.value)
     squares = float(np.sum(residual**2) + np.sum(from_priors**2))
-    minimum = Minimum(squares, found.value, 1, found.jacobian / factor.reshape(-1, 1))
+    slope = found.jacobian / factor.reshape(-1, 1)
+    minimum = FitMinimum(squares, found.value, 1, jacobian=slope)
     return problem, found._replace(minima=[minimum]), float(noise)
 
 

@@ -7,7 +7,7 @@ plane, is filled from the minima outwards.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import NamedTuple
 
@@ -19,6 +19,7 @@ from jimpact.fits.solve import (
     SAME_VALUE,
     START_SCALES,
     Ends,
+    FitMinimum,
     Search,
     Solution,
     find_minima,
@@ -97,18 +98,14 @@ class Deviances:
         # if the noise is undetermined, that of an exact fit up to rounding
         known = np.isfinite(fit.noise) and fit.noise > 0
         self.variance = float(fit.noise**2) if known else self.problem.exact_squares
-        steps = self.problem.steps_at
-        starts = [
-            Start(
-                end.sum_of_squares,
-                self.problem.point(end.value),
-                np.full(len(fit.names), np.nan)
-                if end.standard_error is None
-                else end.standard_error / steps(end.value),
-            )
-            for end in fit.starts
-        ]
-        self.starts, self.best, self.lowest = starts, starts[0], starts[0]
+        self.starts = [self.start(end) for end in fit.starts]
+        self.best = self.lowest = self.starts[0]
+
+    def start(self, end: FitMinimum) -> Start:
+        """A minimum in the solver's scale."""
+        steps = self.problem.steps_at(end.value)
+        error = np.full(len(steps), np.nan) if end.standard_error is None else end.standard_error
+        return Start(end.sum_of_squares, self.problem.point(end.value), error / steps)
 
     def minimize(self, fixed: Sequence[tuple[int, ...]], y: Sequence[np.ndarray]) -> Ends:
         """Minima from each y (A, Q) with these of its parameters fixed, all side by side."""
@@ -285,8 +282,7 @@ class _Lines(Deviances):
         starts = []
         for minimum in found.minima:
             error = uncertainty(self.problem, minimum, self.fit.noise).standard_error
-            y, steps = self.problem.point(minimum.value), self.problem.steps_at(minimum.value)
-            starts.append(Start(minimum.squares, y, error / steps))
+            starts.append(self.start(replace(minimum, standard_error=error)))
         self._choose([*self.starts, *starts])
 
     def grid(self, i: int) -> Grid:

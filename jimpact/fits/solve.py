@@ -8,7 +8,7 @@ One pass evaluates residual and Jacobian together, so that an impact is compiled
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
@@ -451,19 +451,25 @@ def minimize_with(
 # ---------------------------------------------------------------------------- distinct minima
 
 
-class Minimum(NamedTuple):
-    """A point that starts ended in."""
+@dataclass(frozen=True, eq=False)
+class FitMinimum:
+    """A minimum that starts ended in: sum of squared (weighted) residuals, values, how many.
 
-    squares: float  # |r|^2, in units of sigma
-    value: np.ndarray  # of the parameters (P,)
-    starts: int  # how many
-    jacobian: np.ndarray  # (R, P), of the scaled parameters
+    `standard_error` is None where it fits so much worse that it does not matter. A search knows the
+    `jacobian` (R, P) of the scaled parameters.
+    """
+
+    sum_of_squares: float
+    value: np.ndarray
+    count: int
+    standard_error: np.ndarray | None = None
+    jacobian: np.ndarray | None = None
 
 
 class Solution(NamedTuple):
     """All distinct minima, best first, and what the law of the best predicts."""
 
-    minima: list[Minimum]
+    minima: list[FitMinimum]
     predicted: np.ndarray  # shaped like what was measured
     status: np.ndarray
     slopes: np.ndarray | None  # `dv+/dv-` of the shots, where errors of v- are passed on
@@ -481,7 +487,9 @@ class Solution(NamedTuple):
     @property
     def jacobian(self) -> np.ndarray:
         """(R, P), of the scaled parameters at the best."""
-        return self.minima[0].jacobian
+        jacobian = self.minima[0].jacobian
+        assert jacobian is not None
+        return jacobian
 
 
 def solution(
@@ -495,11 +503,11 @@ def solution(
     # starts that did not converge have no minimum to report, unless they are the best there is
     kept = [[i for i in group if ends.converged[i] or i == best] for group in groups]
     minima = [
-        Minimum(
+        FitMinimum(
             float(ends.squares[group[0]]),
             problem.values_at(ends.y[group[0]]),
             int(counts[group].sum()),
-            ends.jacobian[group[0]][: measured.size, :count],  # without what filled up
+            jacobian=ends.jacobian[group[0]][: measured.size, :count],  # without what filled up
         )
         for group in kept
         if group
@@ -515,7 +523,7 @@ def solution(
         stuck=bool(ends.stuck[best]),
         at_bound=(y[best] <= low) | (y[best] >= high),
         steps=int(np.max(ends.steps)),
-        lost=lost + int(counts.sum()) - sum(minimum.starts for minimum in minima),
+        lost=lost + int(counts.sum()) - sum(minimum.count for minimum in minima),
     )
 
 
