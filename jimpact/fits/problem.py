@@ -291,6 +291,29 @@ class FitProblem:
             )
         return problem
 
+    def with_shots(self, data: Experiments) -> "FitProblem":
+        """The same of other shots in the common scene.
+
+        Args:
+            data: shots of as many bodies, with exact v-.
+        """
+        observe: Any = self.observe
+        count, n = data.pre.shape
+        scenes = jax.tree.map(lambda x: np.repeat(x[:1], count, axis=0), observe.scenes)
+        before = np.repeat(observe.pre[:1], count, axis=0)
+        before[:, :n] = np.asarray(data.pre)
+        sigma, errors, unit = _errors_and_unit(data, self.scene)
+        arrays = _weighed_values(np.asarray(data.post), errors, unit)
+        here = int(data.measured.sum())
+        return replace(
+            self,
+            observe=replace(observe, scenes=scenes, pre=before),
+            **_in(self.low.dtype, arrays),
+            sigma=sigma,
+            values=here + len(self.priors) - data.lost_freedom,
+            experiments=data,
+        )
+
     def weighed(self, factor: np.ndarray) -> "FitProblem":
         """With factors on the independent errors.
 
@@ -617,7 +640,7 @@ def of_shots(
     law = with_parts_of_scene(law, scene, not same, free)
     alike, extra = stackable(scenes[:1] if same else scenes)
     pre, post = np.asarray(experiments.pre), np.asarray(experiments.post)
-    unit = max(np.abs(pre).max(), np.nanmax(np.abs(post))) or 1.0
+    sigma, errors, unit = _errors_and_unit(experiments, scene)
     count, n = pre.shape
     masses = experiments.each(scene, dense_mass)
     energy = max(0.5 * v @ mass @ v for mass, v in zip(masses, pre)) or 1.0
@@ -626,8 +649,6 @@ def of_shots(
     )
     filled = np.pad(pre, ((0, 0), (0, extra)), constant_values=unit)
     observe = Shots(stacked, filled, n)  # type: ignore[arg-type]
-    sigma = None if experiments.sigma is None else np.asarray(experiments.sigma)
-    errors = experiments.natural_errors(scene) if sigma is None else sigma
     choice = (free, *known)
     problem = _build(law, observe, post, sigma, errors, unit, choice, energy, alike)
     problem = replace(
@@ -673,13 +694,7 @@ def _build(
             "values is known: priors and data weigh against each other by their errors."
         )
     arrays = _of_parameters(law, parameters, limits, priors, energy)
-    here = ~np.isnan(measured)
-    arrays["weight"] = np.where(here, 1 / np.where(here, errors, 1.0), 0.0)
-    unit = unit or 1.0
-    arrays |= {
-        "unit": np.asarray(unit),
-        "size": np.asarray(unit * np.linalg.norm(arrays["weight"])),
-    }
+    arrays |= _weighed_values(measured, errors, unit)
     owner, ends = arrays["owner"], np.stack([arrays["low"], arrays["high"]])
     moves = np.where(owner[:, None] == np.arange(len(owner)), arrays["scale"], 0.0)
     origin = np.where(owner < 0, arrays["fixed"], 0.0)
@@ -690,16 +705,34 @@ def _build(
         law=_in(dtype, law),
         observe=_in(dtype, observe),
         matrix=matrix,
-        **_in(dtype, arrays | {"measured": measured}),
+        **_in(dtype, arrays),
         fields=parameters.fields,
         ties=ties,
         parameters=parameters,
         domains=np.stack(limits, axis=1),
         sigma=sigma,
-        values=int(here.sum()) + len(priors),
+        values=int((~np.isnan(measured)).sum()) + len(priors),
         priors=priors,
         notes=tuple(notes),
     )
+
+
+def _weighed_values(measured: np.ndarray, errors: np.ndarray, unit: float) -> dict[str, Any]:
+    """What was measured, its weights, and the sizes that follow."""
+    here, unit = ~np.isnan(measured), unit or 1.0
+    weight = np.where(here, 1 / np.where(here, errors, 1.0), 0.0)
+    size = np.asarray(unit * np.linalg.norm(weight))
+    return {"measured": measured, "weight": weight, "unit": np.asarray(unit), "size": size}
+
+
+def _errors_and_unit(
+    data: Experiments, scene: Scene | None
+) -> tuple[np.ndarray | None, np.ndarray, float]:
+    """Stated errors, those to weigh by, and the largest velocity."""
+    sigma = None if data.sigma is None else np.asarray(data.sigma)
+    errors = data.natural_errors(scene) if sigma is None else sigma
+    unit = max(np.abs(np.asarray(data.pre)).max(), np.nanmax(np.abs(np.asarray(data.post))))
+    return sigma, errors, float(unit)
 
 
 def _of_parameters(

@@ -432,10 +432,11 @@ def repeated(problem: "FitProblem", count: int) -> Any:
     return jax.tree.map(each, problem.program())
 
 
-def stacked(problems: "list[FitProblem]") -> Any:
-    """The problems side by side."""
+def stacked(problems: "list[FitProblem]", each: int = 1) -> Any:
+    """The problems side by side, each so many times."""
     filled = [problem.program() for problem in problems]
-    return jax.tree.map(lambda *x: np.stack([np.asarray(leaf) for leaf in x]), *filled)
+    many = jax.tree.map(lambda *x: np.stack([np.asarray(leaf) for leaf in x]), *filled)
+    return many if each == 1 else jax.tree.map(lambda x: np.repeat(x, each, axis=0), many)
 
 
 def minimize_with(
@@ -652,43 +653,23 @@ def _same_values(ends: Ends, first: int, apart: np.ndarray) -> bool:
 
 
 def settled(
-    problems: "list[FitProblem]",
-    points: np.ndarray,
-    search: Search,
-    many: Any = None,
-    slopes: Any = None,
+    problems: "list[FitProblem]", points: np.ndarray, search: Search
 ) -> "tuple[list[FitProblem], Ends]":
-    """Minima next to points (S, Q), equally many of each problem, its best one first.
+    """Minima next to points (S, Q), equally many of each problem.
 
-    Errors of v- are passed on by the law of the best minimum, until both agree. `many`: other
-    problems (S, ...) than these, whose weights alone are taken. `slopes`: `dv+/dv-` of each problem
-    at its best point; None: the problems pass errors on by them already.
+    Errors of v- are passed on by the law of each problem's best minimum, until both agree.
     """
-    each = len(points) // len(problems)
-    if many is None:
-        many = stacked([problem for problem in problems for _ in range(each)])
-
-    def weighted() -> Any:
-        """The many problems with errors of v- passed on by the slopes."""
-        filled = [p.program() for p in problems for _ in range(each)]
-        names = ("weight", "size", "mixing")
-        return replace(many, **{n: np.stack([getattr(p, n) for p in filled]) for n in names})
-
+    each, start = len(points) // len(problems), points
     for _ in range(SETTLING):
-        if slopes is not None:
-            problems = [p.with_errors_before(slope) for p, slope in zip(problems, slopes)]
-            many = weighted()
-        ends = minimize(many, points, search)
-        moved = np.abs(ends.y - points).max(axis=1) > SETTLED
+        ends = minimize(stacked(problems, each), start, search)
         if ends.slopes is None:
             return problems, ends
-        points, best = ends.y, np.nanargmin(ends.squares.reshape(-1, each), axis=1)
-        last = ends.slopes[np.arange(0, len(points), each) + best]
-        if not moved.any():
-            if slopes is not None:  # residuals and Jacobians with the weights of the final law
-                problems = [p.with_errors_before(slope) for p, slope in zip(problems, last)]
-                many = weighted()
-                ends = minimize(many, points, search._replace(max_steps=1))
-            return problems, ends
-        slopes = last
+        best = np.nanargmin(ends.squares.reshape(-1, each), axis=1)
+        slopes = ends.slopes[np.arange(0, len(points), each) + best]
+        problems = [p.with_errors_before(slope) for p, slope in zip(problems, slopes)]
+        moved = np.abs(ends.y - start).max(axis=1) > SETTLED
+        start = ends.y
+        if not moved.any():  # residuals and Jacobians with the weights of the final law
+            last = search._replace(max_steps=1)
+            return problems, minimize(stacked(problems, each), start, last)
     return problems, ends._replace(converged=ends.converged & ~moved)
