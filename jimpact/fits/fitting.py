@@ -80,8 +80,8 @@ def fit(
             a scalar field; an (m,) field is free contact by contact. The stiffnesses of `LZB` with
             equal exponents: only their ratios matter, so that of contact 1 is fixed; a scalar
             stiffness is fixed by default, and naming it in `free` is an error.
-            The (m, m) matrix of a `RestitutionMatrix` stays admissible in all its scenes for every
-            approach velocity, at every evaluation and with every method; the start must be so.
+            The (m, m) matrix of a `RestitutionMatrix` is the best one that is admissible in all its
+            scenes for every approach velocity; the start must be so.
             Or a `FitProblem`, which holds the next three arguments, `bounds`, `priors`, `ties`.
         scene: the scene of all shots; ignored if each shot has its own scene.
         experiments: measured shots.

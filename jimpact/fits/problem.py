@@ -43,7 +43,7 @@ from jimpact.fits.parameters import (
     with_entries,
     with_parts_of_scene,
 )
-from jimpact.fits.solve import EXACT, BoxRegion, Evaluated
+from jimpact.fits.solve import EXACT, Evaluated
 from jimpact.impacts import impact
 from jimpact.law import AnyLaw, Law, forward_only
 from jimpact.scene import Scene, dense_mass, stackable
@@ -449,7 +449,10 @@ class FitProblem:
         rest = len(self.low) - len(x)
         x = jnp.pad(x, (0, rest))
         y = jnp.where(self.log, jnp.log(jnp.where(self.log, x, 1.0)), x / self.scale)
-        return self._values(self.region.nearest(y))[: len(x) - rest]
+        inside = jnp.clip(y, self.low, self.high)
+        if self.matrix is not None:
+            inside = self.matrix.nearest(y, jnp.eye(len(y), dtype=y.dtype), jnp.zeros_like(y))
+        return self._values(inside)[: len(x) - rest]
 
     def log_density(self, x: Any) -> jax.Array:
         """Logarithm () of the probability density of the data at x (P,), normally distributed.
@@ -470,11 +473,6 @@ class FitProblem:
         return -0.5 * squares - float(np.sum(constant))
 
     # ------------------------------------------------------------------ for solvers
-
-    @property
-    def region(self) -> Any:
-        """Where y may lie."""
-        return BoxRegion(self.low, self.high) if self.matrix is None else self.matrix
 
     @full_precision
     def _values(self, y: jax.Array) -> jax.Array:

@@ -1,6 +1,6 @@
-"""Nonlinear least squares in a region, from many starts or of many problems at once, and minima.
+"""Nonlinear least squares in a box, from many starts or of many problems at once, and minima.
 
-Minimize `|r(y)|^2 / 2` for y in a `Region`, mostly the `BoxRegion` `low <= y <= high`, by
+Minimize `|r(y)|^2 / 2` for `low <= y <= high`, by
 Levenberg-Marquardt or by gradient descent with optax. Steps are cut at the box, and a variable on a
 bound whose gradient points outward is left out of the step, so minima on a bound are found exactly.
 One pass evaluates residual and Jacobian together, so that an impact is compiled once.
@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.compiling import full_precision, quick_jit
+from jimpact.compiling import quick_jit
 from jimpact.progress import Show
 
 if TYPE_CHECKING:
@@ -92,8 +92,8 @@ NEAR_RCOND = 1e-10  # directions that the data do not determine are not searched
 SETTLED, SETTLING = 1e-5, 10  # change (natural scales) and rounds, where errors of v- are passed on
 
 
-class BoxRegion(eqx.Module):
-    """The region `low <= y <= high`."""
+class Box(eqx.Module):
+    """The box `low <= y <= high`."""
 
     low: jax.Array
     high: jax.Array
@@ -101,10 +101,6 @@ class BoxRegion(eqx.Module):
     def retract(self, y: jax.Array) -> jax.Array:
         """The nearest point of the box."""
         return jnp.clip(y, self.low, self.high)
-
-    def nearest(self, y: jax.Array) -> jax.Array:
-        """The same."""
-        return self.retract(y)
 
     def free_gradient(self, y: jax.Array, gradient: jax.Array) -> jax.Array:
         """The gradient without variables that sit on a bound and are pushed against it."""
@@ -204,7 +200,7 @@ def begin(y: Any, first: Evaluated, search: "Search") -> SolverState:
 
 def advance(
     evaluate: Evaluate,
-    region: Any,
+    box: Box,
     method: Method,
     max_steps: int,
     state: SolverState,
@@ -213,7 +209,7 @@ def advance(
 ) -> SolverState:
     """Up to `passes` passes more, fewer if done or at the step limit; `stop`: see `FINE`."""
     last = jnp.minimum(state.steps + passes, max_steps)
-    state = eqx.tree_at(lambda s: s.trial, state, region.retract(state.trial))
+    state = eqx.tree_at(lambda s: s.trial, state, box.retract(state.trial))
 
     def one(state: SolverState) -> SolverState:
         """One pass."""
@@ -228,15 +224,15 @@ def advance(
         floor = jnp.asarray(_LEAST[dtype], y.dtype)
         if method == "levenberg-marquardt":
             memory = state.memory.after(state.cost - cost)
-            step = partial(region.step, y, r, jac)
+            step = partial(box.step, y, r, jac)
             moves, gains = jax.vmap(step)(jnp.stack([floor, memory.value]))  # compiled once
-            gain, trial = gains[0], region.retract(y + moves[1])
+            gain, trial = gains[0], box.retract(y + moves[1])
             change = jac @ (trial - y)
             memory = memory._replace(promised=-(r @ change) - 0.5 * jnp.sum(change**2))
             stuck = memory.value > _STUCK
         else:
-            gain = region.step(y, r, jac, floor)[1]
-            gradient = region.free_gradient(state.trial, jacobian.T @ residual)
+            gain = box.step(y, r, jac, floor)[1]
+            gradient = box.free_gradient(state.trial, jacobian.T @ residual)
             # optax itself mixes integers and floats: it needs the standard promotion
             with jax.numpy_dtype_promotion("standard"):
                 move, memory = _transformation(method, max_steps).update(
@@ -245,9 +241,9 @@ def advance(
                     state.trial,
                     value=cost,
                     grad=gradient,
-                    value_fn=lambda y: _cost(evaluate, region.retract(y)),
+                    value_fn=lambda y: _cost(evaluate, box.retract(y)),
                 )
-            trial = region.retract(state.trial + move)
+            trial = box.retract(state.trial + move)
             stuck = jnp.asarray(False)
         finest = stop * least / residual.shape[0] + STOP_EXACT[dtype]
         rounding = ROUNDING[dtype] * least / residual.shape[0] + ROUNDING_EXACT[dtype]
@@ -257,23 +253,6 @@ def advance(
         )
 
     return jax.lax.while_loop(lambda s: ~s.done & (s.steps < last), one, state)
-
-
-@full_precision
-def nearest(region: Any, y: jax.Array) -> jax.Array:
-    """The point of a region nearest to y: least squares of the distance."""
-    identity, method = jnp.eye(y.shape[0], dtype=y.dtype), "levenberg-marquardt"
-    steps = DEFAULT_STEPS[method]
-
-    def distance(at: jax.Array) -> tuple[jax.Array, jax.Array, tuple[()]]:
-        """From y, and its Jacobian."""
-        return at - y, identity, ()
-
-    infinite, no = jnp.asarray(jnp.inf, y.dtype), jnp.asarray(False)
-    memory = Damping(*jnp.asarray([DAMPING, _FIRST_GROWTH, jnp.inf], y.dtype))
-    first = (region.retract(y), y, identity, (), infinite, infinite, y, memory)
-    state = SolverState(*first, jnp.asarray(0), no, no)
-    return advance(distance, region, method, steps, state, steps, FINE[str(y.dtype)]).y
 
 
 def _cost(evaluate: Evaluate, y: jax.Array) -> jax.Array:
@@ -350,15 +329,67 @@ def minimize(
 
     As many as `problems.lanes(S)` are solved side by side; those that are done make room for
     others. `stop`: see `FINE`, which it is at least. `rivals`: all are starts of one problem, and
-    those that creep or will not become the best are given up. Progress counts `what`.
+    those that creep or will not become the best are given up. Progress counts `what`. A matrix that
+    must be admissible is sought without that, and then the best admissible one.
     """
-    dtype, count = problems.low.dtype, len(points)
+    dtype, matrix = problems.low.dtype, problems.matrix
+    problems = replace(problems, matrix=None)
+    rule = (max(FINE[str(dtype)], stop), rivals, what)
+    states, converged = _descended(problems, points.astype(dtype), search, *rule)
+    y, steps, stuck = np.asarray(states.y), states.steps, states.stuck
+    once, moved = search._replace(max_steps=1), np.full(len(y), matrix is not None)
+    for _ in range(SETTLING):
+        if not moved.any():
+            break
+        inside = _in_lanes(best_inside, problems.lanes(len(y)), matrix, states)
+        states, _ = _descended(problems, inside, once, *rule)
+        moved, y = np.abs(inside - y).max(axis=1) > SETTLED, inside
+    size = np.asarray(problems.size, float)
+    return Ends(
+        y=np.asarray(states.y, float),
+        squares=2 * np.asarray(states.cost, float) * size**2,
+        jacobian=np.asarray(states.jacobian, float) * size[:, None, None],
+        predicted=np.asarray(states.aux[0], float),
+        status=states.aux[1],
+        slopes=states.aux[2] if len(states.aux) > 2 else None,
+        converged=converged & ~moved,
+        stuck=np.asarray(stuck),
+        steps=np.asarray(steps),
+        exact=EXACT[str(dtype)] * size**2,
+    )
+
+
+def _in_lanes(compiled: Callable[..., Any], lanes: int, *trees: Any) -> np.ndarray:
+    """Rows of the results of a compiled function of so many rows."""
+    count = len(jax.tree.leaves(trees[-1])[0])
+    some = [np.arange(first, first + lanes) for first in range(0, count, lanes)]
+    rows = [np.minimum(each, count - 1) for each in some]
+    return np.concatenate([compiled(*(_rows(x, each) for x in trees)) for each in rows])[:count]
+
+
+@quick_jit
+def best_inside(matrix: Any, states: SolverState) -> jax.Array:
+    """The admissible points where the linearized residuals are least."""
+
+    def one(matrix: Any, state: SolverState) -> jax.Array:
+        """Of one problem."""
+        jacobian = state.jacobian
+        hessian, gradient = jacobian.T @ jacobian, jacobian.T @ state.residual
+        return matrix.nearest(state.y, hessian, gradient)
+
+    return jax.vmap(one)(matrix, states)
+
+
+def _descended(
+    problems: Any, points: np.ndarray, search: Search, stop: float, rivals: bool, what: str
+) -> tuple[SolverState, np.ndarray]:
+    """States where searches from y (S, Q) ended, and which have converged; see `minimize`."""
+    dtype, count = points.dtype, len(points)
     limit: Any = search.max_steps
     descends = search.method != "levenberg-marquardt"
     if not descends:
         limit = np.asarray(limit)  # one program serves all limits
-    rule: Any = (search.method, limit, np.asarray(max(FINE[str(dtype)], stop), dtype))
-    points = points.astype(dtype)
+    rule: Any = (search.method, limit, np.asarray(stop, dtype))
     states = begin(points, problems.blank(points), search)
     converged = np.zeros(count, bool)
     active, lanes = np.arange(count), problems.lanes(count)
@@ -381,19 +412,7 @@ def minimize(
         search.show(f"fit: {done} of {count} {what} done, step {steps}", done, count)
         if time.monotonic() > search.deadline:
             break
-    size = np.asarray(problems.size, float)
-    return Ends(
-        y=np.asarray(states.y, float),
-        squares=2 * np.asarray(states.cost, float) * size**2,
-        jacobian=np.asarray(states.jacobian, float) * size[:, None, None],
-        predicted=np.asarray(states.aux[0], float),
-        status=states.aux[1],
-        slopes=states.aux[2] if len(states.aux) > 2 else None,
-        converged=converged,
-        stuck=np.asarray(states.stuck),
-        steps=np.asarray(states.steps),
-        exact=EXACT[str(dtype)] * size**2,
-    )
+    return states, converged
 
 
 def _converged(states: SolverState, enough: float) -> np.ndarray:
@@ -411,8 +430,8 @@ def advance_all(
 
     def one(problem: Any, state: SolverState) -> SolverState:
         """One problem."""
-        region, evaluate = problem.region, problem.evaluate
-        return advance(evaluate, region, method, max_steps, state, PASSES, stop)
+        box = Box(problem.low, problem.high)
+        return advance(problem.evaluate, box, method, max_steps, state, PASSES, stop)
 
     return eqx.filter_vmap(one)(problems, states)
 
