@@ -693,6 +693,7 @@ def _build(
         )
     arrays = _of_parameters(law, parameters, limits, priors, energy)
     arrays |= _weighed_values(measured, errors, unit)
+    here = ~np.isnan(measured)
     owner, ends = arrays["owner"], np.stack([arrays["low"], arrays["high"]])
     moves = np.where(owner[:, None] == np.arange(len(owner)), arrays["scale"], 0.0)
     origin = np.where(owner < 0, arrays["fixed"], 0.0)
@@ -709,7 +710,7 @@ def _build(
         parameters=parameters,
         domains=np.stack(limits, axis=1),
         sigma=sigma,
-        values=int((~np.isnan(measured)).sum()) + len(priors),
+        values=int(here.sum()) + len(priors),
         priors=priors,
         notes=tuple(notes),
     )
