@@ -5,7 +5,7 @@ import numpy as np
 
 import jimpact as ji
 from jimpact.fits.report import Fit
-from jimpact.fits.uncertainty import FitMinimum
+from jimpact.fits.solve import FitMinimum
 from jimpact.laws.histories import History
 from jimpact.motion.record import KIND_CODE, Motion, no_events, with_row
 

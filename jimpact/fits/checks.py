@@ -668,7 +668,7 @@ def _equally_good(judged: _Judged) -> Iterable[dict[str, Any]]:
     problem, minima = judged.problem, judged.solution.minima
     noise = judged.errors.noise if np.isfinite(judged.errors.noise) else 0.0
     more = max(EQUALLY_GOOD * noise**2, problem.exact_squares)
-    several = sum(end.squares <= minima[0].squares + more for end in minima)
+    several = sum(end.sum_of_squares <= minima[0].sum_of_squares + more for end in minima)
     return [{"several": several}] if several > 1 and not _undetermined(judged) else []
 
 

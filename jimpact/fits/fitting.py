@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import jax
 import numpy as np
 
 from jimpact._checks import as_whole, check_choice, check_kind
@@ -20,8 +19,8 @@ from jimpact.fits.report import Fit
 from jimpact.fits.solve import (
     DEFAULT_STEPS,
     Ends,
+    FitMinimum,
     Method,
-    Minimum,
     Search,
     Solution,
     check_method,
@@ -31,11 +30,9 @@ from jimpact.fits.solve import (
     repeated,
     settled,
     solution,
-    stacked,
     start_points,
 )
 from jimpact.fits.uncertainty import (
-    FitMinimum,
     Profile,
     Uncertainty,
     check_level,
@@ -83,8 +80,8 @@ def fit(
             a scalar field; an (m,) field is free contact by contact. The stiffnesses of `LZB` with
             equal exponents: only their ratios matter, so that of contact 1 is fixed; a scalar
             stiffness is fixed by default, and naming it in `free` is an error.
-            The (m, m) matrix of a `RestitutionMatrix` stays admissible in all its scenes for every
-            approach velocity, at every evaluation and with every method; the start must be so.
+            The (m, m) matrix of a `RestitutionMatrix` is the best one that is admissible in all its
+            scenes for every approach velocity; the start must be so.
             Or a `FitProblem`, which holds the next three arguments, `bounds`, `priors`, `ties`.
         scene: the scene of all shots; ignored if each shot has its own scene.
         experiments: measured shots.
@@ -166,8 +163,9 @@ def fit(
         _check_derivatives(problem, found)
         if found.slopes is not None:
             points = problem.point(np.array([minimum.value for minimum in found.minima]))
-            (problem,), ends = settled([problem], points, search, slopes=[found.slopes])
-            counts = np.array([minimum.starts for minimum in found.minima])
+            problem = problem.with_errors_before(found.slopes)
+            (problem,), ends = settled([problem], points, search)
+            counts = np.array([minimum.count for minimum in found.minima])
             found = solution(problem, ends, counts, found.lost)
         robust = None
         if loss != "squares":
@@ -242,7 +240,7 @@ def as_fit(
     undetermined = numbers.pop("undetermined")
     slope = found.jacobian.reshape((*residual.shape, len(problem.names)))
     starts = [
-        FitMinimum(x.squares, x.value, x.starts, _standard_error(problem, found, x, errors))
+        replace(x, standard_error=_standard_error(problem, found, x, errors), jacobian=None)
         for x in found.minima
     ]
     return Fit(
@@ -285,12 +283,13 @@ def _errors(
 
 
 def _standard_error(
-    problem: FitProblem, found: Solution, minimum: Minimum, best: Uncertainty
+    problem: FitProblem, found: Solution, minimum: FitMinimum, best: Uncertainty
 ) -> np.ndarray | None:
     """Standard errors (P,) at a minimum that fits hardly worse than the best; else None."""
     if minimum is found.minima[0]:
         return best.standard_error
-    if not minimum.squares - found.minima[0].squares <= (HARDLY_WORSE * best.noise) ** 2:
+    more = minimum.sum_of_squares - found.minima[0].sum_of_squares
+    if not more <= (HARDLY_WORSE * best.noise) ** 2:
         return None
     return uncertainty(problem, minimum, best.noise).standard_error
 
@@ -341,7 +340,8 @@ def _robust(
     residual = problem.independent(problem.measured - found.predicted)
     from_priors, _ = problem.prior_errors(found.value)
     squares = float(np.sum(residual**2) + np.sum(from_priors**2))
-    minimum = Minimum(squares, found.value, 1, found.jacobian / factor.reshape(-1, 1))
+    slope = found.jacobian / factor.reshape(-1, 1)
+    minimum = FitMinimum(squares, found.value, 1, jacobian=slope)
     return problem, found._replace(minima=[minimum]), float(noise)
 
 
@@ -403,109 +403,61 @@ def fit_many(
         "profiles": False,
     }
 
-    @functools.cache
-    def problem(k: int) -> FitProblem:
-        """The problem of one data set."""
-        return of_shots(law, scene, many[k], *choice)
-
+    for k, data in enumerate(many):
+        check_kind(f"many[{k}]", data, Experiments)
+    problems = _problems(law, scene, many, choice)
+    each: list[Ends] = [None] * len(many)  # type: ignore[list-item]  # where its starts ended
     with progress_bar(progress) as show:
-        search = Search(max_steps=max_steps, show=show)
-        groups = [_solved(problem, many, each, starts, seed, search) for each in _alike(many)]
+        for members in _alike(many):
+            first, search = problems[members[0]], Search(max_steps=max_steps, show=show)
+            points = start_points(first, starts, np.random.default_rng(seed))
+            points = np.tile(points, (len(members), 1))
+            found, ends = settled([problems[k] for k in members], points, search)
+            for i, (k, problem) in enumerate(zip(members, found)):
+                each[k] = ends.rows(slice(i * starts, (i + 1) * starts))
+                problems[k] = problem
 
     @functools.cache
     def made(k: int) -> Fit[AnyLaw]:
         """The fit of one; shots that cannot be used are left out in a new one."""
-        members, ends, problems = next(group for group in groups if k in group[0])
-        i, each = members.index(k), len(ends.y) // len(members)
-        one = problem(k) if problems is None else problems[i]
-        found = solution(one, ends.rows(slice(i * each, (i + 1) * each)))
-        if unusable(one, found).any():
-            return fit(problem(k), progress=False, **options)
-        return as_fit(one, found, "levenberg-marquardt")
+        found = solution(problems[k], each[k])
+        if unusable(problems[k], found).any():
+            return fit(problems[k], progress=False, **options)
+        return as_fit(problems[k], found, "levenberg-marquardt")
 
-    order = np.argsort(np.concatenate([members for members, _, _ in groups]))
-    best = [x.rows(_best(x.squares, len(x.y) // len(members))) for members, x, _ in groups]
-
-    def in_order(values: Callable[[Ends], np.ndarray]) -> np.ndarray:
-        """Of the best ends of all sets."""
-        return np.concatenate([values(ends) for ends in best])[order]
-
-    value = problem(0).values_at(in_order(lambda x: x.y))
-    squares, converged = in_order(lambda x: x.squares), in_order(lambda x: x.converged)
-    return Fits(problem(0).names, value, squares, converged, made)
+    best = [ends.rows(np.nanargmin(ends.squares)) for ends in each]
+    y, squares, converged = (
+        np.array([getattr(ends, name) for ends in best]) for name in ("y", "squares", "converged")
+    )
+    return Fits(problems[0].names, problems[0].values_at(y), squares, converged, made)
 
 
-def _solved(
-    problem: Callable[[int], FitProblem],
-    many: Sequence[Experiments],
-    members: list[int],
-    starts: int,
-    seed: int,
-    search: Search,
-) -> tuple[list[int], Ends, list[FitProblem] | None]:
-    """A group of data sets, where their starts ended, and problems with errors of v-, if any."""
-    first, side_by_side = problem(members[0]), _side_by_side(problem, many, members)
-    points = start_points(first, starts, np.random.default_rng(seed))
-    all_starts = jax.tree.map(lambda x: np.repeat(x, starts, axis=0), side_by_side)
-    ends = minimize(all_starts, np.tile(points, (len(members), 1)), search)
-    if ends.slopes is None:
-        return members, ends, None
-    # errors of v- are passed on by each set's own law
-    best, own = ends.rows(_best(ends.squares, starts)), [problem(k) for k in members]
-    problems, ends = settled(own, best.y, search, slopes=best.slopes)
-    return members, ends, problems
-
-
-def _best(squares: np.ndarray, each: int) -> np.ndarray:
-    """Where the best of so many starts is, of each problem."""
-    return np.arange(0, len(squares), each) + np.nanargmin(squares.reshape(-1, each), axis=1)
+def _problems(
+    law: AnyLaw, scene: Scene | None, many: Sequence[Experiments], choice: tuple[Any, ...]
+) -> list[FitProblem]:
+    """The problem of each data set; those in a common scene differ in their shots only."""
+    first = of_shots(law, scene, many[0], *choice)
+    problems = [first]
+    for data in many[1:]:
+        same = data.scenes is None and first.scene is not None and data.units == many[0].units
+        exact = data.sigma_pre is None and first.mixing is None
+        # of a coarser law, where the noise allows it, each set decides by itself
+        coarse = any("computed with `rtol`" in note for note in first.notes)
+        if same and exact and not coarse:
+            problems.append(first.with_shots(data))
+        else:
+            problems.append(of_shots(law, scene, data, *choice))
+    return problems
 
 
 def _alike(many: Sequence[Experiments]) -> list[list[int]]:
     """Data sets that share one program: as many shots, filled up, all with or without errors."""
     groups: dict[Any, list[int]] = {}
     for k, data in enumerate(many):
-        check_kind(f"many[{k}]", data, Experiments)
         kind = (filled_count(len(data.shots)), data.pre.shape[1], data.sigma is None)
         shapes = None if data.scenes is None else data.largest_scene(None).contacts
         groups.setdefault((*kind, data.sigma_pre is None, shapes), []).append(k)
     return list(groups.values())
-
-
-def _side_by_side(
-    problem: Callable[[int], FitProblem], many: Sequence[Experiments], members: list[int]
-) -> Any:
-    """The problems of a group, one program's argument.
-
-    Sets of equal shapes in a common scene are stacked as arrays, whose problems nobody needs.
-    """
-    first, sets = problem(members[0]), [many[k] for k in members]
-    same = all(x.scenes is None and x.sigma_pre is None for x in sets)
-    same = same and len({(x.pre.shape, x.units) for x in sets}) == 1
-    # of a coarser law, where the noise allows it, each set decides by itself
-    if not same or any("computed with `rtol`" in note for note in first.notes):
-        return stacked([problem(k) for k in members])
-    one = first.program()
-    pre, post = (np.stack([np.asarray(getattr(x, name)) for x in sets]) for name in ("pre", "post"))
-    errors = np.broadcast_to(sets[0].natural_errors(first.scene), post.shape)
-    if sets[0].sigma is not None:
-        errors = np.stack([np.asarray(x.sigma) for x in sets])
-    here, dtype = ~np.isnan(post), one.low.dtype
-    weight = np.where(here, 1 / np.where(here, errors, 1.0), 0.0)
-    unit = np.maximum(np.abs(pre).max(axis=(1, 2)), np.nanmax(np.abs(post), axis=(1, 2)))
-    unit = np.where(unit > 0, unit, 1.0)
-    size = unit * np.sqrt(np.sum(weight**2, axis=(1, 2)))
-    rows = np.minimum(np.arange(len(one.measured)), post.shape[1] - 1)
-    weight = np.where(np.arange(len(rows))[:, None] < post.shape[1], weight[:, rows], 0.0)
-    every = repeated(first, len(sets))
-    before = np.array(every.observe.pre)
-    before[:, :, : post.shape[2]] = pre[:, rows]
-    arrays = {"measured": post[:, rows], "weight": weight, "size": size, "unit": unit}
-    return replace(
-        every,
-        observe=replace(every.observe, pre=before),
-        **{name: np.asarray(x, dtype) for name, x in arrays.items()},
-    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -580,20 +532,19 @@ def bootstrap(
     check_squares("fit", fit)
     if not np.isfinite(fit.noise):
         raise ValueError("Argument `fit` must have a known noise, but its noise is not finite.")
-    problem, shape = fit.problem, fit.predicted.shape
-    z = np.random.default_rng(seed).normal(size=(samples, *shape))
+    problem = fit.problem
+    z = np.random.default_rng(seed).normal(size=(samples, *fit.predicted.shape))
     errors = problem.errors_of(fit.noise * np.moveaxis(z, 0, -1))
-    many = repeated(problem, samples)
-    measured = np.full(many.measured.shape, np.nan, many.measured.dtype)
-    rows = (slice(None), slice(len(fit.predicted))) if shape else slice(None)
-    measured[rows] = fit.predicted + np.moveaxis(errors, -1, 0)
-    means = np.array(many.prior_mean)  # as if they had been measured anew
+    measured = fit.predicted + np.moveaxis(errors, -1, 0)
+    means = np.tile(problem.prior_mean, (samples, 1))  # as if they had been measured anew
     z = np.random.default_rng((seed, 1)).normal(size=(samples, len(problem.priors)))
     for prior, drawn in zip(problem.priors, z.T):
         i = prior.parameter
         means[:, i] = fit.value[i] + fit.noise * prior.std * drawn
-    many = replace(many, measured=measured, prior_mean=means)
-    return _refits(fit, [problem] * samples, many, progress)
+    dtype = problem.low.dtype
+    pairs = zip(measured.astype(dtype), means)
+    again = [replace(problem, measured=values, prior_mean=mean) for values, mean in pairs]
+    return _refits(fit, again, progress)
 
 
 def leave_one_out(fit: Fit, *, progress: float | None = None) -> Refits:
@@ -622,19 +573,15 @@ def leave_one_out(fit: Fit, *, progress: float | None = None) -> Refits:
     shots = 0 if fit.experiments is None else len(fit.predicted)
     if shots < 2:
         raise ValueError(f"Argument `fit` must be of at least 2 shots, but has {shots}.")
-    many = repeated(fit.problem, shots)
-    weight = np.array(many.weight)
-    weight[np.arange(shots), np.arange(shots)] = 0.0
     each = np.eye(shots)[:, :, None] * np.ones(fit.predicted.shape)
-    problems = [fit.problem.weighed(1 - shot) for shot in each]
-    refits = _refits(fit, problems, replace(many, weight=weight), progress)
+    refits = _refits(fit, [fit.problem.weighed(1 - shot) for shot in each], progress)
     return replace(refits, predicted=refits.predicted[np.arange(shots), np.arange(shots)])
 
 
-def _refits(fit: Fit, problems: list[FitProblem], many: Any, progress: float | None) -> Refits:
+def _refits(fit: Fit, problems: list[FitProblem], progress: float | None) -> Refits:
     """Minima of these problems next to a fit."""
     points = np.tile(fit.problem.point(fit.value), (len(problems), 1))
     with progress_bar(progress) as show:
-        _, ends = settled(problems, points, Search(show=show), many)
+        _, ends = settled(problems, points, Search(show=show))
     predicted = ends.predicted[:, : len(fit.predicted)] if fit.predicted.ndim else ends.predicted
     return Refits(fit.names, fit.problem.values_at(ends.y), predicted, ends.converged)

@@ -1,9 +1,8 @@
 """Fits of a restitution matrix: the region in which it is consistent for every approach.
 
 The set `{E : E >= 0, G^-1 (I + E) >= 0, G^-1 - E^T G^-1 E copositive}` is convex (each x >= 0
-asks `|E x| <= |x|` in the norm of G^-1), so points outside are drawn back on the ray to a
-point inside, and steps are cut by the conditions linearized at the current matrix. Only the
-energy bends; its second derivatives make the steps converge quadratically.
+asks `|E x| <= |x|` in the norm of G^-1). Residuals are linear in E, so a fit goes where it likes
+and then to the admissible matrix of the least sum of squares.
 """
 
 from itertools import product
@@ -14,14 +13,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.compiling import quick_jit
+from jimpact.compiling import full_precision, quick_jit
 from jimpact.contact import decoupled, delassus_matrix, kinetic_norm
-from jimpact.fits.solve import nearest
 from jimpact.law import Law
 from jimpact.laws.kinematic import RestitutionMatrix
 from jimpact.scene import Scene
 from jimpact.solvers.lcp import solve_lcp
 from jimpact.solvers.tridiagonal import as_matrix, scaled
+from jimpact.status import CODE
 
 # A point drawn back stops short of the boundary by this share of the way, times eps.
 _SHORT = 16.0
@@ -35,9 +34,15 @@ LARGEST = 6
 # Conditions may be broken by rounding, in units of the entries of G^-1.
 _ROUNDING = {"float64": 1e-9, "float32": 1e-4}
 _REDUNDANT = 100.0  # G with an eigenvalue below this multiple of m eps has no inverse
-_CUTS = 60  # rounds of cutting planes in the search of a start
+_CUTS = 60  # rounds of cutting planes, mostly 10 to 20
+_FLAT = 1e-9  # share of the longest derivative below which a condition does not depend on y
+_WORST = 2  # new cuts of each scene and contact
 _HALVINGS = 40  # from a start on the boundary towards the inside
 _FACES = ("E >= 0", "G^-1 (I + E) >= 0", "G^-1 - E^T G^-1 E copositive (energy)")
+
+
+# z, slacks at y and derivatives of the cuts that hold it, whether to go on, steps
+_Nearest = tuple[jax.Array, tuple[jax.Array, jax.Array], jax.Array, jax.Array]
 
 
 class AdmissibleMatrices(eqx.Module):
@@ -113,9 +118,41 @@ class AdmissibleMatrices(eqx.Module):
         inside = self.center + short * share * (y - self.center)
         return jnp.where(share < 1, inside, y)
 
-    def nearest(self, y: jax.Array) -> jax.Array:
-        """The admissible point nearest to y."""
-        return nearest(self, y)
+    @full_precision
+    def nearest(self, y: jax.Array, hessian: jax.Array, gradient: jax.Array) -> jax.Array:
+        """The admissible z of the least `g^T (z - y) + (z - y)^T H (z - y) / 2`.
+
+        By cutting planes: conditions on the energy are concave, so that they lie below all their
+        tangents. Those at the last z, the worst ones, join those that hold this z.
+        """
+        size, dtype = y.shape[0], y.dtype
+        largest = jnp.max(jnp.diagonal(hessian))
+        weight = _LEAST_DAMPING[str(dtype)] * jnp.where(largest > 0, largest, 1.0)
+        hessian = hessian + weight * jnp.eye(size, dtype=dtype)
+        rounding = _SHORT * jnp.finfo(dtype).eps * jnp.abs(self.inverse).max()
+        first = len(self.moving)
+        slack, rows = self.conditions(y)
+        linear = slack[:first], rows[:first]
+        worst = min(len(slack) - first, _WORST * self.closed.size)
+
+        def closer(state: _Nearest) -> _Nearest:
+            """One step."""
+            z, held, _, step = state
+            energy, tangent = (x[first:] for x in self.conditions(z))
+            which = jnp.argsort(energy)[:worst]
+            new = energy[which] + tangent[which] @ (y - z), tangent[which]
+            slacks, slopes = (jnp.concatenate(parts) for parts in zip(linear, held, new))
+            move, pressure, solved = _quadratic(hessian, gradient, slacks, slopes)
+            holding = first + jnp.argsort(-pressure[first:])[:size]
+            held = slacks[holding], slopes[holding]
+            inside = (energy.min() >= -rounding) & (step > 0)  # the best of a larger set
+            goes_on = solved & ~inside
+            return jnp.where(goes_on, y + move, z), held, goes_on, step + 1
+
+        none = jnp.ones(size, dtype), jnp.zeros((size, size), dtype)
+        start = (y, none, jnp.asarray(True), jnp.asarray(0))
+        end = jax.lax.while_loop(lambda s: s[2] & (s[3] < _CUTS), closer, start)
+        return self.retract(end[0])
 
     def share(self, y: jax.Array) -> jax.Array:
         """How much of the way from the center to y is admissible, at most 1."""
@@ -158,55 +195,21 @@ class AdmissibleMatrices(eqx.Module):
         rows, slack = jax.jacfwd(slacks, has_aux=True)(y)
         return slack, rows
 
-    def curvature(self, y: jax.Array, pressure: jax.Array) -> jax.Array:
-        """Minus the second derivatives (Q, Q) of the lost energies, weighted; semidefinite.
-
-        Of the approaches as they are: that they turn with E makes steps shorter, not wrong.
-        """
-        x = self.worst(y)
-        return -jax.hessian(lambda y: pressure @ self.lost_energy(y, x).reshape(-1))(y)
-
-    def free_gradient(self, y: jax.Array, gradient: jax.Array) -> jax.Array:
-        """Minus the step of steepest descent that the linearized conditions leave."""
-        slack, rows = self.conditions(y)
-        return -_quadratic(jnp.eye(y.shape[0], dtype=y.dtype), gradient, slack, rows)[0]
-
-    def step(
-        self, y: jax.Array, residual: jax.Array, jacobian: jax.Array, damping: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """Damped Gauss-Newton step under the linearized conditions, and what it promises.
-
-        A second solve knows how the conditions bend where the first step pressed on them.
-        """
-        gradient, hessian = jacobian.T @ residual, jacobian.T @ jacobian
-        largest = jnp.max(jnp.diagonal(hessian))
-        least = jnp.maximum(damping, _LEAST_DAMPING[str(y.dtype)])
-        weight = least * jnp.where(largest > 0, largest, 1.0)
-        hessian = hessian + weight * jnp.eye(y.shape[0], dtype=y.dtype)
-        slack, rows = self.conditions(y)
-        first = len(self.moving)
-
-        def solve(_: int, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-            """The step with the curvature of the last multipliers."""
-            bent = self.curvature(y, state[1][first:])
-            return _quadratic(hessian + bent, gradient, slack, rows)
-
-        start = (jnp.zeros_like(gradient), jnp.zeros_like(slack))
-        move, _ = jax.lax.fori_loop(0, 2, solve, start)
-        return move, -(gradient @ move) - 0.5 * jnp.sum((jacobian @ move) ** 2)
-
 
 def _quadratic(
     hessian: jax.Array, gradient: jax.Array, slack: jax.Array, rows: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """`min d^T H d / 2 + g^T d` with `slack + A d >= 0`: d and the multipliers, by the dual."""
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """`min d^T H d / 2 + g^T d` with `slack + A d >= 0`: d, multipliers, whether solved."""
+    length = jnp.sqrt(jnp.sum(rows**2, axis=1))
+    depends = length > _FLAT * length.max()  # others are rounding
+    scale = jnp.where(depends, 1 / jnp.where(depends, length, 1.0), 0.0)
+    rows, slack = rows * scale[:, None], jnp.where(depends, slack * scale, 1.0)
     factor = jax.scipy.linalg.cho_factor(hessian)
     free = -jax.scipy.linalg.cho_solve(factor, gradient)
     response = jax.scipy.linalg.cho_solve(factor, rows.T)
-    slack = jnp.maximum(slack, 0.0)
     # positive semidefinite; the multipliers need not be unique, the step is
-    pressure = solve_lcp(rows @ response, slack + rows @ free, symmetric=False).z
-    return free + response @ pressure, pressure
+    dual = solve_lcp(rows @ response, slack + rows @ free, symmetric=False)
+    return free + response @ dual.z, dual.z * scale, dual.code == CODE["ok"]
 
 
 def _square(inverse: jax.Array, x: jax.Array) -> jax.Array:

@@ -43,7 +43,7 @@ from jimpact.fits.parameters import (
     with_entries,
     with_parts_of_scene,
 )
-from jimpact.fits.solve import EXACT, BoxRegion, Evaluated
+from jimpact.fits.solve import EXACT, Evaluated
 from jimpact.impacts import impact
 from jimpact.law import AnyLaw, Law, forward_only
 from jimpact.scene import Scene, dense_mass, stackable
@@ -291,6 +291,29 @@ class FitProblem:
             )
         return problem
 
+    def with_shots(self, data: Experiments) -> "FitProblem":
+        """The same of other shots in the common scene.
+
+        Args:
+            data: shots of as many bodies, with exact v-.
+        """
+        observe: Any = self.observe
+        count, n = data.pre.shape
+        scenes = jax.tree.map(lambda x: np.repeat(x[:1], count, axis=0), observe.scenes)
+        before = np.repeat(observe.pre[:1], count, axis=0)
+        before[:, :n] = np.asarray(data.pre)
+        sigma, errors, unit = _errors_and_unit(data, self.scene)
+        arrays = _weighed_values(np.asarray(data.post), errors, unit)
+        here = int(data.measured.sum())
+        return replace(
+            self,
+            observe=replace(observe, scenes=scenes, pre=before),
+            **_in(self.low.dtype, arrays),
+            sigma=sigma,
+            values=here + len(self.priors) - data.lost_freedom,
+            experiments=data,
+        )
+
     def weighed(self, factor: np.ndarray) -> "FitProblem":
         """With factors on the independent errors.
 
@@ -426,7 +449,10 @@ class FitProblem:
         rest = len(self.low) - len(x)
         x = jnp.pad(x, (0, rest))
         y = jnp.where(self.log, jnp.log(jnp.where(self.log, x, 1.0)), x / self.scale)
-        return self._values(self.region.nearest(y))[: len(x) - rest]
+        inside = jnp.clip(y, self.low, self.high)
+        if self.matrix is not None:
+            inside = self.matrix.nearest(y, jnp.eye(len(y), dtype=y.dtype), jnp.zeros_like(y))
+        return self._values(inside)[: len(x) - rest]
 
     def log_density(self, x: Any) -> jax.Array:
         """Logarithm () of the probability density of the data at x (P,), normally distributed.
@@ -447,11 +473,6 @@ class FitProblem:
         return -0.5 * squares - float(np.sum(constant))
 
     # ------------------------------------------------------------------ for solvers
-
-    @property
-    def region(self) -> Any:
-        """Where y may lie."""
-        return BoxRegion(self.low, self.high) if self.matrix is None else self.matrix
 
     @full_precision
     def _values(self, y: jax.Array) -> jax.Array:
@@ -617,7 +638,7 @@ def of_shots(
     law = with_parts_of_scene(law, scene, not same, free)
     alike, extra = stackable(scenes[:1] if same else scenes)
     pre, post = np.asarray(experiments.pre), np.asarray(experiments.post)
-    unit = max(np.abs(pre).max(), np.nanmax(np.abs(post))) or 1.0
+    sigma, errors, unit = _errors_and_unit(experiments, scene)
     count, n = pre.shape
     masses = experiments.each(scene, dense_mass)
     energy = max(0.5 * v @ mass @ v for mass, v in zip(masses, pre)) or 1.0
@@ -626,8 +647,6 @@ def of_shots(
     )
     filled = np.pad(pre, ((0, 0), (0, extra)), constant_values=unit)
     observe = Shots(stacked, filled, n)  # type: ignore[arg-type]
-    sigma = None if experiments.sigma is None else np.asarray(experiments.sigma)
-    errors = experiments.natural_errors(scene) if sigma is None else sigma
     choice = (free, *known)
     problem = _build(law, observe, post, sigma, errors, unit, choice, energy, alike)
     problem = replace(
@@ -673,13 +692,8 @@ def _build(
             "values is known: priors and data weigh against each other by their errors."
         )
     arrays = _of_parameters(law, parameters, limits, priors, energy)
+    arrays |= _weighed_values(measured, errors, unit)
     here = ~np.isnan(measured)
-    arrays["weight"] = np.where(here, 1 / np.where(here, errors, 1.0), 0.0)
-    unit = unit or 1.0
-    arrays |= {
-        "unit": np.asarray(unit),
-        "size": np.asarray(unit * np.linalg.norm(arrays["weight"])),
-    }
     owner, ends = arrays["owner"], np.stack([arrays["low"], arrays["high"]])
     moves = np.where(owner[:, None] == np.arange(len(owner)), arrays["scale"], 0.0)
     origin = np.where(owner < 0, arrays["fixed"], 0.0)
@@ -690,7 +704,7 @@ def _build(
         law=_in(dtype, law),
         observe=_in(dtype, observe),
         matrix=matrix,
-        **_in(dtype, arrays | {"measured": measured}),
+        **_in(dtype, arrays),
         fields=parameters.fields,
         ties=ties,
         parameters=parameters,
@@ -700,6 +714,24 @@ def _build(
         priors=priors,
         notes=tuple(notes),
     )
+
+
+def _weighed_values(measured: np.ndarray, errors: np.ndarray, unit: float) -> dict[str, Any]:
+    """What was measured, its weights, and the sizes that follow."""
+    here, unit = ~np.isnan(measured), unit or 1.0
+    weight = np.where(here, 1 / np.where(here, errors, 1.0), 0.0)
+    size = np.asarray(unit * np.linalg.norm(weight))
+    return {"measured": measured, "weight": weight, "unit": np.asarray(unit), "size": size}
+
+
+def _errors_and_unit(
+    data: Experiments, scene: Scene | None
+) -> tuple[np.ndarray | None, np.ndarray, float]:
+    """Stated errors, those to weigh by, and the largest velocity."""
+    sigma = None if data.sigma is None else np.asarray(data.sigma)
+    errors = data.natural_errors(scene) if sigma is None else sigma
+    unit = max(np.abs(np.asarray(data.pre)).max(), np.nanmax(np.abs(np.asarray(data.post))))
+    return sigma, errors, float(unit)
 
 
 def _of_parameters(

@@ -1,6 +1,5 @@
 """A fit as text (verdict, parameters, quality, minima, warnings, shots), as data, and in a file."""
 
-import csv
 import dataclasses
 import json
 import platform
@@ -9,7 +8,7 @@ from collections.abc import Sequence
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,15 +16,12 @@ import numpy as np
 
 import jimpact
 from jimpact._checks import needed
-from jimpact.files.records import as_data, with_error
+from jimpact.files.records import Column, Table, Tabular, as_data, with_error
 from jimpact.fits.parameters import AnyLaw, value_of
 from jimpact.fits.problem import FitProblem
 from jimpact.fits.uncertainty import FitResult, pieces_in_words
 from jimpact.law import StaticNumber, StaticNumbers
 from jimpact.status import STATUS
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure  # which takes long to import
 
 _ROUNDING = 1e-7  # share of the largest velocity that is printed as 0: impacts are good to 1e-8
 _VELOCITIES_SHOWN = 24  # in the table of shots
@@ -49,20 +45,6 @@ def joined_words(parts: Sequence[str]) -> str:
     ('a', 'a, b and c')
     """
     return " and ".join([", ".join(parts[:-1]), parts[-1]]) if len(parts) > 1 else "".join(parts)
-
-
-def report_blocks(fit: "Fit") -> dict[str, list[str]]:
-    """The lines of the report, block by block."""
-    return {
-        "verdict": [fit.verdict],
-        "headline": [_headline(fit)],
-        "parameters": _parameters(fit),
-        "quality": _quality(fit),
-        "undetermined": _section("What the data do not determine", fit.identifiability),
-        "minima": _minima(fit),
-        "warnings": _section("Warnings", fit.warnings),
-        "shots": _shots(fit),
-    }
 
 
 def _values_in_words(fit: FitResult) -> str:
@@ -169,26 +151,6 @@ def _headline(fit: FitResult) -> str:
     )
 
 
-def parameter_rows(fit: FitResult) -> list[list[str]]:
-    """Name, value, standard error, 95 % interval, remark of every parameter."""
-    rows, seen = [], fit.determined
-    for i, pieces in enumerate(fit.intervals()):
-        error = fit.standard_error[i]
-        if np.isinf(error):
-            error_text = "undetermined"
-        else:
-            error_text = "unknown" if np.isnan(error) else f"{error:.3g}"
-        interval = "-"
-        if np.isfinite(error) or fit.profiles:
-            interval = pieces_in_words(pieces, (fit.bounds[0][i], fit.bounds[1][i]))
-        note = "at its bound" if fit.at_bound[i] else ""
-        note = ", ".join(filter(None, [note if seen[i] else UNSEEN, _prior(fit, i)]))
-        rows.append(
-            [fit.names[i], marked(fit.value[i], seen[i], ".6g"), error_text, interval, note]
-        )
-    return rows
-
-
 def _prior(fit: FitResult, i: int) -> str:
     """The prior of a parameter, and whether it alone determines the value; '' without one."""
     for prior in fit.problem.priors:
@@ -212,11 +174,20 @@ def named_values(fit: FitResult, values: np.ndarray) -> str:
 def _parameters(fit: FitResult) -> list[str]:
     """The table of parameters."""
     width = max(9, *(len(name) for name in fit.names))
-    head = ["parameter", "value", "std. error", "95 % interval" + " (profile)" * bool(fit.profiles)]
-    lines = [
-        f"{name:{width}s} {value:>12s} {error:>12s}   {'   '.join(rest)}".rstrip()
-        for name, value, error, *rest in [head, *parameter_rows(fit)]
-    ]
+    heads = f"{'parameter':{width}s} {'value':>12s} {'std. error':>12s}   95 % interval"
+    lines = [heads + " (profile)" * bool(fit.profiles)]
+    seen = fit.determined
+    for i, (name, pieces) in enumerate(zip(fit.names, fit.intervals())):
+        error = fit.standard_error[i]
+        known = "unknown" if np.isnan(error) else f"{error:.3g}"
+        known = "undetermined" if np.isinf(error) else known
+        interval = "-"
+        if np.isfinite(error) or fit.profiles:
+            interval = pieces_in_words(pieces, (fit.bounds[0][i], fit.bounds[1][i]))
+        note = "at its bound" if fit.at_bound[i] else ""
+        note = ", ".join(filter(None, [note if seen[i] else UNSEEN, _prior(fit, i)]))
+        value = marked(fit.value[i], seen[i], ".6g")
+        lines.append(f"{name:{width}s} {value:>12s} {known:>12s}   {interval}   {note}".rstrip())
     lines += [f"{name} = {with_error(*pair)} is tied" for name, pair in fit.tied.items()]
     freedom = fit.degrees_of_freedom
     if fit.problem.sigma is None and 0 < freedom <= FEW_DEGREES:
@@ -320,22 +291,6 @@ def _minima(fit: FitResult) -> list[str]:
     return [*lines, unfinished] if unfinished else lines
 
 
-def shot_rows(fit: FitResult, most: int | None = None) -> list[list[str]]:
-    """Label, number, before, measured, fitted, residual, unit, status; of at most `most` shots."""
-    data = fit.experiments
-    assert data is not None
-    before, measured = np.asarray(data.pre, float), np.asarray(data.post, float)
-    rows, fitted = [], _without_rounding(fit.predicted)
-    for k, i in np.ndindex(*before[:most].shape):
-        value = "-" if np.isnan(measured[k, i]) else f"{measured[k, i]:.6g}"
-        residual = "-" if np.isnan(fit.residual[k, i]) else f"{fit.residual[k, i]:.3g}"
-        label = data.shots[k] if i == 0 else ""
-        status = STATUS[int(fit.status[k])].name if fit.status[k] and i == 0 else ""
-        velocities = [f"{before[k, i]:.6g}", value, f"{fitted[k, i]:.6g}", residual]
-        rows.append([label, str(i + 1), *velocities, data.units[i], status])
-    return rows
-
-
 def _without_rounding(values: np.ndarray) -> np.ndarray:
     """0 for what is rounding against the largest of the values (K, n) of its shot."""
     largest = np.abs(values).max(axis=1, keepdims=True)
@@ -350,24 +305,38 @@ def _shots(fit: FitResult) -> list[str]:
     mixed = len(set(data.units)) > 1
     common_unit = "" if mixed else f" [{data.units[0]}]"
     head = f"{'shot':>8s} {'body':>5s} {'before':>12s} {'measured':>12s} {'fitted':>12s}"
-    lines = [head + common_unit]
-    shots, bodies = data.pre.shape
-    rows_shown = max(1, _VELOCITIES_SHOWN // bodies)
-    for label, body, before, value, fitted, _, unit, status in shot_rows(fit, rows_shown):
-        row = f"{label:>8s} {body:>5s} {before:>12s} {value:>12s} {fitted:>12s}"
-        lines.append(f"{row}{' ' + unit if mixed else ''}{'   ' + status if status else ''}")
-    if shots > rows_shown:
-        lines.append(f"     ... and {shots - rows_shown} more shots")
+    lines, (shots, bodies) = [head + common_unit], data.pre.shape
+    before, measured = np.asarray(data.pre, float), np.asarray(data.post, float)
+    fitted, shown = _without_rounding(fit.predicted), max(1, _VELOCITIES_SHOWN // bodies)
+    for k, i in np.ndindex(*before[:shown].shape):
+        label = data.shots[k] if i == 0 else ""
+        status = STATUS[int(fit.status[k])].name if fit.status[k] and i == 0 else ""
+        value = "-" if np.isnan(measured[k, i]) else f"{measured[k, i]:.6g}"
+        row = f"{label:>8s} {i + 1:>5d} {before[k, i]:>12.6g} {value:>12s} {fitted[k, i]:>12.6g}"
+        unit = f" {data.units[i]}" if mixed else ""
+        lines.append(f"{row}{unit}   {status}".rstrip())
+    if shots > shown:
+        lines.append(f"     ... and {shots - shown} more shots")
     return lines
 
 
 # ---------------------------------------------------------------------------- the fit
 
 
-class Fit(FitResult[AnyLaw]):
+class Fit(FitResult[AnyLaw], Tabular):
     """See `FitResult`."""
 
     __doc__ = FitResult.__doc__
+    picture = "fit"
+
+    @property
+    def table(self) -> Table:
+        """A row a parameter: value, standard error, ends of its 95 % interval, whether seen."""
+        names = ("value", "standard_error", "low_95", "high_95", "at_bound", "determined")
+        ends = self.confidence_interval().T
+        columns = (self.value, self.standard_error, *ends, self.at_bound, self.determined)
+        rows = list(zip(self.names, *(column.tolist() for column in columns)))
+        return Table([Column(name) for name in ("parameter", *names)], rows)
 
     def to_dict(self) -> dict[str, Any]:
         """Everything a JSON file can hold; numbers that are not finite become None."""
@@ -467,33 +436,9 @@ class Fit(FitResult[AnyLaw]):
         path.write_text(json.dumps(record, allow_nan=False, indent=1) + "\n", encoding="utf-8")
         return path
 
-    def plot(self) -> "Figure":
-        """The picture of `ji.plot.fit`: measured and fitted velocities, and the residuals."""
-        from jimpact import plot
-
-        return plot.fit(self)
-
-    def to_csv(self, path: str | Path) -> Path:
-        """Write a row a parameter: value, standard error, ends of its 95 % interval, whether seen.
-
-        Args:
-            path: the file; an existing file is replaced.
-
-        Returns:
-            The path.
-        """
-        columns, path = parameter_columns(self), Path(path)
-        with path.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
-            writer.writerow(["parameter", *columns])
-            for name, *row in zip(self.names, *(x.tolist() for x in columns.values())):
-                writer.writerow([name, *row])
-        return path
-
     def to_pandas(self) -> Any:
         """The parameters as a `pandas.DataFrame`, which must be installed."""
-        columns, index = parameter_columns(self), list(self.names)
-        return needed("pandas", "pip install pandas").DataFrame(columns, index=index)
+        return super().to_pandas().set_index("parameter")
 
     def to_xarray(self) -> Any:
         """Parameters, covariance, every shot as an `xarray.Dataset`, which must be installed."""
@@ -524,7 +469,18 @@ class Fit(FitResult[AnyLaw]):
         return needed("xarray", "pip install xarray").Dataset(arrays, coordinates, about)
 
     def __str__(self) -> str:
-        return "\n\n".join("\n".join(block) for block in report_blocks(self).values() if block)
+        """The report: the verdict, then a block each."""
+        blocks = [
+            [self.verdict],
+            [_headline(self)],
+            _parameters(self),
+            _quality(self),
+            _section("What the data do not determine", self.identifiability),
+            _minima(self),
+            _section("Warnings", self.warnings),
+            _shots(self),
+        ]
+        return "\n\n".join("\n".join(block) for block in blocks if block)
 
 
 def load_fit(path: str | Path) -> Fit[Any]:
@@ -550,22 +506,6 @@ def load_fit(path: str | Path) -> Fit[Any]:
     True
     """
     return Fit(**_read_fit(Path(path)))
-
-
-# ---------------------------------------------------------------------------- as data
-
-
-def parameter_columns(fit: FitResult) -> dict[str, np.ndarray]:
-    """Value, standard error, ends of the 95 % interval, at its bound, seen (P,)."""
-    interval = fit.confidence_interval()
-    return {
-        "value": fit.value,
-        "standard_error": fit.standard_error,
-        "low_95": interval[:, 0],
-        "high_95": interval[:, 1],
-        "at_bound": fit.at_bound,
-        "determined": fit.determined,
-    }
 
 
 # ---------------------------------------------------------------------------- in a file

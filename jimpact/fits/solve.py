@@ -1,6 +1,6 @@
-"""Nonlinear least squares in a region, from many starts or of many problems at once, and minima.
+"""Nonlinear least squares in a box, from many starts or of many problems at once, and minima.
 
-Minimize `|r(y)|^2 / 2` for y in a `Region`, mostly the `BoxRegion` `low <= y <= high`, by
+Minimize `|r(y)|^2 / 2` for `low <= y <= high`, by
 Levenberg-Marquardt or by gradient descent with optax. Steps are cut at the box, and a variable on a
 bound whose gradient points outward is left out of the step, so minima on a bound are found exactly.
 One pass evaluates residual and Jacobian together, so that an impact is compiled once.
@@ -8,7 +8,7 @@ One pass evaluates residual and Jacobian together, so that an impact is compiled
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.compiling import full_precision, quick_jit
+from jimpact.compiling import quick_jit
 from jimpact.progress import Show
 
 if TYPE_CHECKING:
@@ -92,8 +92,8 @@ NEAR_RCOND = 1e-10  # directions that the data do not determine are not searched
 SETTLED, SETTLING = 1e-5, 10  # change (natural scales) and rounds, where errors of v- are passed on
 
 
-class BoxRegion(eqx.Module):
-    """The region `low <= y <= high`."""
+class Box(eqx.Module):
+    """The box `low <= y <= high`."""
 
     low: jax.Array
     high: jax.Array
@@ -101,10 +101,6 @@ class BoxRegion(eqx.Module):
     def retract(self, y: jax.Array) -> jax.Array:
         """The nearest point of the box."""
         return jnp.clip(y, self.low, self.high)
-
-    def nearest(self, y: jax.Array) -> jax.Array:
-        """The same."""
-        return self.retract(y)
 
     def free_gradient(self, y: jax.Array, gradient: jax.Array) -> jax.Array:
         """The gradient without variables that sit on a bound and are pushed against it."""
@@ -204,7 +200,7 @@ def begin(y: Any, first: Evaluated, search: "Search") -> SolverState:
 
 def advance(
     evaluate: Evaluate,
-    region: Any,
+    box: Box,
     method: Method,
     max_steps: int,
     state: SolverState,
@@ -213,7 +209,7 @@ def advance(
 ) -> SolverState:
     """Up to `passes` passes more, fewer if done or at the step limit; `stop`: see `FINE`."""
     last = jnp.minimum(state.steps + passes, max_steps)
-    state = eqx.tree_at(lambda s: s.trial, state, region.retract(state.trial))
+    state = eqx.tree_at(lambda s: s.trial, state, box.retract(state.trial))
 
     def one(state: SolverState) -> SolverState:
         """One pass."""
@@ -228,15 +224,15 @@ def advance(
         floor = jnp.asarray(_LEAST[dtype], y.dtype)
         if method == "levenberg-marquardt":
             memory = state.memory.after(state.cost - cost)
-            step = partial(region.step, y, r, jac)
+            step = partial(box.step, y, r, jac)
             moves, gains = jax.vmap(step)(jnp.stack([floor, memory.value]))  # compiled once
-            gain, trial = gains[0], region.retract(y + moves[1])
+            gain, trial = gains[0], box.retract(y + moves[1])
             change = jac @ (trial - y)
             memory = memory._replace(promised=-(r @ change) - 0.5 * jnp.sum(change**2))
             stuck = memory.value > _STUCK
         else:
-            gain = region.step(y, r, jac, floor)[1]
-            gradient = region.free_gradient(state.trial, jacobian.T @ residual)
+            gain = box.step(y, r, jac, floor)[1]
+            gradient = box.free_gradient(state.trial, jacobian.T @ residual)
             # optax itself mixes integers and floats: it needs the standard promotion
             with jax.numpy_dtype_promotion("standard"):
                 move, memory = _transformation(method, max_steps).update(
@@ -245,9 +241,9 @@ def advance(
                     state.trial,
                     value=cost,
                     grad=gradient,
-                    value_fn=lambda y: _cost(evaluate, region.retract(y)),
+                    value_fn=lambda y: _cost(evaluate, box.retract(y)),
                 )
-            trial = region.retract(state.trial + move)
+            trial = box.retract(state.trial + move)
             stuck = jnp.asarray(False)
         finest = stop * least / residual.shape[0] + STOP_EXACT[dtype]
         rounding = ROUNDING[dtype] * least / residual.shape[0] + ROUNDING_EXACT[dtype]
@@ -257,23 +253,6 @@ def advance(
         )
 
     return jax.lax.while_loop(lambda s: ~s.done & (s.steps < last), one, state)
-
-
-@full_precision
-def nearest(region: Any, y: jax.Array) -> jax.Array:
-    """The point of a region nearest to y: least squares of the distance."""
-    identity, method = jnp.eye(y.shape[0], dtype=y.dtype), "levenberg-marquardt"
-    steps = DEFAULT_STEPS[method]
-
-    def distance(at: jax.Array) -> tuple[jax.Array, jax.Array, tuple[()]]:
-        """From y, and its Jacobian."""
-        return at - y, identity, ()
-
-    infinite, no = jnp.asarray(jnp.inf, y.dtype), jnp.asarray(False)
-    memory = Damping(*jnp.asarray([DAMPING, _FIRST_GROWTH, jnp.inf], y.dtype))
-    first = (region.retract(y), y, identity, (), infinite, infinite, y, memory)
-    state = SolverState(*first, jnp.asarray(0), no, no)
-    return advance(distance, region, method, steps, state, steps, FINE[str(y.dtype)]).y
 
 
 def _cost(evaluate: Evaluate, y: jax.Array) -> jax.Array:
@@ -350,15 +329,67 @@ def minimize(
 
     As many as `problems.lanes(S)` are solved side by side; those that are done make room for
     others. `stop`: see `FINE`, which it is at least. `rivals`: all are starts of one problem, and
-    those that creep or will not become the best are given up. Progress counts `what`.
+    those that creep or will not become the best are given up. Progress counts `what`. A matrix that
+    must be admissible is sought without that, and then the best admissible one.
     """
-    dtype, count = problems.low.dtype, len(points)
+    dtype, matrix = problems.low.dtype, problems.matrix
+    problems = replace(problems, matrix=None)
+    rule = (max(FINE[str(dtype)], stop), rivals, what)
+    states, converged = _descended(problems, points.astype(dtype), search, *rule)
+    y, steps, stuck = np.asarray(states.y), states.steps, states.stuck
+    once, moved = search._replace(max_steps=1), np.full(len(y), matrix is not None)
+    for _ in range(SETTLING):
+        if not moved.any():
+            break
+        inside = _in_lanes(best_inside, problems.lanes(len(y)), matrix, states)
+        states, _ = _descended(problems, inside, once, *rule)
+        moved, y = np.abs(inside - y).max(axis=1) > SETTLED, inside
+    size = np.asarray(problems.size, float)
+    return Ends(
+        y=np.asarray(states.y, float),
+        squares=2 * np.asarray(states.cost, float) * size**2,
+        jacobian=np.asarray(states.jacobian, float) * size[:, None, None],
+        predicted=np.asarray(states.aux[0], float),
+        status=states.aux[1],
+        slopes=states.aux[2] if len(states.aux) > 2 else None,
+        converged=converged & ~moved,
+        stuck=np.asarray(stuck),
+        steps=np.asarray(steps),
+        exact=EXACT[str(dtype)] * size**2,
+    )
+
+
+def _in_lanes(compiled: Callable[..., Any], lanes: int, *trees: Any) -> np.ndarray:
+    """Rows of the results of a compiled function of so many rows."""
+    count = len(jax.tree.leaves(trees[-1])[0])
+    some = [np.arange(first, first + lanes) for first in range(0, count, lanes)]
+    rows = [np.minimum(each, count - 1) for each in some]
+    return np.concatenate([compiled(*(_rows(x, each) for x in trees)) for each in rows])[:count]
+
+
+@quick_jit
+def best_inside(matrix: Any, states: SolverState) -> jax.Array:
+    """The admissible points where the linearized residuals are least."""
+
+    def one(matrix: Any, state: SolverState) -> jax.Array:
+        """Of one problem."""
+        jacobian = state.jacobian
+        hessian, gradient = jacobian.T @ jacobian, jacobian.T @ state.residual
+        return matrix.nearest(state.y, hessian, gradient)
+
+    return jax.vmap(one)(matrix, states)
+
+
+def _descended(
+    problems: Any, points: np.ndarray, search: Search, stop: float, rivals: bool, what: str
+) -> tuple[SolverState, np.ndarray]:
+    """States where searches from y (S, Q) ended, and which have converged; see `minimize`."""
+    dtype, count = points.dtype, len(points)
     limit: Any = search.max_steps
     descends = search.method != "levenberg-marquardt"
     if not descends:
         limit = np.asarray(limit)  # one program serves all limits
-    rule: Any = (search.method, limit, np.asarray(max(FINE[str(dtype)], stop), dtype))
-    points = points.astype(dtype)
+    rule: Any = (search.method, limit, np.asarray(stop, dtype))
     states = begin(points, problems.blank(points), search)
     converged = np.zeros(count, bool)
     active, lanes = np.arange(count), problems.lanes(count)
@@ -381,19 +412,7 @@ def minimize(
         search.show(f"fit: {done} of {count} {what} done, step {steps}", done, count)
         if time.monotonic() > search.deadline:
             break
-    size = np.asarray(problems.size, float)
-    return Ends(
-        y=np.asarray(states.y, float),
-        squares=2 * np.asarray(states.cost, float) * size**2,
-        jacobian=np.asarray(states.jacobian, float) * size[:, None, None],
-        predicted=np.asarray(states.aux[0], float),
-        status=states.aux[1],
-        slopes=states.aux[2] if len(states.aux) > 2 else None,
-        converged=converged,
-        stuck=np.asarray(states.stuck),
-        steps=np.asarray(states.steps),
-        exact=EXACT[str(dtype)] * size**2,
-    )
+    return states, converged
 
 
 def _converged(states: SolverState, enough: float) -> np.ndarray:
@@ -411,8 +430,8 @@ def advance_all(
 
     def one(problem: Any, state: SolverState) -> SolverState:
         """One problem."""
-        region, evaluate = problem.region, problem.evaluate
-        return advance(evaluate, region, method, max_steps, state, PASSES, stop)
+        box = Box(problem.low, problem.high)
+        return advance(problem.evaluate, box, method, max_steps, state, PASSES, stop)
 
     return eqx.filter_vmap(one)(problems, states)
 
@@ -432,10 +451,11 @@ def repeated(problem: "FitProblem", count: int) -> Any:
     return jax.tree.map(each, problem.program())
 
 
-def stacked(problems: "list[FitProblem]") -> Any:
-    """The problems side by side."""
+def stacked(problems: "list[FitProblem]", each: int = 1) -> Any:
+    """The problems side by side, each so many times."""
     filled = [problem.program() for problem in problems]
-    return jax.tree.map(lambda *x: np.stack([np.asarray(leaf) for leaf in x]), *filled)
+    many = jax.tree.map(lambda *x: np.stack([np.asarray(leaf) for leaf in x]), *filled)
+    return many if each == 1 else jax.tree.map(lambda x: np.repeat(x, each, axis=0), many)
 
 
 def minimize_with(
@@ -451,19 +471,25 @@ def minimize_with(
 # ---------------------------------------------------------------------------- distinct minima
 
 
-class Minimum(NamedTuple):
-    """A point that starts ended in."""
+@dataclass(frozen=True, eq=False)
+class FitMinimum:
+    """A minimum that starts ended in: sum of squared (weighted) residuals, values, how many.
 
-    squares: float  # |r|^2, in units of sigma
-    value: np.ndarray  # of the parameters (P,)
-    starts: int  # how many
-    jacobian: np.ndarray  # (R, P), of the scaled parameters
+    `standard_error` is None where it fits so much worse that it does not matter. A search knows the
+    `jacobian` (R, P) of the scaled parameters.
+    """
+
+    sum_of_squares: float
+    value: np.ndarray
+    count: int
+    standard_error: np.ndarray | None = None
+    jacobian: np.ndarray | None = None
 
 
 class Solution(NamedTuple):
     """All distinct minima, best first, and what the law of the best predicts."""
 
-    minima: list[Minimum]
+    minima: list[FitMinimum]
     predicted: np.ndarray  # shaped like what was measured
     status: np.ndarray
     slopes: np.ndarray | None  # `dv+/dv-` of the shots, where errors of v- are passed on
@@ -481,7 +507,9 @@ class Solution(NamedTuple):
     @property
     def jacobian(self) -> np.ndarray:
         """(R, P), of the scaled parameters at the best."""
-        return self.minima[0].jacobian
+        jacobian = self.minima[0].jacobian
+        assert jacobian is not None
+        return jacobian
 
 
 def solution(
@@ -495,11 +523,11 @@ def solution(
     # starts that did not converge have no minimum to report, unless they are the best there is
     kept = [[i for i in group if ends.converged[i] or i == best] for group in groups]
     minima = [
-        Minimum(
+        FitMinimum(
             float(ends.squares[group[0]]),
             problem.values_at(ends.y[group[0]]),
             int(counts[group].sum()),
-            ends.jacobian[group[0]][: measured.size, :count],  # without what filled up
+            jacobian=ends.jacobian[group[0]][: measured.size, :count],  # without what filled up
         )
         for group in kept
         if group
@@ -515,7 +543,7 @@ def solution(
         stuck=bool(ends.stuck[best]),
         at_bound=(y[best] <= low) | (y[best] >= high),
         steps=int(np.max(ends.steps)),
-        lost=lost + int(counts.sum()) - sum(minimum.starts for minimum in minima),
+        lost=lost + int(counts.sum()) - sum(minimum.count for minimum in minima),
     )
 
 
@@ -644,43 +672,23 @@ def _same_values(ends: Ends, first: int, apart: np.ndarray) -> bool:
 
 
 def settled(
-    problems: "list[FitProblem]",
-    points: np.ndarray,
-    search: Search,
-    many: Any = None,
-    slopes: Any = None,
+    problems: "list[FitProblem]", points: np.ndarray, search: Search
 ) -> "tuple[list[FitProblem], Ends]":
-    """Minima next to points (S, Q), equally many of each problem, its best one first.
+    """Minima next to points (S, Q), equally many of each problem.
 
-    Errors of v- are passed on by the law of the best minimum, until both agree. `many`: other
-    problems (S, ...) than these, whose weights alone are taken. `slopes`: `dv+/dv-` of each problem
-    at its best point; None: the problems pass errors on by them already.
+    Errors of v- are passed on by the law of each problem's best minimum, until both agree.
     """
-    each = len(points) // len(problems)
-    if many is None:
-        many = stacked([problem for problem in problems for _ in range(each)])
-
-    def weighted() -> Any:
-        """The many problems with errors of v- passed on by the slopes."""
-        filled = [p.program() for p in problems for _ in range(each)]
-        names = ("weight", "size", "mixing")
-        return replace(many, **{n: np.stack([getattr(p, n) for p in filled]) for n in names})
-
+    each, start = len(points) // len(problems), points
     for _ in range(SETTLING):
-        if slopes is not None:
-            problems = [p.with_errors_before(slope) for p, slope in zip(problems, slopes)]
-            many = weighted()
-        ends = minimize(many, points, search)
-        moved = np.abs(ends.y - points).max(axis=1) > SETTLED
+        ends = minimize(stacked(problems, each), start, search)
         if ends.slopes is None:
             return problems, ends
-        points, best = ends.y, np.nanargmin(ends.squares.reshape(-1, each), axis=1)
-        last = ends.slopes[np.arange(0, len(points), each) + best]
-        if not moved.any():
-            if slopes is not None:  # residuals and Jacobians with the weights of the final law
-                problems = [p.with_errors_before(slope) for p, slope in zip(problems, last)]
-                many = weighted()
-                ends = minimize(many, points, search._replace(max_steps=1))
-            return problems, ends
-        slopes = last
+        best = np.nanargmin(ends.squares.reshape(-1, each), axis=1)
+        slopes = ends.slopes[np.arange(0, len(points), each) + best]
+        problems = [p.with_errors_before(slope) for p, slope in zip(problems, slopes)]
+        moved = np.abs(ends.y - start).max(axis=1) > SETTLED
+        start = ends.y
+        if not moved.any():  # residuals and Jacobians with the weights of the final law
+            last = search._replace(max_steps=1)
+            return problems, minimize(stacked(problems, each), start, last)
     return problems, ends._replace(converged=ends.converged & ~moved)

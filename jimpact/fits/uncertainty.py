@@ -20,7 +20,7 @@ from jimpact.fits.parameters import (
     value_of,
 )
 from jimpact.fits.problem import FitProblem
-from jimpact.fits.solve import Minimum, Search, minimize_with, repeated, solution
+from jimpact.fits.solve import FitMinimum, Search, minimize_with, repeated, solution
 from jimpact.law import Law, parameters_of
 from jimpact.scene import Scene
 
@@ -57,7 +57,9 @@ class Uncertainty(NamedTuple):
     undetermined: tuple[str, ...]
 
 
-def uncertainty(problem: FitProblem, minimum: Minimum, noise: float | None = None) -> Uncertainty:
+def uncertainty(
+    problem: FitProblem, minimum: FitMinimum, noise: float | None = None
+) -> Uncertainty:
     """Linearized errors at a minimum.
 
     Equation: `C = s^2 (J^T J)^-1` on the determined subspace, `s^2 = |r|^2 / (values - rank)`, or
@@ -72,6 +74,7 @@ def uncertainty(problem: FitProblem, minimum: Minimum, noise: float | None = Non
     """
     scale = problem.steps_at(minimum.value)
     _, of_priors = problem.prior_errors(minimum.value)
+    assert minimum.jacobian is not None
     jacobian = np.vstack([minimum.jacobian, of_priors * scale])
     _, singular, directions = np.linalg.svd(jacobian, full_matrices=True)
     singular = np.pad(singular, (0, len(scale) - len(singular)))
@@ -82,7 +85,7 @@ def uncertainty(problem: FitProblem, minimum: Minimum, noise: float | None = Non
     elif noise is None and (freedom < 1 or reproduced(problem, minimum)):
         noise = np.nan
     elif noise is None:
-        noise = float(np.sqrt(minimum.squares / freedom))
+        noise = float(np.sqrt(minimum.sum_of_squares / freedom))
     determined = directions[:rank] / singular[:rank, None]
     covariance = noise**2 * (determined.T @ determined) * np.outer(scale, scale)
     null = directions[rank:]
@@ -97,9 +100,9 @@ def uncertainty(problem: FitProblem, minimum: Minimum, noise: float | None = Non
     return Uncertainty(rank, singular, freedom, noise, covariance, correlation, error, words)
 
 
-def reproduced(problem: FitProblem, minimum: Minimum) -> bool:
+def reproduced(problem: FitProblem, minimum: FitMinimum) -> bool:
     """Whether all measured values are reproduced to the last digit."""
-    return minimum.squares <= problem.exact_squares
+    return minimum.sum_of_squares <= problem.exact_squares
 
 
 def _reduced(null: np.ndarray) -> np.ndarray:
@@ -211,19 +214,6 @@ def _piece(low: float, high: float, domain: tuple[float, float]) -> str:
 
 
 # ---------------------------------------------------------------------------- the result
-
-
-@dataclass(frozen=True, eq=False)
-class FitMinimum:
-    """A minimum that starts ended in: sum of squared (weighted) residuals, values, how many.
-
-    `standard_error` is None where it fits so much worse that it does not matter.
-    """
-
-    sum_of_squares: float
-    value: np.ndarray
-    count: int
-    standard_error: np.ndarray | None = None
 
 
 class FittedParameter(NamedTuple):
