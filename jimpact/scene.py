@@ -24,6 +24,7 @@ import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values, in_numbers, is_traced
 from jimpact.compiling import full_precision
+from jimpact.solvers.dense import solve_definite, solve_mass_matrix
 from jimpact.solvers.sparse import Neighbours, Sparse
 
 # Asymmetry of M, relative to its largest entry, that rounding causes in float32. Ten times more
@@ -438,16 +439,12 @@ def dense_mass(scene: Scene) -> np.ndarray:
 @full_precision
 def solve_mass(scene: Scene, right: jax.Array) -> jax.Array:
     """`M^-1 right`, with the reactions of bilateral constraints if the scene has any."""
-    if scene.mass.ndim == 1:
-        shape = (-1,) + (1,) * (right.ndim - 1)
-        free = right / scene.mass.reshape(shape)
-    else:
-        free = jax.scipy.linalg.solve(scene.mass, right, assume_a="pos")
+    free = solve_mass_matrix(scene.mass, right)
     if scene.constraints is None:
         return free
     h = scene.constraints
     m_inv_h = solve_mass(without_constraints(scene), h)
-    return free - m_inv_h @ jnp.linalg.solve(h.T @ m_inv_h, h.T @ free)
+    return free - m_inv_h @ solve_definite(h.T @ m_inv_h, h.T @ free)
 
 
 @full_precision

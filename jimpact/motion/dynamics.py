@@ -8,6 +8,7 @@ import jax.numpy as jnp
 
 from jimpact.compiling import full_precision
 from jimpact.motion.system import System
+from jimpact.solvers.dense import solve_mass_matrix
 
 _ROUNDINGS = 4  # that a share may be off by in single precision; more would hide slow approach
 
@@ -153,18 +154,11 @@ def mass_at(system: System, q: jax.Array) -> jax.Array:
     return system.body.mass_matrix(q)
 
 
-def solve_mass(mass: jax.Array, right: jax.Array) -> jax.Array:
-    """`M^-1 right`, (n,) or (n, k)."""
-    if mass.ndim == 1:
-        return right / (mass if right.ndim == 1 else mass[:, None])
-    return jax.scipy.linalg.solve(mass, right, assume_a="pos")
-
-
 def definite(mass: jax.Array) -> jax.Array:
     """Whether M is positive definite."""
     if mass.ndim == 1:
         return jnp.all(mass > 0)
-    return jnp.all(jnp.isfinite(jnp.linalg.cholesky(jax.lax.stop_gradient(mass))))
+    return jnp.all(jnp.isfinite(solve_mass_matrix(jax.lax.stop_gradient(mass), mass[:, 0])))
 
 
 @full_precision
@@ -193,4 +187,4 @@ def free_acceleration(
     total = force
     if system.potential is not None:
         total = total - system.body.pulled(q, jax.grad(system.potential)(q))
-    return solve_mass(mass, total + system.body.inertial_force(q, v))
+    return solve_mass_matrix(mass, total + system.body.inertial_force(q, v))

@@ -19,11 +19,16 @@ from jimpact.motion.dynamics import (
     kinematics_with_tangents,
     mass_at,
     not_rounding,
-    solve_mass,
     user_force,
 )
 from jimpact.motion.system import System
-from jimpact.solvers.dense import determinants, load_shares, regularized, solve_definite
+from jimpact.solvers.dense import (
+    determinants,
+    load_shares,
+    regularized,
+    solve_definite,
+    solve_mass_matrix,
+)
 from jimpact.solvers.friction import solve
 from jimpact.solvers.lcp import solve_lcp
 from jimpact.status import CODE
@@ -155,7 +160,7 @@ def contacts_at(
     if tangent is not None:
         directions = jnp.concatenate([directions, tangent.gradient], axis=1)
         drift = jnp.concatenate([drift, tangent.drift])
-    moved = solve_mass(mass, directions)
+    moved = solve_mass_matrix(mass, directions)
     free = free_acceleration(system, q, v, user_force(system, q, v, t), mass)
     return Contacts(
         normal, tangent, directions, moved, directions.T @ moved, free, directions.T @ free + drift

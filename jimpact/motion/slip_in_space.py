@@ -37,6 +37,7 @@ from jimpact.motion.persistent_contact import (
     forces,
     length,
 )
+from jimpact.solvers.dense import solve_by_pivots
 
 # Least part of the slip at the beginning of a step that lies ahead within it. Ten times more, and
 # what a landing leaves of slip that turns is ten times as large.
@@ -166,7 +167,8 @@ def _first_directions(
         size = jax.lax.stop_gradient(jnp.max(jnp.abs(jacobian)))
         size = jnp.where(size > 0, size, 1.0)
         away = jnp.where(starts, -_RIDGE, 1.0)
-        change = jnp.linalg.solve(jacobian / size + eye * away[:, None], -turn / size)
+        equations = jacobian / size + eye * away[:, None]
+        change = solve_by_pivots(equations, -turn[:, None] / size)[0][:, 0]
         return angle + jnp.clip(change, -_MOST_TURN, _MOST_TURN)
 
     return unit(jax.lax.fori_loop(0, _NEWTON, newton, angle))

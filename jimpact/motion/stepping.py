@@ -40,7 +40,6 @@ from jimpact.motion.dynamics import (
     normals_at,
     recorded_gaps,
     seen_from_base,
-    solve_mass,
     user_force,
 )
 from jimpact.motion.flow import State, out_of_range, status_at_start
@@ -49,6 +48,7 @@ from jimpact.motion.system import System
 from jimpact.motion.tables import Course
 from jimpact.motion.transitions import FAILS, scene_at
 from jimpact.scene import Scene
+from jimpact.solvers.dense import solve_mass_matrix
 from jimpact.solvers.many_contacts import Many, solve_many
 from jimpact.status import CODE
 
@@ -412,7 +412,7 @@ def _contacts(
     least = jnp.minimum(gap, jnp.atleast_1d(system.body.gap_function(end)))
     closed = ~(least > closed_below)  # NaN does not pass for open
     directions = jnp.where(closed[:, None], directions, 0.0)
-    moved = solve_mass(mass, directions.reshape(n, -1)).reshape(directions.shape)
+    moved = solve_mass_matrix(mass, directions.reshape(n, -1)).reshape(directions.shape)
     matrix = jnp.tensordot(directions, moved, axes=([0], [0]))
     return _AllContacts(gap, normals, closed, directions, moved, matrix)
 

@@ -1,8 +1,8 @@
 """Small dense systems: elimination, singular matrices, and how redundant contacts share forces.
 
 LAYOUT   Flows keep the batch in the last axis: matrices (n, n, B), vectors (n, B). The functions
-`solve_definite`, `singular_values`, `eigenvectors`, `null_projector`, `solve_symmetric` and
-`determinants` have no batch.
+`solve_definite`, `solve_mass_matrix`, `solve_by_pivots`, `singular_values`, `eigenvectors`,
+`null_projector`, `solve_symmetric` and `determinants` have no batch.
 
 LAPACK   Its kernels go through a batch one by one, and independent ones can wait for each other for
 ever on few cores (jaxlib 0.10). So they factor single matrices; in batches, loops of our own do, up
@@ -23,6 +23,7 @@ depend on the choice; it decides which contact reaches its friction cone first:
 
 import functools
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -90,12 +91,20 @@ def solve(matrix: jax.Array, right: jax.Array) -> jax.Array:
         return right / matrix
     if n == 2:  # written out: the loop takes 8 % of a batch of impacts with planar friction
         return _solve_two(matrix, right)
+    return _eliminated(matrix, right, lambda pivot: 1 / pivot)
+
+
+def _eliminated(
+    matrix: jax.Array, right: jax.Array, inverted: Callable[[jax.Array], jax.Array]
+) -> jax.Array:
+    """`solve` by the loop, with the inverses of the pivots."""
+    n = len(matrix)
     number = jnp.arange(n).reshape(n, 1, *[1] * (matrix.ndim - 2))
 
     def eliminate(k: jax.Array, rows: jax.Array) -> jax.Array:
         """Rows after the pivot k."""
         row = jax.lax.dynamic_index_in_dim(rows, k, 0)
-        row = row * (1 / jax.lax.dynamic_index_in_dim(row, k, 1))
+        row = row * inverted(jax.lax.dynamic_index_in_dim(row, k, 1))
         factor = jax.lax.dynamic_index_in_dim(rows, k, 1)
         return jnp.where(number == k, row, rows - factor * row)
 
@@ -134,6 +143,20 @@ def solve_definite(g: jax.Array, right: jax.Array) -> jax.Array:
     if len(g) > _BY_LOOP:
         return jnp.linalg.solve(g, right)
     return solve(g[..., None], right.reshape(len(g), -1, 1)).reshape(right.shape)
+
+
+def solve_mass_matrix(mass: jax.Array, right: jax.Array) -> jax.Array:
+    """`M^-1 right` of M (n,), its diagonal, or (n, n); right sides (n,) or (n, c).
+
+    NaN where M (n, n) is not positive definite.
+    """
+    if mass.ndim == 1:
+        return right / mass.reshape(-1, *[1] * (right.ndim - 1))
+    if len(mass) > _BY_LOOP:
+        return jax.scipy.linalg.solve(mass, right, assume_a="pos")
+    columns = right.reshape(len(mass), -1, 1)
+    solved = _eliminated(mass[..., None], columns, lambda p: 1 / jnp.where(p > 0, p, jnp.nan))
+    return solved.reshape(right.shape)
 
 
 def block_inverse(matrix: jax.Array) -> jax.Array:
@@ -199,10 +222,38 @@ def _cofactors(a: jax.Array) -> jax.Array:
     return jnp.stack(sides, axis=1)
 
 
+def solve_by_pivots(matrix: jax.Array, right: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """`matrix^-1 right` (n, c) of any regular matrix (n, n), and its determinant ().
+
+    Gauss-Jordan with partial pivoting, in a loop over the pivots.
+    """
+    n = len(matrix)
+    number = jnp.arange(n)[:, None]
+
+    def eliminate(k: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        """Rows after the pivot k, and the product of the pivots."""
+        rows, determinant = state
+        column = jax.lax.dynamic_index_in_dim(rows, k, 1)
+        largest = jnp.argmax(jnp.where(number >= k, jnp.abs(column), -1.0), axis=0)[0]
+        own, chosen = (jax.lax.dynamic_index_in_dim(rows, i, 0) for i in (k, largest))
+        pivot = jax.lax.dynamic_index_in_dim(chosen, k, 1)
+        rows = jnp.where(number == largest, own, rows)
+        row = chosen / jnp.where(pivot != 0, pivot, 1.0)
+        factor = jax.lax.dynamic_index_in_dim(rows, k, 1)
+        signed = jnp.where(largest == k, pivot, -pivot)[0, 0]
+        return jnp.where(number == k, row, rows - factor * row), determinant * signed
+
+    one = jnp.ones((), matrix.dtype)
+    start = jnp.concatenate([matrix, right], axis=1), one
+    rows, determinant = fori_loop(0, n, eliminate, start)
+    return rows[:, n:], determinant
+
+
 def determinants(k: jax.Array) -> jax.Array:
     """Of (N, n, n); those of four rows by minors of two rows, which is quicker to compile."""
     if k.shape[-1] != 4:
-        return jnp.linalg.det(k)
+        none = jnp.zeros((k.shape[-1], 0), k.dtype)
+        return jax.vmap(lambda matrix: solve_by_pivots(matrix, none)[1])(k)
     left, right = np.triu_indices(4, 1)
     upper = k[..., 0, left] * k[..., 1, right] - k[..., 0, right] * k[..., 1, left]
     lower = k[..., 2, left] * k[..., 3, right] - k[..., 2, right] * k[..., 3, left]

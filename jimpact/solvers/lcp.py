@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from jimpact.compiling import full_precision
 from jimpact.loops import while_loop
-from jimpact.solvers.dense import null_projector, solve_definite
+from jimpact.solvers.dense import null_projector, solve_by_pivots, solve_definite
 from jimpact.solvers.many_contacts import solve_many
 from jimpact.solvers.sparse import Sparse, conjugate_gradients
 from jimpact.solvers.tridiagonal import Symmetric, as_matrix, is_regular
@@ -143,8 +143,10 @@ def _solve_on(
     """Solve `A_SS z_S = right_S`, z = 0 elsewhere."""
     both = support[:, None] & support[None, :]
     masked = jnp.where(both, a, jnp.eye(a.shape[0], dtype=a.dtype))
-    solve = solve_definite if symmetric else jnp.linalg.solve
-    return solve(masked, jnp.where(support, right, 0.0))
+    right = jnp.where(support, right, 0.0)
+    if symmetric:
+        return solve_definite(masked, right)
+    return solve_by_pivots(masked, right[:, None])[0][:, 0]
 
 
 def _least_norm(a: jax.Array, b: jax.Array, z: jax.Array) -> tuple[jax.Array, jax.Array]:
