@@ -145,6 +145,7 @@ def solve_definite(g: jax.Array, right: jax.Array) -> jax.Array:
     return solve(g[..., None], right.reshape(len(g), -1, 1)).reshape(right.shape)
 
 
+@jax.jit
 def solve_mass_matrix(mass: jax.Array, right: jax.Array) -> jax.Array:
     """`M^-1 right` of M (n,), its diagonal, or (n, n); right sides (n,) or (n, c).
 
@@ -222,6 +223,7 @@ def _cofactors(a: jax.Array) -> jax.Array:
     return jnp.stack(sides, axis=1)
 
 
+@jax.jit
 def solve_by_pivots(matrix: jax.Array, right: jax.Array) -> tuple[jax.Array, jax.Array]:
     """`matrix^-1 right` (n, c) of any regular matrix (n, n), and its determinant ().
 
