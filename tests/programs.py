@@ -85,7 +85,7 @@ LAWS = {
 }
 SEQUENTIAL = ("binary", "binary-earliest", "binary-left")
 SLOW_SLOPES = (  # LZB's, Binary's and Moreau's code again
-    *("compliant", "binary-earliest", "binary-left", "routh"),
+    *("compliant", "binary-earliest", "binary-left", "routh", "velocity"),
 )
 
 

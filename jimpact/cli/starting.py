@@ -105,7 +105,7 @@ def begin(kind: str, folder: Path, like: str | None = None) -> list[Path]:
     if existing:
         other = folder.with_name(f"{folder.name}_2")
         raise ValueError(
-            f"{', '.join(existing)} must not exist yet; name another folder: "
+            f"These files exist already: {', '.join(existing)}. Name another folder: "
             f"`jimpact new {kind} {other}`."
         )
     folder.mkdir(parents=True, exist_ok=True)

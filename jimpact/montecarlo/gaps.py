@@ -90,7 +90,7 @@ def gap_scale(scene: Scene, law: Law, velocity: Any) -> GapScale:
     >>> print(ji.theory.gap_scale(scene, ji.Compliant(ji.Hertz(1.2e10)), [1.0, 0.0, 0.0]))
     gap 1 is closed (delta_c = 31.4 µm)
     gap 2 is 3.18 delta_c (delta_c = 31.4 µm): wide, its collisions come one after another
-    delta_c: how deep a contact is indented at the largest approach speed of the scene
+    delta_c: indentation of a contact at the largest approach speed of the scene
     """
     v = as_velocity(scene, velocity)
     check_values("velocity", v)

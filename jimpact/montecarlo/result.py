@@ -21,7 +21,7 @@ from jimpact.montecarlo.statistics import (
 )
 from jimpact.scene import Scene
 
-DELTA_C = "delta_c: how deep a contact is indented at the largest approach speed of the scene"
+DELTA_C = "delta_c: indentation of a contact at the largest approach speed of the scene"
 REPORTED = (0.05, 0.5, 0.95)  # quantiles in the report
 _OUTCOMES = {row.name: row for row in OUTCOMES}
 

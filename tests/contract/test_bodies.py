@@ -139,6 +139,7 @@ def heap():
     return body, q, jax.tree.map(np.asarray, jax.jit(jax.vmap(look))(q))
 
 
+@pytest.mark.slow
 def test_gaps_are_distances(heap):
     body, q, (found, _, _, valid) = heap
     kinds = [k for k, (_, second) in enumerate(body.between) if second >= 0]
@@ -294,6 +295,7 @@ def corner_on_side(bodies, below, above, path):
     return np.array(rows), np.append(0, np.cumsum(np.diff(corners) != 0))
 
 
+@pytest.mark.slow
 def test_contacts_of_odd_polygons_keep_their_places(polygons):
     """Rolling through full turns: contacts change places only where the next corner touches."""
     bodies, seen = polygons
@@ -408,6 +410,7 @@ def test_turning_is_exact(brick):
     np.testing.assert_allclose(weight, [0, 0, 20, 0, 0, 0], atol=1e-15)
 
 
+@pytest.mark.slow
 def test_a_quaternion_must_have_length_one():
     ball = ji.Sphere(0.1)
     with pytest.raises(ValueError, match=r"`quaternion` must have length 1, but has length 2"):

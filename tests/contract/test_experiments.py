@@ -265,6 +265,7 @@ def test_readings_in_steps_have_the_error_of_their_rounding():
     np.testing.assert_allclose((rounded - rounded.round(1)).std(), 0.1 / np.sqrt(12), rtol=0.02)
 
 
+@pytest.mark.slow
 def test_the_cube():
     data = ji.data.cube_impacts()
     assert read_study("tossed_cube.toml").experiments.shots == data.only(data.contacts == 1).shots

@@ -319,7 +319,7 @@ def test_stated_errors_that_are_too_small_are_noticed():
 @pytest.mark.parametrize(
     "method",
     [
-        "lbfgs",
+        pytest.param("lbfgs", marks=pytest.mark.slow),
         pytest.param("adam", marks=pytest.mark.slow),
         pytest.param("sgd", marks=pytest.mark.slow),
         pytest.param(optax.rmsprop(0.01), marks=pytest.mark.slow),
@@ -704,6 +704,7 @@ def test_a_free_exponent():
     np.testing.assert_allclose(found.value, [0.9, 1.3], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_contact_that_is_never_loaded_is_named():
     pre = [[1.0, 0.0, 5.0], [2.0, 0.0, 5.0], [1.0, -1.0, 5.0], [3.0, 0.0, 9.0]]  # 3 runs away
     data = ji.Experiments(pre, simulated(ji.LZB([0.9, 0.5], [1.0, 1.0]), BALLS, pre))
@@ -884,6 +885,7 @@ class Cubic(Law):
         return ji.Impulses(jnp.linalg.solve(as_matrix(contact.delassus), change))
 
 
+@pytest.mark.slow
 def test_a_lower_minimum_of_one_profile_is_that_of_all():
     """The fit ends at the side maximum of the cubic; the true `other` is 0.05."""
     pre = SHOTS * [[1.0, 0.0]]

@@ -98,7 +98,7 @@ DISK = (
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(x, marks=[] if x in ("lzb", "moreau") else [pytest.mark.slow]) for x in LAWS],
+    [pytest.param(x, marks=[] if x == "moreau" else [pytest.mark.slow]) for x in LAWS],
 )
 def test_disk_in_closed_form(name):
     """It sticks for `-(1 + e_t) v_t / W_tt`; friction gives at most mu p of that."""
@@ -582,7 +582,7 @@ SLOPES = {"planar": (1, 4), "planar, both ways": (1, 4), "space": (2, 6)}
 @pytest.mark.parametrize(
     ("name", "kind"),
     [
-        ("moreau", "planar, both ways"),
+        pytest.param("moreau", "planar, both ways", marks=pytest.mark.slow),
         pytest.param("newton", "planar", marks=pytest.mark.slow),
         pytest.param("binary", "planar", marks=pytest.mark.slow),
         pytest.param("lzb", "planar, both ways", marks=pytest.mark.release),

@@ -124,6 +124,7 @@ def lifted(scenes):
     ]
 
 
+@pytest.mark.slow
 def test_planar_outcomes_are_those_of_sweeps(scenes):
     given, expected = scenes
     after, statuses = impacts(given)

@@ -49,6 +49,7 @@ def pressed(name):
     return ji.Scene(body.mass, body.normals, body.tangents), jnp.asarray(body.velocity)
 
 
+@pytest.mark.slow
 def test_agrees_with_the_method_that_stops_at_every_event():
     """Two and four corners, e = 0 included: right to the tolerance asked for."""
     for (name, e), expected in EVENT_BY_EVENT.items():

@@ -156,6 +156,7 @@ def test_a_status_of_a_motion_is_a_row_of_the_one_table():
     assert "max_events" in str(motion).splitlines()[0]
 
 
+@pytest.mark.slow
 def test_discs_keep_their_angular_momentum():
     """Levers are those of the points in contact, also where discs overlap."""
     discs = piles.discs([1.0, 1.5], [0.1, 0.1])

@@ -289,7 +289,7 @@ def test_the_linearization_beside_monte_carlo():
     np.testing.assert_array_equal(narrow.gap_scale, scale)
     ratio = narrow.gap_mean[0] / scale[0]
     assert f"in units of delta_c = {scale[0]:.3g} m: {ratio:.3g} and " in str(narrow)
-    assert "delta_c: how deep a contact is indented" in str(narrow)
+    assert "delta_c: indentation of a contact" in str(narrow)
     assert narrow.to_dict()["gap_scale"] == scale.tolist()
     wide = sampled(gaps=Uniform([0.0, 0.0], [3.0, 3.0]), **sampler)
     across = gap_sensitivity(law, BALLS, BEFORE, wide.gap_mean, wide)

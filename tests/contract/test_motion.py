@@ -414,6 +414,7 @@ def mean_error(motion_of, exact, step):
     return np.mean([np.abs(np.asarray(motion.q) - exact).max() for motion in found])
 
 
+@pytest.mark.slow
 def test_time_stepping_is_of_first_order():
     exact = np.array([[height(0.8, t)] for t in np.linspace(0, 2, 11)])
     coarse, fine = (mean_error(lambda h: stepped(0.8, h), exact, h) for h in (2e-3, 2e-4))

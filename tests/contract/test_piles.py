@@ -60,6 +60,7 @@ def test_pairs_that_meet_within_a_step_may_be_two_cells_apart():
     assert sorted(np.asarray(pairs.bodies)[np.asarray(pairs.closed)].tolist()) == expected
 
 
+@pytest.mark.slow
 def test_directions_are_velocities_of_the_points_that_touch(packing):
     """gamma and slip of both bodies at the middle of their gap or overlap, walls at rest."""
     spheres, q, _ = packing

@@ -235,6 +235,7 @@ def test_rocking_ratios_are_a_conversion():
 # ----------------------------------------------------------------------------- gradients
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", [CHAIN, CONSTRAINED], ids=["chain", "constrained"])
 def test_derivatives_in_the_entries(scene):
     """v+ is affine in E: dv+/dE_ij = -M^-1 N diag(1/|grad f|) G^-1 e_i qn_j."""

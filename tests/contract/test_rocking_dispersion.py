@@ -48,6 +48,7 @@ def test_without_friction_as_the_check_values(found, a, eta, e, expected):
     np.testing.assert_allclose(found[eta].gap_velocity[i, 0, k], expected, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("exponent", "stiffness"), [(1.0, None), (1.5, None), (1.5, (1.0, 4.0))])
 def test_the_tip_depends_on_friction_alone(found, exponent, stiffness):
     out = solved(BOTH, E, exponent, stiffness) if stiffness else found[exponent]

@@ -76,7 +76,13 @@ def test_kinetic_angles_of_tied_bodies():
 
 
 @pytest.mark.parametrize(
-    "name", ["newton", pytest.param("poisson", marks=pytest.mark.slow), "binary", "lzb"]
+    "name",
+    [
+        "newton",
+        pytest.param("poisson", marks=pytest.mark.slow),
+        "binary",
+        pytest.param("lzb", marks=pytest.mark.slow),
+    ],
 )
 def test_welded_bodies_are_one(name):
     """Four balls, the middle two welded together: three balls, in every kind of law."""

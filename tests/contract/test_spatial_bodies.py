@@ -84,6 +84,7 @@ def test_gaps_of_spheres_boxes_planes_and_walls(places):
     assert np.abs(normals).max() > 0.99
 
 
+@pytest.mark.slow
 def test_slip_is_that_of_the_points_in_contact(places):
     """H_t^T v for random velocities: what the bodies' points at the contact do, across n."""
     bodies, (contacts, _, tangents, _) = places

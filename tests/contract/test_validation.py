@@ -16,6 +16,7 @@ TEXT = page.PAGE.read_text(encoding="utf-8") if page.PAGE.exists() else ""
 MARKS = {
     "solitary_wave": pytest.mark.release,
     "vibrating_plate": pytest.mark.release,
+    "bouncing_ball": pytest.mark.slow,
     "schroedinger": pytest.mark.slow,
     "spring_and_dashpot": pytest.mark.slow,
 }
