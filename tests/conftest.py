@@ -181,16 +181,32 @@ def pytest_terminal_summary(terminalreporter, config):
         write(f"FAILED: {len(operations)} programs are more than the budget of {BUDGET}")
 
 
+def stem_of(nodeid):
+    return Path(nodeid.split("::")[0]).stem.removesuffix("_inside")
+
+
 def group(nodeid):
-    """Tests that share programs run in one process: those of a law, else those of a file."""
-    stem = Path(nodeid.split("::")[0]).stem.removesuffix("_inside")
+    """Tests that share programs run in one process: those of a law, else those of a file.
+
+    Documents share few: each may run anywhere, or one process would run all of them.
+    """
+    stem = stem_of(nodeid)
+    if stem == "test_documents":
+        return nodeid
     laws = sorted(programs_of_laws.LAWS, key=len, reverse=True) if stem in BY_LAW else ()
     return next((law for law in laws if law in nodeid), OF_LAW.get(stem, stem))
 
 
 def pytest_collection_modifyitems(items):
     """The dearest groups first, so that no process is left alone with one at the end."""
-    items.sort(key=lambda item: [*DEAR, group(item.nodeid)].index(group(item.nodeid)))
+    ranks = {name: rank for rank, name in enumerate(DEAR)}
+
+    def rank(item):
+        """Place of its group, or of its file, among the dearest."""
+        own = ranks.get(group(item.nodeid))
+        return ranks.get(stem_of(item.nodeid), len(DEAR)) if own is None else own
+
+    items.sort(key=rank)
 
 
 @pytest.hookimpl(optionalhook=True)

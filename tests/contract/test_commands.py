@@ -405,7 +405,7 @@ def test_a_new_study(tmp_path, capsys, kind):
             assert hasattr(ji, name)
     code, said = call(capsys, "new", kind)
     assert code == 2
-    assert "must not exist" in said.err
+    assert "exist already" in said.err
 
 
 def test_a_new_study_like_another(tmp_path, capsys):

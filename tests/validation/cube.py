@@ -244,7 +244,7 @@ HEAD = """# Laws on a tossed cube
 Written by `python tests/validation/cube.py`. The data are measured: {one} impacts on one corner and {two} on two,
 of {tosses} tosses of an acrylic cube (`ji.data.cube_impacts(nearly_clean=True)`). They are all impacts on one corner that
 are clean, and all on two (the second one up to 2 mm above the first) that are clean or nearly so: the flights
-before and after meet within .5 mm.
+before and after meet within 0.5 mm.
 
 Every law is fitted to one and two corners together, by the same cost. The error of an impact is
 `|v+ predicted - v+ measured| / |v-|` in the energy norm. *Held out*: the tosses are divided into {folds} groups;
@@ -255,7 +255,7 @@ all.
 LZB, Newton and Moreau take a second corner up to 2 mm above the first as closed; `Compliant` (`Bistiffness`,
 exponent 1.5, stiffness in N/m^1.5) and MuJoCo begin with the measured gap, which decides in each impact whether the
 corners strike together. "e falls": by a power of the speed of approach (`VelocityDependent`). MuJoCo: soft spheres
-at the corners, one `solref` (s, 1) and mu, steps of .05 ms, fitted by finite differences, the best of four starts.
+at the corners, one `solref` (s, 1) and mu, steps of 0.05 ms, fitted by finite differences, the best of four starts.
 Seven numbers: `solimp` (least and largest impedance, width in m) and torsional friction (m), too.
 
 """
@@ -278,7 +278,7 @@ impacts, held out, that lie in the region predicted for v+ [%].
 
 Two corners have heavy tails: 16 of 105 impacts are off by more than 10 %. The four that are off by more than half of
 |v-| have the second corner 1.4 to 1.8 mm above the first, where it may strike or not. No force beyond the corners is
-needed: the best impulses at the corners leave .4 % of |v-| on two and .6 % on one (medians), so torsional and rolling
+needed: the best impulses at the corners leave 0.4 % of |v-| on two and 0.6 % on one (medians), so torsional and rolling
 friction have little to explain, and on two corners what is left does not go with the error (correlation -.1).
 
 """
