@@ -14,7 +14,7 @@ from jimpact.fits.checks import MEDIAN, fit_warnings, stretch, unusable, weighte
 from jimpact.fits.data import Experiments
 from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw, plain_law
 from jimpact.fits.problem import FitProblem, filled_count, of_shots
-from jimpact.fits.profiles import needs_profiles, profile, walked_profiles
+from jimpact.fits.profiles import needs_profiles, profile, profiles_of
 from jimpact.fits.report import Fit
 from jimpact.fits.solve import (
     DEFAULT_STEPS,
@@ -175,7 +175,7 @@ def fit(
         return _with_profiles(result, profile(result, progress=progress))
     if profiles is None and needs_profiles(result):
         every = range(len(result.names))
-        return _with_profiles(result, walked_profiles(result, every, QUICK_LEVEL, 0, progress))
+        return _with_profiles(result, profiles_of(result, every, QUICK_LEVEL, 0, progress))
     return result
 
 

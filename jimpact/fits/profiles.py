@@ -228,10 +228,10 @@ def profile(
     wanted = fit.names if names is None else (names,) if isinstance(names, str) else tuple(names)
     for name in wanted:
         check_choice("names", name, fit.names)
-    return walked_profiles(fit, [fit.names.index(name) for name in wanted], level, points, progress)
+    return profiles_of(fit, [fit.names.index(name) for name in wanted], level, points, progress)
 
 
-def walked_profiles(
+def profiles_of(
     fit: FitResult, which: Sequence[int], level: float, points: int, progress: float | None
 ) -> tuple[Profile, ...]:
     """Profiles of these parameters; points: starts of a search for more minima."""

@@ -158,7 +158,8 @@ def definite(mass: jax.Array) -> jax.Array:
     """Whether M is positive definite."""
     if mass.ndim == 1:
         return jnp.all(mass > 0)
-    return jnp.all(jnp.isfinite(solve_mass_matrix(jax.lax.stop_gradient(mass), mass[:, 0])))
+    mass = jax.lax.stop_gradient(mass)
+    return jnp.all(jnp.isfinite(solve_mass_matrix(mass, mass[:, 0])))
 
 
 @full_precision

@@ -138,6 +138,7 @@ def inverse(matrix: jax.Array) -> jax.Array:
     return fori_loop(0, n, eliminate, matrix)
 
 
+@jax.jit
 def solve_definite(g: jax.Array, right: jax.Array) -> jax.Array:
     """`G x = right` for a symmetric positive definite G (m, m); right sides (m,) or (m, c)."""
     if len(g) > _BY_LOOP:
@@ -225,9 +226,10 @@ def _cofactors(a: jax.Array) -> jax.Array:
 
 @jax.jit
 def solve_by_pivots(matrix: jax.Array, right: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """`matrix^-1 right` (n, c) of any regular matrix (n, n), and its determinant ().
+    """`matrix^-1 right` (n, c) of any matrix (n, n), and its determinant ().
 
-    Gauss-Jordan with partial pivoting, in a loop over the pivots.
+    Gauss-Jordan with partial pivoting, in a loop over the pivots. Where the matrix is singular the
+    determinant is 0 and the solution not finite.
     """
     n = len(matrix)
     number = jnp.arange(n)[:, None]
@@ -240,10 +242,11 @@ def solve_by_pivots(matrix: jax.Array, right: jax.Array) -> tuple[jax.Array, jax
         own, chosen = (jax.lax.dynamic_index_in_dim(rows, i, 0) for i in (k, largest))
         pivot = jax.lax.dynamic_index_in_dim(chosen, k, 1)
         rows = jnp.where(number == largest, own, rows)
-        row = chosen / jnp.where(pivot != 0, pivot, 1.0)
+        row = chosen / pivot
         factor = jax.lax.dynamic_index_in_dim(rows, k, 1)
         signed = jnp.where(largest == k, pivot, -pivot)[0, 0]
-        return jnp.where(number == k, row, rows - factor * row), determinant * signed
+        determinant = jnp.where(determinant == 0, 0.0, determinant * signed)  # NaN after 0
+        return jnp.where(number == k, row, rows - factor * row), determinant
 
     one = jnp.ones((), matrix.dtype)
     start = jnp.concatenate([matrix, right], axis=1), one

@@ -35,7 +35,7 @@ def row(
     with stage(f"{name} {precision} {batch}"):
         first, _, out = timed(run)
         wall = [timed(run)[0] for _ in range(REPEATS)]
-    found = {
+    entries = {
         "name": name,
         "precision": precision,
         "batch": batch,
@@ -45,10 +45,10 @@ def row(
     }
     if isinstance(out, tuple):
         failures = jnp.asarray([status.failure for status in ji.STATUS])
-        found["failed"] = int(failures[out[1]].sum())
+        entries["failed"] = int(failures[out[1]].sum())
         if exact is not None:
-            found["error"] = float(np.abs(np.asarray(out[0][:CHECKED], float) - exact).max())
-    return found
+            entries["error"] = float(np.abs(np.asarray(out[0][:CHECKED], float) - exact).max())
+    return entries
 
 
 def sizes(largest: int, *wanted: int) -> list[int]:

@@ -66,6 +66,18 @@ def test_constraints_reduce_and_distort():
     assert (np.diag(g) < 1).all()
 
 
+def test_an_indefinite_mass_has_no_outcome_inside_jit():
+    """On the host `Scene` refuses it."""
+    normals = np.asarray(ji.chain([1.0, 1.0, 1.0]).normals)
+
+    @jax.jit
+    def status(mass):
+        return ji.impact(ji.Newton(0.5), ji.Scene(mass, normals), [1.0, 0.0, 0.0]).status
+
+    assert ji.STATUS[int(status(np.eye(3)))].name == "ok"
+    assert ji.STATUS[int(status(np.eye(3) - 1.5 * np.outer([0, 0, 1], [0, 0, 1])))].failure
+
+
 def test_kinetic_angles_of_tied_bodies():
     """Pairs 1-2 and 3-4, 2 tied to 3: cos = (1/2) / (1 + 1/2); by the masses alone (6.66) pi/2."""
     mass, pairs = [1.0] * 4, [[-1.0, 0], [1, 0], [0, -1], [0, 1]]
