@@ -279,6 +279,7 @@ LAWS = registered_laws({"restitution": 0.9, "stiffness": 1.0, "matrix": 0.9 * np
 @pytest.mark.parametrize("name", LAWS)
 def test_every_law_can_be_sampled(name):
     law = LAWS[name]
+    gaps = GAPS if law.uses_gaps else None
     if name != "restitution_matrix" and hasattr(law, "restitution"):
         law = RandomLaw(law, restitution=Uniform(0.8, 0.9))
     with warnings.catch_warnings():
@@ -286,7 +287,7 @@ def test_every_law_can_be_sampled(name):
         result = sampled(
             law=law,
             velocity=Normal([1.0, 0.0, -1.0], 0.1),
-            gaps=GAPS if law.uses_gaps else None,
+            gaps=gaps,
             samples=64,
             chunk=64,
         )
