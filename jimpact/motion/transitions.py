@@ -286,13 +286,15 @@ def _brought_slow_to_rest(
         """What comes to rest if `slow` contacts (m,) may."""
         slack = _slack(strike)
         pressed, still, force = pressed_together(contacts, slow, slack)
-        held = tight | (slow & pressed)
+        stopped = tight | (slow & pressed)
+        stop = _brought_to_rest(system, contacts, mu, stopped, stick, strike.t, strike.jump)
+        # redundant contacts come to rest with others
+        left = gamma + contacts.delassus[:m] @ stop.impulse
+        at_rest = closed & (jnp.abs(left) <= strike.rest)
         # a contact accumulates if it was brought to rest from more than rounding
-        ends = held & ~tight & strike.happens & ~strike.jams
-        jump, passed = _brought_to_rest(
-            system, contacts, mu, held, stick, ends, strike.t, strike.jump
-        )
-        return _Resting(pressed, still, force, held, ends, jump, passed)
+        ends = at_rest & ~tight & strike.happens & ~strike.jams
+        passed = _passed(stop, ends, -jnp.sum(strike.jump.energy))
+        return _Resting(pressed, still, at_rest, force, ends, stop.jump, passed)
 
     slow = closed & (jnp.abs(gamma) <= slowly)
     if m == 1:
@@ -301,7 +303,7 @@ def _brought_slow_to_rest(
     nested = nested & (jnp.abs(gamma) <= jnp.sqrt(settings.accumulation) * scales.gap_velocity)
     both = jax.lax.map(resting, jnp.stack([slow, slow | nested]))
     alone, cluster = (jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1))
-    undisturbed = _undisturbed(system, contacts, cluster, tight, strike.t)
+    undisturbed = _undisturbed(system, contacts, cluster, strike.t)
     return selected(undisturbed, cluster, alone)
 
 
@@ -324,18 +326,14 @@ def _next_modes(
     contacts, rest = strike.contacts, strike.rest
     if mu is not None:  # what velocities before the rest would still turn, redundant contacts fight
         contacts = contacts_at(system, state.q, state.v, strike.t, True)
-    # redundant contacts come to rest with others
-    relative = state.v - carried_along(system, state.v, strike.t)
-    rate = contacts.normal.gradient.T @ relative
-    at_rest = strike.closed & (jnp.abs(rate) <= rest)
-    held = result.held | at_rest
+    held = result.at_rest
     held_before = before.active if not settings.friction else jnp.tile(before.active, 2)
     released = fired & held_before & ~strike.happens
     if mu is not None:
         choice = _with_friction(contacts, mu, before, held, released, rest, _slack(strike))
         return choice, held, released
     m = held.shape[0]
-    active = result.pressed | (at_rest & result.still & ~released)
+    active = result.pressed | (held & result.still & ~released)
     no = jnp.asarray(False)
     modes = no_modes(m, rest.dtype)._replace(active=active)
     return ModeChoice(modes, ~no, rest, no, jnp.zeros(m, bool)), held, released
@@ -365,8 +363,8 @@ class _Resting(NamedTuple):
 
     pressed: jax.Array
     still: jax.Array
+    at_rest: jax.Array
     force: jax.Array
-    held: jax.Array
     ends: jax.Array
     jump: Jump
     passed: Passed
@@ -381,11 +379,9 @@ def _share_bodies(contacts: Contacts, touched: jax.Array) -> jax.Array:
     return jnp.any(others & (w > LEAST_COUPLING * jnp.outer(size, size)), axis=1)
 
 
-def _undisturbed(
-    system: System, contacts: Contacts, result: _Resting, tight: jax.Array, t: jax.Array
-) -> jax.Array:
+def _undisturbed(system: System, contacts: Contacts, result: _Resting, t: jax.Array) -> jax.Array:
     """Whether () no other contact is reached within the time that is passed, by parabolas."""
-    m = tight.shape[0]
+    m = result.at_rest.shape[0]
     gap, normals = jnp.maximum(contacts.normal.value, 0.0), contacts.normal.gradient
     rate = normals.T @ (result.jump.v - carried_along(system, result.jump.v, t))
     fall = contacts.approach[:m] + contacts.delassus[:m, :m] @ result.force
@@ -394,7 +390,7 @@ def _undisturbed(
     later = (rate + root) / jnp.where(fall < 0, -fall, 1.0)
     reached = jnp.where(rate < 0, 2 * gap / jnp.where(rate < 0, root - rate, 1.0), later)
     never = (square < 0) | ((rate >= 0) & (fall >= 0))
-    return jnp.all(result.held | tight | never | (reached > result.passed.time))
+    return jnp.all(result.at_rest | never | (reached > result.passed.time))
 
 
 def _approach(choice: ModeChoice, slip: jax.Array, held: jax.Array) -> jax.Array:
@@ -476,20 +472,25 @@ def _grown(
     return jax.lax.stop_gradient(jax.tree.map(jnp.maximum, scales, now))
 
 
+class _Stop(NamedTuple):
+    """Contacts that are brought to rest."""
+
+    jump: Jump  # after it
+    impulse: jax.Array  # (k,) that does it [N s]
+    force: jax.Array  # (m,) that will keep contacts closed [N]
+    energy: jax.Array  # () that it takes [J]
+
+
 def _brought_to_rest(
     system: System,
     contacts: Contacts,
     mu: jax.Array | None,
     held: jax.Array,
     stick: jax.Array,
-    ends: jax.Array,
     t: jax.Array,
     jump: Jump,
-) -> tuple[Jump, Passed]:
-    """Gap velocities of `held` contacts set to 0, tangential ones of those that `stick`, too.
-
-    And what is passed by that at contacts whose accumulation `ends`.
-    """
+) -> _Stop:
+    """Gap velocities of `held` contacts set to 0, tangential ones of those that `stick`, too."""
     m = held.shape[0]
     modes, rates = (
         no_modes(m, jump.v.dtype)._replace(active=held, stick=stick),
@@ -508,7 +509,6 @@ def _brought_to_rest(
     # the gaps, up to `closed_below`, are closed by the flight that follows
     fallen = jnp.where(held, jnp.maximum(force[:m], 0.0) * contacts.normal.value, 0.0)
     carried = carried_along(system, jump.v, t)
-    passed = _passed(p[:m], force[:m], ends, -jnp.sum(energy), -jnp.sum(jump.energy))
     jump = jump._replace(
         v=jump.v + contacts.moved @ p,
         impulse=jump.impulse + p[:m],
@@ -516,23 +516,22 @@ def _brought_to_rest(
         energy=(jump.energy + energy).at[0].add(-fallen),
         base_work=jump.base_work + (contacts.directions @ p) @ carried,
     )
-    return jump, passed
+    return _Stop(jump, p, force[:m], -jnp.sum(work))
 
 
-def _passed(
-    p: jax.Array, force: jax.Array, ends: jax.Array, left: jax.Array, lost: jax.Array
-) -> Passed:
-    """By the energy `left` in hops, and what the impact took.
+def _passed(stop: _Stop, ends: jax.Array, lost: jax.Array) -> Passed:
+    """By the energy in hops that the stop takes, and what the impact took.
 
     Under the force F that will keep a contact closed a hop takes 2 p / F, and energy E lifts it by
     E / F at most. If each impact keeps r^2 of the energy, and k contacts strike in turn, hops
     take `2 k p / F (1 + r + ..)` together: exact for a single contact.
     """
-    ends = ends & (force > 0)
-    safe, some = jnp.where(ends, force, 1.0), jnp.any(ends) & (left > 0)
+    p, left = stop.impulse[: len(ends)], stop.energy
+    pressed = ends & (stop.force > 0)
+    safe, some = jnp.where(pressed, stop.force, 1.0), jnp.any(pressed) & (left > 0)
     r = jnp.sqrt(jnp.where(some, left, 0.25) / jnp.where(some, left + jnp.maximum(lost, 0), 1.0))
-    hop = jnp.max(jnp.where(ends, 2 * jnp.abs(p) / safe, 0.0))
-    lift = jnp.max(jnp.where(ends, left / safe, 0.0))
+    hop = jnp.max(jnp.where(pressed, 2 * jnp.abs(p) / safe, 0.0))
+    lift = jnp.max(jnp.where(pressed, left / safe, 0.0))
     return Passed(jnp.sum(ends.astype(p.dtype)) * hop / (1 - r), lift)
 
 
