@@ -44,8 +44,8 @@ class PlanarBodies(FewBodies):
     point of a body has `f = n . (x + R c_i) - r - d`. Two discs have `f = |x_1 - x_2| - r_1 - r_2`,
     a disc and a polygon `f = dist(x_1, polygon) - r_1`. Two polygons have the two contacts of two
     sides that face each other: at each end of the first side, the distance of its corner from the
-    second side, or, where it overhangs, that of the second side's end from the first side, or, in
-    between, that of the two corners; the least of both is the distance of the polygons. Normals are
+    second side, or, if that is less, that of the second side's end from the first side; the least
+    of both is the distance of the polygons. Normals are
     unit vectors n from the second body to the first, tangents (n_y, -n_x); both as rates of q.
 
     Contacts, in order: for each plane and body, its contact points; then the pairs of discs; discs

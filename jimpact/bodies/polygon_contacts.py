@@ -9,7 +9,9 @@ from jimpact.bodies.base import dot, lengths
 from jimpact.bodies.contacts import ContactPoints
 from jimpact.compiling import full_precision
 
-PARALLEL = 1e-9  # [m] more than rounding: between parallel sides it does not decide
+# [m] More than rounding: it decides neither between parallel sides nor whether a point at the end
+# of a side is over it.
+PARALLEL = 1e-9
 
 
 def outward(side: jax.Array) -> jax.Array:
@@ -34,13 +36,26 @@ def from_polygon(middle: jax.Array, begin: jax.Array) -> tuple[jax.Array, jax.Ar
     normals = outward(side)
     heights = _of_sides(jnp.sum((middle[:, None] - begin[None]) * normals[None], axis=2), normals)
     nearest = jnp.argmax(heights, axis=1)  # outside, its side or one of its ends is the nearest
-    a, tangent, n = begin[nearest], side[nearest], normals[nearest]
-    share = dot(middle - a, tangent) / dot(tangent, tangent)
-    beyond = (share < 0) | (share > 1)
-    corner = a + jnp.where(share > 1, 1.0, 0.0)[:, None] * tangent
-    length, toward = lengths(middle - corner)
-    n = jnp.where(beyond[:, None], toward, n)
-    return jnp.where(beyond, length, jnp.max(heights, axis=1)), n
+    distance, _, n = _from_side(middle, begin[nearest], side[nearest], normals[nearest])
+    return distance, n
+
+
+def _from_side(
+    point: jax.Array, begin: jax.Array, side: jax.Array, n: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Distances (g,) of points (g, 2) from sides with normals n, negative behind one of them.
+
+    And where (g, 2) they touch at distance 0, and unit vectors (g, 2) from the side.
+    """
+    square = dot(side, side)
+    along = dot(side, point - begin)
+    slack = PARALLEL * jnp.sqrt(square)
+    beyond = (along < -slack) | (along > square + slack)
+    end = begin + jnp.where(along > square, 1.0, 0.0)[:, None] * side
+    length, toward = lengths(point - end)
+    distance = jnp.where(beyond, length, dot(n, point - begin))
+    beyond = beyond[:, None]
+    return distance, jnp.where(beyond, 0.5 * (point + end), point), jnp.where(beyond, toward, n)
 
 
 def _of_sides(heights: jax.Array, normals: jax.Array) -> jax.Array:
@@ -75,27 +90,27 @@ def facing_now(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array, jax.Ar
 
 
 def facing_sides(sides: FacingSides) -> ContactPoints:
-    """Two contacts a pair, at the begin and at the end of the first body's side."""
+    """Two contacts a pair, at the begin and at the end of the first body's side.
+
+    Each is the nearer one of the end of the first side to the second side, and of the end of the
+    second side that faces it to the first side: the distance has no jumps.
+    """
     (a_begin, a_end), (b_begin, b_end) = sides.first, sides.second
-    n_a, n_b = outward(a_end - a_begin), outward(b_end - b_begin)
+    side_a, side_b = a_end - a_begin, b_end - b_begin
+    n_a, n_b = outward(side_a), outward(side_b)
 
-    def at_end(a: jax.Array, other_a: jax.Array, b: jax.Array, other_b: jax.Array) -> ContactPoints:
+    def at_end(a: jax.Array, b: jax.Array) -> ContactPoints:
         """Contacts at the ends a (g, 2) of first sides, which face the ends b of second ones."""
-        side = other_a - a
-        share = dot(side, b - a) / dot(side, side)
-        over = dot(b - other_b, a - b) > 0  # a overhangs: b is under the side, or beyond it
-        past = dot(other_b - b, a - other_b) > 0  # the sides do not overlap
-        by_side = over & (share >= 0) & (share <= 1)
-        by_end = past | (over & ~by_side)
-        end = jnp.where((over & (share > 1))[:, None], other_a, a)
-        b = jnp.where(past[:, None], other_b, b)
-        apart, toward = lengths(end - b)
-        gap = jnp.where(by_end, apart, jnp.where(by_side, dot(n_a, b - a), dot(n_b, a - b)))
-        n = jnp.where(by_end[:, None], toward, jnp.where(by_side[:, None], -n_a, n_b))
-        point = jnp.where(by_end[:, None], 0.5 * (end + b), jnp.where(by_side[:, None], b, a))
-        return ContactPoints(gap, point, n)
+        gap_a, point_a, from_b = _from_side(a, b_begin, side_b, n_b)
+        gap_b, point_b, from_a = _from_side(b, a_begin, side_a, n_a)
+        first = (gap_a <= gap_b)[:, None]
+        return ContactPoints(
+            jnp.minimum(gap_a, gap_b),
+            jnp.where(first, point_a, point_b),
+            jnp.where(first, from_b, -from_a),
+        )
 
-    both = (at_end(a_begin, a_end, b_end, b_begin), at_end(a_end, a_begin, b_begin, b_end))
+    both = (at_end(a_begin, b_end), at_end(a_end, b_begin))
     gap, point, n = (jnp.stack(parts, axis=1) for parts in zip(*both))
     swapped = sides.swapped[:, None]
     gap = jnp.where(swapped, gap[:, ::-1], gap)

@@ -218,7 +218,6 @@ def test_a_block_on_springs_passes_the_flat_position():
 
 
 @pytest.mark.release
-@fault(ENGINE)
 def test_a_domino_reaches_the_next_one():
     height, width, gap = 0.048, 0.0075, 0.0185
     bodies = ji.Bodies([ji.Block(width, height, mass=0.01)] * 2, pairs=[(0, 1)])
