@@ -514,12 +514,15 @@ def _place_within(
     """Where u (k, B) in a step margins vanish if they have `crossed` 0, otherwise turn."""
     (c0, c1), (d0, d1) = values, slopes
     # the root of the chord c0 + (c1 - c0) u, or of the slope d0 + (d1 - d0) u
-    part = jnp.where(crossed, jnp.maximum(c0, 0.0), -d0)
+    above = jnp.maximum(c0, 0.0)
+    part = jnp.where(crossed, above, -d0)
     whole = jnp.where(crossed, c0 - c1, d1 - d0)
     u = part / jnp.where(whole > 0, whole, jnp.inf)
-    # a margin that rises from 0 and falls back: the root of the parabola d0 u + (c1 - d0) u^2
-    rises = crossed & (c0 <= flow.zero_margin) & (d0 > 0)
-    u = jnp.where(rises, d0 / jnp.where(crossed, d0 - c1, 1.0), u)
+    # a margin that rises and falls back: the root of the parabola c0 + d0 u + (c1 - c0 - d0) u^2
+    rises = crossed & (d0 > 0)
+    bend = jnp.where(rises, above + d0 - c1, 1.0)
+    root = jnp.sqrt(jnp.where(rises, d0 * d0 + 4 * bend * above, 1.0))
+    u = jnp.where(rises, (d0 + root) / (2 * bend), u)
     if flow.near:
         # a step in time precedes the landing: dt/dxi is singular at the top of a parabola
         u = jnp.where(crossed, _root_of_cubic(u, c0, d0, c1, d1), u)

@@ -177,7 +177,6 @@ def test_discs_keep_their_angular_momentum():
 
 @pytest.mark.release
 @pytest.mark.long_run
-@fault(ENGINE)
 def test_flat_boxes_in_an_assembly_bounce_as_they_do_alone():
     """Which of them end early depends on rounding, which the law enlarges from bounce to bounce."""
     e, t1 = 0.9, np.sqrt(2 / G)
