@@ -180,8 +180,12 @@ def _with_friction(problem: MotionProblem, run: _CompliantRun) -> _CompliantRun:
             still = still._replace(sign=jnp.ones_like(still.sign))
         held = forces(known, mu, still, jnp.where(slides[:, None], moves, 0.0))
         left = cone_margins(known, mu, held)
-        least = jnp.where(let_go, WITHIN * friction_acceleration(known, mu, held.normal), 0.0)
-        sticks = jnp.all(~still.stick | (left >= least))
+        within = WITHIN * friction_acceleration(known, mu, held.normal)
+        # what passes the flat position turns: no forces hold both of its corners
+        both = jnp.concatenate([held.normal, held.tangential])
+        growth = length(by_contact((known.approach + known.delassus @ both)[m:], m))
+        holds = (growth <= within) & (left >= jnp.where(let_go, within, 0.0))
+        sticks = jnp.all(~still.stick | holds)
         chosen = selected(sticks, still, choice.modes)
         if settings.spatial:  # a force that changes as fast as in a contact has slip begin at once
             chosen = chosen._replace(sign=jnp.ones_like(chosen.sign))

@@ -1,8 +1,4 @@
-"""Inputs that give a wrong answer today, with the right one: whoever mends a kind removes its mark.
-
-A mark names the issue that mends it. Each stands for its kind: the input itself is not to be
-treated specially.
-"""
+"""Inputs that gave a wrong answer, with the right one. Each stands for its kind."""
 
 import warnings
 
@@ -15,14 +11,6 @@ import pytest
 import jimpact as ji
 
 G = 9.80665
-
-
-def fault(issue, **options):
-    """A known fault: the test must fail until the issue is resolved."""
-    return pytest.mark.xfail(strict=True, reason=f"issue '{issue}'", **options)
-
-
-ENGINE = "One engine"
 
 
 def status_of(out):
@@ -193,7 +181,6 @@ def test_flat_boxes_in_an_assembly_bounce_as_they_do_alone():
 
 
 @pytest.mark.release
-@fault(ENGINE)
 def test_a_block_on_springs_passes_the_flat_position():
     """Both corners carry, one sticks: Radau with regularized friction gets through."""
     rng, cases = np.random.default_rng(11), []
