@@ -263,6 +263,7 @@ def unit_of(comment: str) -> str:
 
 
 @functools.cache
+@functools.cache
 def constants() -> dict[str, list[tuple[str, str, str]]]:
     """Constants of all modules, by path in the package."""
     package = ROOT / "jimpact"

@@ -46,8 +46,9 @@ COUNTS_FROM = 200  # operations of StableHLO
 BUDGET = 310
 COMPILED = "/jax/core/compile/backend_compile_duration"
 
-# XLA's newer emitters of loops take twice as long to compile; users compile batches with them.
-QUICK = "--xla_cpu_use_fusion_emitters=false"
+# XLA's newer emitters of loops take twice as long to compile; users compile batches with them. A
+# program that is cut into parts for several cores takes a fifth longer where each core has a test.
+QUICK = "--xla_cpu_use_fusion_emitters=false", "--xla_cpu_parallel_codegen_split_count=1"
 
 BY_LAW = ("test_contract", "test_systems")  # a law's tests share its programs
 OF_LAW = {
@@ -114,10 +115,10 @@ def optimize(fully):
     os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(not fully)
 
 
-def is_known(flag):
-    """Whether this version's compiler knows the flag: it aborts a process over others."""
+def is_known(flags):
+    """Whether this version's compiler knows the flags: it aborts a process over others."""
     start = [sys.executable, "-c", "import jax; jax.devices()"]
-    process = subprocess.run(start, env=os.environ | {"XLA_FLAGS": flag}, capture_output=True)
+    process = subprocess.run(start, env=os.environ | {"XLA_FLAGS": flags}, capture_output=True)
     return process.returncode == 0
 
 
@@ -131,8 +132,9 @@ def pytest_configure(config):
     if hasattr(config, "workerinput"):
         return
     flags = os.environ.get("XLA_FLAGS", "")
-    if QUICK.partition("=")[0] not in flags and is_known(QUICK):
-        os.environ["XLA_FLAGS"] = f"{flags} {QUICK}".strip()
+    quick = " ".join(x for x in QUICK if x.partition("=")[0] not in flags)
+    if is_known(quick):
+        os.environ["XLA_FLAGS"] = f"{flags} {quick}".strip()
     config.pluginmanager.register(Workers())
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         folder = tempfile.TemporaryDirectory(prefix="jimpact-tests-")
