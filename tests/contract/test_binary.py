@@ -208,6 +208,7 @@ def test_kink_where_a_collision_appears():
     assert np.abs(slope[3] - slope[1]).max() > 0.1
 
 
+@pytest.mark.slow
 def test_extreme_masses_and_speeds_are_right_or_flagged():
     """A light ball between heavy ones collides more often than `max_collisions` allows."""
     rng, count = np.random.default_rng(2), 500

@@ -281,6 +281,7 @@ TILTED = """pre_1[m/s],pre_2[m/s],pre_3[rad/s],post_1[m/s],post_2[m/s],post_3[ra
 """
 
 
+@pytest.mark.slow
 def test_fit_of_a_body(tmp_path, capsys):
     """A block that falls flat on its base, e = 0.5; the same tables as of a motion."""
     path = written(tmp_path, ON_GROUND, TILTED)

@@ -135,7 +135,7 @@ def test_least_norm_of_many():
     np.testing.assert_allclose(np.asarray(p[2]), np.asarray(p[1])[:, order], atol=1e-13)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_derivatives_of_every_order():
     """Two contacts, W = [[1, -a], [-a, 1]], the first struck: p = (1, a) / (1 - a^2)."""
 

@@ -148,7 +148,7 @@ def draw(number=COUNT, seed=1):
 
 @pytest.mark.parametrize(
     "force",
-    [pytest.param(x, marks=[pytest.mark.slow] if x != "kelvin-voigt" else []) for x in FORCES],
+    [pytest.param(x, marks=[pytest.mark.release] if x != "kelvin-voigt" else []) for x in FORCES],
 )
 def test_damped_chains_against_scipy(force):
     """Forces that slacken at x > 0 and are loaded again, at any damping; none of it elastic."""
@@ -327,6 +327,7 @@ def test_precompression_energy():
     np.testing.assert_allclose(energy, k * x ** (eta + 1) / (eta + 1), rtol=1e-14)
 
 
+@pytest.mark.slow
 def test_history_of_one_ball_on_a_linear_spring():
     """Half a period of `x = v / w sin(w t)`, of 1 kg, k = 2 N/m and 1 m/s."""
     history = ji.history(ji.LZB(1.0, 2.0, exponent=1.0), ji.chain([1.0], wall=True), [1.0])
@@ -341,7 +342,7 @@ def test_history_of_one_ball_on_a_linear_spring():
     np.testing.assert_allclose(history.approach[:, 0], x, atol=1e-7)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_the_status_of_a_history_is_that_of_the_impact():
     """Bad parameters, unknown velocities and energies without a number, inside jit."""
 

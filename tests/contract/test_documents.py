@@ -81,8 +81,25 @@ def code_of(path):
     return own, ">>>" in text  # (a cluster does not exist here)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("path", [pytest.param(p, id=p.stem) for p in DOCS if any(code_of(p))])
+def documents(paths, long_run=()):
+    """Pages and notebooks that run: those that take longest wait for the release."""
+    return [
+        pytest.param(
+            path,
+            id=path.stem,
+            marks=[
+                pytest.mark.release if path.stem.startswith(LONGEST) else pytest.mark.slow,
+                *([pytest.mark.long_run] if path.stem.startswith(tuple(long_run)) else []),
+            ],
+        )
+        for path in paths
+    ]
+
+
+LONGEST = ("mujoco", "gradient_descent", "waves", "03", "05", "06", "10")
+
+
+@pytest.mark.parametrize("path", documents(p for p in DOCS if any(code_of(p))))
 def test_docs_run(path):
     blocks, prompts = code_of(path)
     space = {}
@@ -247,21 +264,8 @@ def shell():
     matplotlib.use(backend)
 
 
-RUNNING = ("01", "11", "17")  # running takes most of their time
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "path",
-    [
-        pytest.param(
-            path,
-            id=path.stem,
-            marks=[pytest.mark.long_run] if path.stem.startswith(RUNNING) else [],
-        )
-        for path in NOTEBOOKS
-    ],
-)
+# running takes most of the time of the last three
+@pytest.mark.parametrize("path", documents(NOTEBOOKS, long_run=("01", "11", "17")))
 def test_notebook_runs(path, shell):
     for cell in nbformat.read(path, as_version=4).cells:
         if cell.cell_type == "code":

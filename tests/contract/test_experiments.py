@@ -265,7 +265,7 @@ def test_readings_in_steps_have_the_error_of_their_rounding():
     np.testing.assert_allclose((rounded - rounded.round(1)).std(), 0.1 / np.sqrt(12), rtol=0.02)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_the_cube():
     data = ji.data.cube_impacts()
     assert read_study("tossed_cube.toml").experiments.shots == data.only(data.contacts == 1).shots
@@ -280,7 +280,7 @@ def test_the_cube():
         ji.data.cube_impacts(3)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_nearly_clean_impacts_of_the_cube():
     """Two corners: the clean impacts and 84 more, none twice."""
     two = ji.data.cube_impacts(2, nearly_clean=True)

@@ -319,10 +319,10 @@ def test_stated_errors_that_are_too_small_are_noticed():
 @pytest.mark.parametrize(
     "method",
     [
-        pytest.param("lbfgs", marks=pytest.mark.slow),
-        pytest.param("adam", marks=pytest.mark.slow),
-        pytest.param("sgd", marks=pytest.mark.slow),
-        pytest.param(optax.rmsprop(0.01), marks=pytest.mark.slow),
+        pytest.param("lbfgs", marks=pytest.mark.release),
+        pytest.param("adam", marks=pytest.mark.release),
+        pytest.param("sgd", marks=pytest.mark.release),
+        pytest.param(optax.rmsprop(0.01), marks=pytest.mark.release),
     ],
 )
 def test_gradient_descent_agrees_with_levenberg_marquardt(method):

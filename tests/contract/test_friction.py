@@ -98,7 +98,7 @@ DISK = (
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(x, marks=[] if x == "moreau" else [pytest.mark.slow]) for x in LAWS],
+    [pytest.param(x, marks=[] if x == "moreau" else [pytest.mark.release]) for x in LAWS],
 )
 def test_disk_in_closed_form(name):
     """It sticks for `-(1 + e_t) v_t / W_tt`; friction gives at most mu p of that."""
@@ -234,7 +234,7 @@ def test_a_single_contact_in_closed_form():
     assert (least < 0).any()  # drawn back by friction, and compressed
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize("rod", [RODS[16], RODS[54]], ids=["slips", "jams"])
 def test_regularized_friction_is_rouths(rod):
     """The independent integration itself, against the closed form."""
@@ -582,11 +582,11 @@ SLOPES = {"planar": (1, 4), "planar, both ways": (1, 4), "space": (2, 6)}
 @pytest.mark.parametrize(
     ("name", "kind"),
     [
-        pytest.param("moreau", "planar, both ways", marks=pytest.mark.slow),
-        pytest.param("newton", "planar", marks=pytest.mark.slow),
-        pytest.param("binary", "planar", marks=pytest.mark.slow),
+        pytest.param("moreau", "planar, both ways", marks=pytest.mark.release),
+        pytest.param("newton", "planar", marks=pytest.mark.release),
+        pytest.param("binary", "planar", marks=pytest.mark.release),
         pytest.param("lzb", "planar, both ways", marks=pytest.mark.release),
-        pytest.param("moreau", "space", marks=pytest.mark.slow),
+        pytest.param("moreau", "space", marks=pytest.mark.release),
         pytest.param("lzb", "space", marks=pytest.mark.release),
     ],
 )

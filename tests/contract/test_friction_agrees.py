@@ -162,7 +162,7 @@ def test_planar_scenes_in_space_have_the_same_outcome(scenes):
     assert np.abs(after[:, 9:]).max() < 1e-8
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_disc_rolls_into_a_standing_block():
     """Two corners of the block stand, the disc rolls: four contacts, of which one is new."""
     bodies = ji.Bodies([ji.Block(0.1, 0.4), ji.Disc(0.1)])

@@ -22,7 +22,7 @@ def on_an_edge(tangents=True):
     return ji.Scene(MASS, rows(z).T, sides if tangents else None)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_tangents_without_friction_change_nothing():
     law = ji.LZB(0.7, [1.0, 1.7])
     plain, other = (ji.impact(law, on_an_edge(t), VELOCITY) for t in (False, True))
@@ -44,6 +44,7 @@ def test_damped_forces_keep_rtol(friction):
     np.testing.assert_allclose(coarse.velocity, exact.velocity, atol=2 * RTOL["implicit"] * speed)
 
 
+@pytest.mark.slow
 def test_what_rtol_allows_is_no_gain_of_energy():
     """An elastic impact gains a fortieth of this rtol."""
     scene, v = ji.chain([1.0, 3.0, 2.0]), [1.0, 0.0, 0.0]

@@ -49,7 +49,7 @@ def pressed(name):
     return ji.Scene(body.mass, body.normals, body.tangents), jnp.asarray(body.velocity)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_agrees_with_the_method_that_stops_at_every_event():
     """Two and four corners, e = 0 included: right to the tolerance asked for."""
     for (name, e), expected in EVENT_BY_EVENT.items():
@@ -119,7 +119,7 @@ def edge_problem(sigma=0.01, name="edge", **options):
     return ji.FitProblem.from_shots(law, scene, data, ("restitution", "friction"))
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_second_derivatives_of_a_fit_say_what_auto_is():
     """The error names what the user may not have asked for; nothing is compiled."""
     problem = edge_problem()

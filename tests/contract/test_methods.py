@@ -251,7 +251,7 @@ def check_right(point, steps):
     assert error[i] <= HONEST * RTOL
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize("point", HARD, ids=HARD.get)
 def test_hard_points(point):
     check_right(point, STEPS)
@@ -326,7 +326,7 @@ def test_stability_map():
     assert ji.plot.stability_map(result, "title").axes
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_stability_map_of_a_scene_with_friction():
     """A rod: Verlet needs fine steps, the default method is right; a rod has no balls."""
     axes = {"setting": [0.35, 0.8], "friction": [0.05, 2.0]}
@@ -683,6 +683,7 @@ def test_validity_map_refuses(arguments, message):
         ji.validity_map(*arguments)
 
 
+@pytest.mark.slow
 def test_compare_gives_every_law_its_outcome():
     result = ji.compare(BALLS, STRIKE, restitution=0.9, stiffness=[1.0, 2.0])
     assert {"lzb", "newton", "moreau", "poisson", "binary"} <= set(result.entries)

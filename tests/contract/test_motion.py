@@ -154,7 +154,7 @@ def test_a_bad_motion_ends_alone(balls):
     assert np.isfinite(slope.events.time).all()
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_law_with_friction_may_be_made_outside_of_jit():
     block, law = ji.System(ji.Block(0.2, 0.4), gravity=True), ji.LZB(0.5, friction=0.3)
 
@@ -207,7 +207,7 @@ def test_second_derivatives_over_twenty_bounces():
     np.testing.assert_allclose(found, exact, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_derivatives_in_what_functions_close_over():
     def second(height):
         system = ji.System(lambda q: q - height, [1.0], potential=lambda q: 9.0 * q[0])
@@ -414,7 +414,7 @@ def mean_error(motion_of, exact, step):
     return np.mean([np.abs(np.asarray(motion.q) - exact).max() for motion in found])
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_time_stepping_is_of_first_order():
     exact = np.array([[height(0.8, t)] for t in np.linspace(0, 2, 11)])
     coarse, fine = (mean_error(lambda h: stepped(0.8, h), exact, h) for h in (2e-3, 2e-4))
@@ -431,7 +431,7 @@ def test_time_stepping_is_of_first_order():
         ),
         pytest.param(
             ji.System(ji.Column([1.0, 0.5], 0.05), gravity=True), ji.Moreau(0.6), [0.2, 0.45], [0.0] * 2, 0.35,
-            marks=pytest.mark.slow,
+            marks=pytest.mark.release,
         ),
         # it falls on a corner, tips and strikes with the other one
         pytest.param(
@@ -459,6 +459,7 @@ def test_derivatives_of_time_stepping_are_refused():
             derivative(lambda e: stepped(e, 1e-3).q[5, 0])(0.8)
 
 
+@pytest.mark.slow
 def test_a_block_on_a_slope_stays_slides_and_stops():
     """Time stepping is exact here: distances are those of a constant deceleration."""
     slope, g, mu = 0.3, 9.81, 0.5
@@ -552,9 +553,9 @@ def test_discs_are_a_body_like_others():
             np.testing.assert_allclose(found[:3].reshape(-1), expected[:, column], atol=1e-15)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize(
-    "law", [ji.Moreau(0.5), pytest.param(ji.Newton(0.5), marks=pytest.mark.slow)]
+    "law", [ji.Moreau(0.5), pytest.param(ji.Newton(0.5), marks=pytest.mark.release)]
 )
 def test_time_stepping_of_many_beads_comes_to_rest(law):
     n = 20
@@ -575,7 +576,7 @@ def test_time_stepping_of_many_beads_comes_to_rest(law):
     assert int(stays.events.count) == 0
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_time_stepping_reports_what_it_cannot_resolve():
     pile = piles.discs(1.0, [0.1, 0.1], planes=[[0.0, 1.0, 0.0]], room=1)
     system, q = ji.System(pile, gravity=True), pile.at([[0.0, 0.1], [0.3, 0.1]])

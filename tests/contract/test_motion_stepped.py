@@ -107,13 +107,8 @@ class Table(ji.Body):
         return lambda q: acceleration * q[1]
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        pytest.param({}, marks=pytest.mark.slow),
-        {"method": "time_stepping", "step": 1e-2},
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [{}, {"method": "time_stepping", "step": 1e-2}])
 def test_leaving_the_range_of_a_gap_function_is_reported(options):
     system = ji.System(Table(), potential=Table().gravity(G))
     motion = ji.simulate(system, ji.Moreau(0.5), [0.0, 0.1], [1.0, 0.0], 2.0, samples=11, **options)
@@ -370,13 +365,13 @@ PLANE = (1.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # of two; the third flie
 DISCS = ji.Bodies([ji.Disc(0.1)] * 3, planes=[], pairs=[(0, 1), (2, 0)])
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize(
     ("body", "way", "speed", "expected"),
     [
         (Apart(), LINE, 50.0, "coarse_step"),
         (DISCS, PLANE, 50.0, "coarse_step"),
-        pytest.param(DISCS, PLANE, 3.0, "ok", marks=pytest.mark.slow),
+        pytest.param(DISCS, PLANE, 3.0, "ok", marks=pytest.mark.release),
     ],
 )
 def test_bodies_that_pass_each_other_in_a_step_are_reported(body, way, speed, expected):

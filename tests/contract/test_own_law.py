@@ -218,6 +218,7 @@ def test_a_law_is_printed_with_its_numbers():
     assert "force=Bistiffness(stiffness=3," in str(ji.Compliant(ji.Hertz(3.0)))
 
 
+@pytest.mark.slow
 def test_lists_of_traced_numbers():
     """`[1.0, k]` under grad and jit, in laws, scenes and velocities: as `jnp.stack` of them."""
 

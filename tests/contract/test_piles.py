@@ -379,6 +379,7 @@ def test_dynamics_of_a_packing_are_those_of_the_dense_scene(struck, method):
     assert sparse.velocity[20] == pytest.approx(2.1, abs=1e-5)
 
 
+@pytest.mark.slow
 def test_piles_by_events_are_refused_with_friction():
     pile = ji.Bodies([ji.Disc(0.1)] * 2, (), room=12)
     at = pile.at([[0.0, 0.0], [0.3, 0.0]])

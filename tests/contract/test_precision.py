@@ -74,7 +74,7 @@ def test_laws(name):
     assert not coarse_products(whole, jnp.array(0.6), VELOCITY)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize(
     ("name", "scene"),
     [("poisson", "plane"), ("lzb", "plane"), ("moreau", "space"), ("lzb", "space")],

@@ -104,7 +104,7 @@ def test_friction_block():
     np.testing.assert_allclose(work.total, change, atol=1e-14)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize("constraints", [0, 1])
 def test_identities_of_random_scenes(constraints):
     scene = random_scene(constraints)

@@ -91,9 +91,9 @@ def test_kinetic_angles_of_tied_bodies():
     "name",
     [
         "newton",
-        pytest.param("poisson", marks=pytest.mark.slow),
+        pytest.param("poisson", marks=pytest.mark.release),
         "binary",
-        pytest.param("lzb", marks=pytest.mark.slow),
+        pytest.param("lzb", marks=pytest.mark.release),
     ],
 )
 def test_welded_bodies_are_one(name):
@@ -303,7 +303,7 @@ def test_cradle_gaps():
         cradle.scene([0.2, 0.0, 0.0])
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_scenes_are_differentiable_in_their_arguments():
     """d/d(width, height, angle) of an impact on a tilted block, against differences."""
 

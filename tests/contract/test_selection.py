@@ -62,7 +62,7 @@ def test_the_criterion_without_sigma_is_corrected_for_few_values():
     assert best.aicc == pytest.approx(n * np.log(squares / n) + 2 * k * n / (n - k - 1))
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_law_that_fails_is_named_and_comes_last():
     """Newton pulls at a contact that separates."""
     balls = ji.chain([1.0, 1.0, 1.0])

@@ -84,7 +84,7 @@ def test_straight_chain_does_not_turn(force):
     assert bool(out.ended)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_mass_that_depends_on_the_configuration():
     """Polar coordinates of a bouncing point: the same motion as in Cartesian ones."""
 

@@ -78,7 +78,7 @@ def test_mypy_sees_names_signatures_and_fields():
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.skipif(find_spec("basedpyright") is None, reason="basedpyright is not installed")
 def test_pyright_sees_names_signatures_and_fields(tmp_path):
     """By basedpyright, which is pyright with a node of its own: nothing is downloaded."""

@@ -17,6 +17,7 @@ def test_register_refuses():
         ji.register("Mine", ji.Newton)
 
 
+@pytest.mark.slow
 def test_contact_for_a_law_of_ones_own():
     contact = ji.Contact([[2.0, -1.0], [-1.0, 2.0]], [-1.0, 0.0])
     p = ji.Moreau(0.5).impulses(contact).normal
