@@ -235,8 +235,6 @@ def run(mutation):
         (folder / path.relative_to(ROOT)).write_text(text, encoding="utf-8")
         command = [sys.executable, "-m", "pytest", "-p", "no:xdist", "-x", "-q", "--no-header"]
         command += ["-o", "addopts=--import-mode=importlib", "--tb=no", "-rfE"]
-        if not any("::" in test for test in mutation.tests):  # a test that is named may be long
-            command += ["-m", "not release"]
         command += [f"tests/contract/{test}" for test in mutation.tests]
         environment = os.environ | {"PYTHONPATH": name, "JAX_PLATFORMS": "cpu"}
         options = {"cwd": folder, "env": environment, "capture_output": True, "text": True}
