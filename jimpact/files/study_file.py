@@ -125,11 +125,8 @@ class CheckedStudy(NamedTuple):
     tables: dict[str, Any]
     law: LawTable
     free: dict[str, Any]
-
-    @property
-    def fitted(self) -> bool:
-        """Whether there is something to fit."""
-        return "data" in self.tables
+    motion: bool  # whether it is of a motion, else of one impact
+    rows: int = 0  # shots or samples of its data, where these have been read
 
     @property
     def fit_options(self) -> dict[str, Any]:
@@ -150,9 +147,24 @@ class CheckedStudy(NamedTuple):
 # -------------------------------------------------------------------------- locating and reading
 
 
-def from_file(path: str | Path, table: str, build: Callable[[dict[str, Any], Path], T]) -> T:
-    """What `build` makes of a study file's tables; studies of a kind have this `table`."""
-    path = located(Path(path), table)
+def from_file(
+    path: str | Path,
+    law: str | None,
+    motion: bool | None,
+    build: Callable[[CheckedStudy], T],
+    prepare: Callable[[dict[str, Any], Path], None] | None = None,
+) -> T:
+    """What `build` makes of a study file, checked.
+
+    Args:
+        path: of the file, its folder, or the name of a bundled study.
+        law: name of a law in the place of the study's; values that it does not take are left out.
+        motion: whether it must be of a motion or of an impact; None: what it is.
+        build: of the checked study.
+        prepare: called before with the tables and the folder, to import the module that the study
+            names; None: a law that may be registered there is not checked.
+    """
+    path = located(Path(path), {True: "[system]", False: "[scene]", None: "[law]"}[motion])
     try:
         tables = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
@@ -162,10 +174,38 @@ def from_file(path: str | Path, table: str, build: Callable[[dict[str, Any], Pat
                 "my_fit` writes a study; name this file under [data] in it."
             ) from None
         raise ValueError(f"{path}: the study must be a TOML file: {_position(error)}.") from None
+    moves = "motion" in tables if motion is None else motion
     try:
-        return build(tables, path)
+        if prepare is not None:
+            prepare(tables, path.parent)
+        if moves:
+            check_tables(tables, ("system", "law", "motion"), MOTION_TABLES)
+            body_keys("[system]", tables["system"], (GRAVITY,))
+        else:
+            check_tables(tables, ("scene", "law"), IMPACT_TABLES)
+            check_scene(tables["scene"])
+            check_sampling(tables.get("monte_carlo", {}))
+        free = masks(tables.get("fit", {}).get("free", []))
+        checked, free = check_law(tables["law"], law, free, prepare is not None)
+        return build(CheckedStudy(path, tables, checked, free, moves))
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None
+
+
+def check_study(
+    path: str | Path, law: str | None = None, motion: bool | None = None
+) -> CheckedStudy:
+    """A study with its data, all checked; arguments as of `from_file`."""
+
+    def with_data(study: CheckedStudy) -> CheckedStudy:
+        """The study, after its data are read."""
+        if "data" not in study.tables:
+            return study
+        file = study.data_file
+        rows = read_positions(file).time if study.motion else read_shots(file).values["pre"]
+        return study._replace(rows=len(rows))
+
+    return from_file(path, law, motion, with_data)
 
 
 def _position(error: Exception) -> str:
@@ -199,77 +239,6 @@ def located(path: Path, table: str) -> Path:
         f"Study '{path}' does not exist; bundled studies are {', '.join(choices)}."
         f"{suggestion(path, choices)}"
     )
-
-
-# ---------------------------------------------------------------------------------- whole studies
-
-
-def check_study(path: str | Path, law: str | None = None) -> tuple[CheckedStudy, int]:
-    """The study of one impact and the number of its shots, all checked; see `read_study`."""
-
-    def check(tables: dict[str, Any], file: Path) -> tuple[CheckedStudy, int]:
-        """Check the tables and the shots."""
-        study = check_impact_tables(tables, file, law)
-        shots = read_shots(study.data_file).values["pre"] if "data" in tables else ()
-        return study, len(shots)
-
-    return from_file(path, "[scene]", check)
-
-
-def check_motion_study(path: str | Path, law: str | None = None) -> CheckedStudy:
-    """The study of a motion, all checked; see `read_study`."""
-
-    def check(tables: dict[str, Any], file: Path) -> CheckedStudy:
-        """Check the tables and the positions."""
-        study = check_motion_tables(tables, file, law)
-        if "data" in tables:
-            read_positions(study.data_file)
-        return study
-
-    return from_file(path, "[system]", check)
-
-
-def is_motion(path: str | Path) -> bool:
-    """Whether a study is of a motion."""
-    return from_file(path, "[law]", lambda tables, _: "motion" in tables)
-
-
-def check_impact_tables(
-    tables: dict[str, Any], path: Path, other_law: str | None, modules: bool = False
-) -> CheckedStudy:
-    """The checked tables of a study of one impact.
-
-    Args:
-        tables: as read from the file.
-        path: of the file.
-        other_law: name of a law in the place of the study's; values that it does not take are left
-            out.
-        modules: whether the module that a study names has been imported; else a law that may be
-            registered there is not checked.
-    """
-    check_tables(tables, ("scene", "law"), IMPACT_TABLES)
-    check_scene(tables["scene"])
-    if "monte_carlo" in tables:
-        check_sampling(tables["monte_carlo"])
-    return _with_law(tables, path, other_law, modules)
-
-
-def check_motion_tables(
-    tables: dict[str, Any], path: Path, other_law: str | None, modules: bool = False
-) -> CheckedStudy:
-    """The checked tables of the study of a motion; arguments as of `check_impact_tables`."""
-    check_tables(tables, ("system", "law", "motion"), MOTION_TABLES)
-    body_keys("[system]", tables["system"], (GRAVITY,))
-    return _with_law(tables, path, other_law, modules)
-
-
-def _with_law(
-    tables: dict[str, Any], path: Path, other_law: str | None, modules: bool
-) -> CheckedStudy:
-    """The study, after its law and what is free of it are checked, too."""
-    free = masks(tables.get("fit", {}).get("free", []))
-    law, free = check_law(tables["law"], other_law, free, modules)
-    return CheckedStudy(path, tables, law, free)
 
 
 # ---------------------------------------------------------------------------------- single tables
@@ -317,7 +286,7 @@ def check_law(
 ) -> tuple[LawTable, dict[str, Any]]:
     """The table [law], checked by the declaration of its law, and what is free of that law.
 
-    The arguments are those of `check_impact_tables`.
+    `modules`: whether the module that a study names has been imported.
     """
     check_keys("[law]", table, tuple(table), required=("name",))
     laws = declared_laws()

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_axis, as_float_array, check_choice, check_per_contact, check_values
+from jimpact._checks import as_axis, as_numbers, check_choice, check_values
 from jimpact.compiling import precise_jit
 from jimpact.files.records import Column, Table, Tabular, fields_as_data
 from jimpact.impacts import impact
@@ -132,9 +132,7 @@ def validity_map(
     check_values("exponents", eta, low=1.0)
     if (np.diff(np.asarray(ratio)) <= 0).any():
         raise ValueError("Argument `ratios` must rise, but does not.")
-    e = as_float_array("restitution", restitution)
-    check_values("restitution", e, low=0.0, high=1.0)
-    check_per_contact("restitution", e, scene.contacts)
+    e = as_numbers("restitution", restitution, low=0.0, high=1.0, contacts=scene.contacts)
     velocities, spread, status = _grid(scene, v, ratio, eta, e.astype(v.dtype))
     laws: dict[str, Law] = {"moreau": Moreau(e), "binary": Binary(e)}
     after = {name: impact(law, scene, v).velocity for name, law in laws.items()}

@@ -2,7 +2,6 @@
 
 import abc
 import operator
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -190,10 +189,7 @@ class RandomLaw(eqx.Module):
         return law
 
 
-Source = Distribution | Rows | Callable[[jax.Array], Any] | jax.Array | None
-
-
-def as_source(name: str, value: Any, size: int, non_negative: bool) -> Source:
+def as_source(name: str, value: Any, size: int, non_negative: bool) -> Any:
     """A distribution, a function of a key, rows, or a constant (size,); checked on the host."""
     if isinstance(value, Distribution):
         value.check(name, size, non_negative)

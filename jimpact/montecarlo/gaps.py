@@ -19,10 +19,6 @@ from jimpact.solvers.tridiagonal import diagonal
 # between the two is about 2 delta_c wide.
 NEARLY_TOUCHING, WIDE = 0.1, 2.0
 
-# Linearized over sampled standard deviation, less 1, up to which the outcome is called linear.
-AGREES = 0.2
-CONSTANT = 1e-12  # a standard deviation below this, relative to the velocities, is rounding
-
 
 class GapScale(eqx.Module):
     """`delta` (m,) [m], indentation scale of each contact, and the scene's `gaps` (m,) [m]."""

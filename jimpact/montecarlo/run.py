@@ -19,9 +19,9 @@ import numpy as np
 from jimpact._checks import in_common_dtype, needed
 from jimpact.law import Law
 from jimpact.montecarlo.gaps import gap_scale
-from jimpact.montecarlo.plan import Plan, Run, Sources, planned_run
+from jimpact.montecarlo.plan import Inputs, Plan, Run, planned_run
 from jimpact.montecarlo.result import MonteCarlo, result_of
-from jimpact.montecarlo.statistics import IN_MEMORY, Chunk, Task, joined
+from jimpact.montecarlo.statistics import Chunk, Task, joined
 from jimpact.montecarlo.store import Store
 from jimpact.progress import counting_bar
 from jimpact.scene import Scene
@@ -97,7 +97,7 @@ def monte_carlo(
     >>> [round(float(v), 2) for v in result.quantile(0.9)]  # one of two mirror images
     [-0.6, 0.16, 1.24]
     """
-    run = planned_run(Sources(law, velocity, gaps), scene, samples, key, chunk, bins, keep_samples)
+    run = planned_run(Inputs(law, velocity, gaps), scene, samples, key, chunk, bins, keep_samples)
     _check_executor(executor)
     if keep_samples and folder is None:
         raise ValueError("Argument `folder` must be given to keep samples, but is None.")
@@ -122,15 +122,16 @@ def _total(
 
     The first chunk that is computed compiles the program: it does not count for the rate.
     """
+    counts = [run.task(number).count for number in range(run.chunks)]
 
     def read(number: int) -> Chunk | None:
         """The chunk as it is stored, if it is."""
-        count, keep = run.task(number).count, run.plan.keep_samples
-        return store.read(number, count, keep) if store is not None else None
+        if store is None:
+            return None
+        return store.read(number, counts[number], run.plan.keep_samples)
 
     stored = {number for number in range(run.chunks) if read(number) is not None}
-    resumed = finished = sum(run.task(number).count for number in stored)
-    missing = (n for n in range(1, run.chunks) if n not in stored)
+    resumed = finished = sum(counts[number] for number in stored)
     times = [(resumed, time.perf_counter())]
 
     def new(chunk: Chunk) -> Chunk:
@@ -145,9 +146,9 @@ def _total(
 
     try:
         with counting_bar(run.samples, "samples", progress, resumed) as advance:
-            first = read(0) or new(run.plan(run.task(0)))  # it sets the histograms
-            tasks = (run.task(number, first["ends"]) for number in missing)
-            total = first | {k: v[:IN_MEMORY] for k, v in first.items() if k.startswith("raw.")}
+            total = read(0) or new(run.plan(run.task(0)))  # it sets the histograms
+            missing = (n for n in range(1, run.chunks) if n not in stored)
+            tasks = (run.task(number, total["ends"]) for number in missing)
             with closing(_computed(executor, run.plan, tasks)) as chunks:
                 for number in range(1, run.chunks):
                     chunk = read(number) if number in stored else new(next(chunks))
@@ -166,7 +167,7 @@ def _total(
     return total, resumed, (after - before) / (end - begin) if after > before else 0.0
 
 
-def _gap_scale(sources: Sources, scene: Scene) -> np.ndarray | None:
+def _gap_scale(sources: Inputs, scene: Scene) -> np.ndarray | None:
     """delta_c (m,), where law and velocity are constant and the law's contacts indent."""
     law, velocity = sources.law, sources.velocity
     if not (isinstance(law, Law) and isinstance(velocity, jax.Array)):

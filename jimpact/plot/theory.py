@@ -228,6 +228,7 @@ def rocking_dispersion(result: RockingDispersion, title: str = "") -> Figure:
     for j, axes in enumerate(panels):
         for k, e in enumerate(np.asarray(result.restitution)):
             axes.plot(theta, size[:, j, k], color=colour_of(k), lw=1.6, label=f"e = {e:g}")
+    _critical_lines(panels, result)
     panels[0].set_ylim(bottom=0)  # shared by all, so last
     legend_below(figure, 6)
     return figure
@@ -265,6 +266,7 @@ def rocking_outcomes(
     for j, axes in enumerate(panels):
         axes.grid(False)
         axes.pcolormesh(theta, e, codes[:, j].T, cmap=colours, norm=norm, shading="nearest")
+    _critical_lines(panels, result)
     handles = [Patch(color=_OUTCOME_COLOURS[i], label=OUTCOMES[i]) for i in np.unique(codes)]
     legend_below(figure, 5, handles)
     return figure
@@ -306,14 +308,18 @@ def rocking_domains(domains: Sequence[RockingDomain], title: str = "") -> Figure
 
 
 def _panels(result: RockingDispersion, title: str, label: str) -> tuple[Figure, Any]:
-    """A panel for each mu, with the critical angle."""
+    """A panel for each mu."""
     figure, panels = new_panels(len(result.friction), 2.8, 0.6, title, sharex=True, sharey=True)
     for axes, mu in zip(panels, np.asarray(result.friction)):
         axes.set_title(f"mu = {mu:g}")
-        critical = float(np.degrees(critical_kinetic_angle(mu)))
-        axes.axvline(critical, color="black", ls=":", lw=1)
     _label_outer(panels, r"kinetic angle $\theta_{12}$ [degrees]", label)
     return figure, panels
+
+
+def _critical_lines(panels: np.ndarray, result: RockingDispersion) -> None:
+    """The critical angle of each mu."""
+    for axes, angle in zip(panels, np.degrees(critical_kinetic_angle(result.friction))):
+        axes.axvline(float(angle), color="black", ls=":", lw=1)
 
 
 def _label_outer(panels: np.ndarray, x: str, y: str) -> None:

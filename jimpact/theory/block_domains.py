@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jimpact._checks import as_float_array, check_shape, check_values
+from jimpact._checks import as_numbers
 from jimpact.theory.rocking import housner_restitution
 
 
@@ -69,9 +69,7 @@ def rocking_domain(aspect: Any, sliding: bool = True) -> RockingDomain:
     >>> domain.half_rocking, ji.theory.rocking_domain(2.0, sliding=False).rocking
     (None, (0.7, 1.0))
     """
-    a = as_float_array("aspect", aspect)
-    check_shape("aspect", a, (), "one block")
-    check_values("aspect", a, low=0.0, open_low=True)
+    a = as_numbers("aspect", aspect, (), "one block", low=0.0, open_low=True)
     slenderness = float(a)
     if sliding:
         g = (slenderness**2 - 2) / (slenderness**2 + 4)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import brentq
 
-from jimpact._checks import as_float_array, as_whole, check_per_contact, check_shape, check_values
+from jimpact._checks import as_numbers, as_whole, check_values
 from jimpact.compiling import full_precision
 from jimpact.scene import Scene, as_velocity, gap_velocity, velocity_change
 
@@ -48,11 +48,8 @@ def bilateral_motion(
     [0.0, 1.0]
     """
     v = as_velocity(scene, velocity)
-    k = as_float_array("stiffness", stiffness)
-    check_values("stiffness", k, low=0.0)
-    check_per_contact("stiffness", k, scene.contacts)
-    t = as_float_array("time", time)
-    check_shape("time", t, (), "one instant; vmap over many")
+    k = as_numbers("stiffness", stiffness, low=0.0, contacts=scene.contacts)
+    t = as_numbers("time", time, (), "one instant; vmap over many")
     n = scene.size
 
     def acceleration(x: jax.Array) -> jax.Array:

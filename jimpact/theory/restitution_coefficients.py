@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jimpact._checks import as_float_array, check_per_contact, check_values
+from jimpact._checks import as_numbers
 from jimpact.contact import normalized_delassus
 from jimpact.scene import Scene
 from jimpact.solvers.tridiagonal import as_matrix
@@ -61,9 +61,7 @@ def audit_coefficients(scene: Scene, restitution: Any) -> CoefficientAudit:
     Moreau's law with these coefficients: some impacts GAIN energy
     sufficient: 1 <= 0.3333: does not, which decides nothing
     """
-    e = as_float_array("restitution", restitution)
-    check_values("restitution", e, low=0.0, high=1.0)
-    check_per_contact("restitution", e, scene.contacts)
+    e = as_numbers("restitution", restitution, low=0.0, high=1.0, contacts=scene.contacts)
     closed = np.flatnonzero(np.asarray(scene.closed))
     if not closed.size:
         raise ValueError("Argument `scene` must have a closed contact, but all gaps are open.")

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_shape, check_values
+from jimpact._checks import as_numbers, check_shape, check_values
 from jimpact.compiling import full_precision
 from jimpact.contact import kinetic_norm, normalized_delassus, normalized_gap_velocity
 from jimpact.scene import Scene, kinetic_energy, velocity_change
@@ -101,9 +101,8 @@ def copositivity(
     >>> copositivity([[1.0, -1.0], [-1.0, 1.0]]).answer
     'boundary'
     """
-    q = as_float_array("matrix", matrix)
+    q = as_numbers("matrix", matrix)
     _size(q)
-    check_values("matrix", q)
     check_values("tolerance", tolerance, low=0.0)
     check_values("scale", scale, low=0.0)
     value, witness = (np.asarray(part) for part in _compiled_margin(q))
@@ -285,10 +284,8 @@ def carnot_energy_loss(scene: Scene, jump: Any, restitution: Any = 0.0) -> jax.A
     >>> float(carnot_energy_loss(ji.chain([1.0, 1.0]), [-0.5, 0.5]))
     0.25
     """
-    change, e = as_float_array("jump", jump), as_float_array("restitution", restitution)
-    check_shape("jump", change, (scene.size,), "one per coordinate of the scene")
-    check_shape("restitution", e, (), "one for all contacts")
-    check_values("restitution", e, low=0.0, high=1.0)
+    change = as_numbers("jump", jump, (scene.size,), "one per coordinate of the scene")
+    e = as_numbers("restitution", restitution, (), "one for all contacts", low=0.0, high=1.0)
     return (1 - e) / (1 + e) * kinetic_energy(scene, change)
 
 
@@ -297,9 +294,8 @@ def _closed_problem(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """G, norms and E of the closed contacts, and which those are."""
     m = scene.contacts
-    array = as_float_array("matrix", matrix)
+    array = as_numbers("matrix", matrix)
     check_shape("matrix", array, (m, m), "one row and one column per contact")
-    check_values("matrix", array)
     closed = np.asarray(scene.closed)
     if not closed.any():
         raise ValueError("Argument `scene` must have a closed contact, but all gaps are open.")

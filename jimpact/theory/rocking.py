@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_axis, as_float_array, check_shape, check_values
+from jimpact._checks import as_axis, as_numbers, check_values
 from jimpact.bodies.blocks import Block
 from jimpact.compiling import precise_jit
 from jimpact.impacts import impact
@@ -62,8 +62,7 @@ def housner_restitution(aspect: Any) -> jax.Array:
     >>> [round(float(ji.theory.housner_restitution(a)), 6) for a in (1.0, 2.0, 3.0)]
     [0.25, 0.7, 0.85]
     """
-    a = as_float_array("aspect", aspect)
-    check_values("aspect", a, low=0.0, open_low=True)
+    a = as_numbers("aspect", aspect, low=0.0, open_low=True)
     return 1 - 1.5 / (1 + a**2)
 
 
@@ -94,9 +93,8 @@ def rocking_matrix(restitution: Any) -> jax.Array:
     >>> (10 * ji.theory.rocking_matrix(0.7)).round().tolist()
     [[0.0, 7.0, 0.0], [7.0, 0.0, 0.0], [0.0, 0.0, -7.0]]
     """
-    e = as_float_array("restitution", restitution)
-    check_shape("restitution", e, (), "one ratio of angular velocities")
-    check_values("restitution", e, low=0.0, high=1.0)
+    ratio = "one ratio of angular velocities"
+    e = as_numbers("restitution", restitution, (), ratio, low=0.0, high=1.0)
     return e * jnp.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]], e.dtype)
 
 
@@ -208,8 +206,7 @@ def rocking_kinetic_angle(aspect: Any) -> jax.Array:
     >>> round(float(ji.theory.rocking_kinetic_angle(2.0**0.5)), 6)
     1.570796
     """
-    a = as_float_array("aspect", aspect)
-    check_values("aspect", a, low=0.0, open_low=True)
+    a = as_numbers("aspect", aspect, low=0.0, open_low=True)
     return jnp.arccos(-(a**2 - 2) / (a**2 + 4))
 
 
@@ -237,8 +234,7 @@ def critical_kinetic_angle(friction: Any) -> jax.Array:
     >>> [round(float(ji.theory.critical_kinetic_angle(mu)), 4) for mu in (0.0, 0.3, 1.0)]
     [1.5708, 1.3862, 1.231]
     """
-    mu = as_float_array("friction", friction)
-    check_values("friction", mu, low=0.0)
+    mu = as_numbers("friction", friction, low=0.0)
     slips = jnp.minimum(mu, 0.5**0.5)  # beyond, B sticks
     return rocking_kinetic_angle((jnp.sqrt(9 * slips**2 + 8) - 3 * slips) / 2)
 

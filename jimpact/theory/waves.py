@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.special import gammaln
 
-from jimpact._checks import as_float_array, as_whole, check_values
+from jimpact._checks import as_numbers, as_whole
 
 
 def nesterenko_speed(stiffness: Any, mass: Any, velocity: Any) -> jax.Array:
@@ -35,11 +35,9 @@ def nesterenko_speed(stiffness: Any, mass: Any, velocity: Any) -> jax.Array:
     >>> round(float(ji.theory.nesterenko_speed(8.0, 2.0, 3.0)), 6)
     1.983738
     """
-    k, m = as_float_array("stiffness", stiffness), as_float_array("mass", mass)
-    v = as_float_array("velocity", velocity)
-    check_values("stiffness", k, low=0.0, open_low=True)
-    check_values("mass", m, low=0.0, open_low=True)
-    check_values("velocity", v, low=0.0)
+    k = as_numbers("stiffness", stiffness, low=0.0, open_low=True)
+    m = as_numbers("mass", mass, low=0.0, open_low=True)
+    v = as_numbers("velocity", velocity, low=0.0)
     return (16 / 25) ** 0.2 * (k / m) ** 0.4 * v**0.2
 
 
@@ -75,7 +73,7 @@ def reinsch_chain(balls: int, mass: float = 1.0, stiffness: float = 1.0) -> tupl
     """
     n = as_whole("balls", balls, 2) - 1
     for name, value in (("mass", mass), ("stiffness", stiffness)):
-        check_values(name, as_float_array(name, value), low=0.0, open_low=True)
+        as_numbers(name, value, low=0.0, open_low=True)
     j = np.arange(n + 1)
     share = np.exp(_log_central(j) + _log_central(n - j) - _log_central(n))
     springs = share[:-1] * (j[:-1] + 0.5) * (n - j[:-1]) / (n / 2)
