@@ -32,7 +32,7 @@ _WRITTEN = 6  # velocities that the report lists
 SAMPLES = 100_000  # default number of samples; ten times more: quantiles three times finer
 
 
-class Inputs(eqx.Module):
+class Sources(eqx.Module):
     """Law, velocity and gaps of the samples: sources, or what was drawn from them for a chunk.
 
     A source is a distribution, a function of a key, `Rows`, or a constant (array, `Law`, None). Of
@@ -52,8 +52,8 @@ class Inputs(eqx.Module):
 
 @precise_jit
 def draw(
-    sources: Inputs, scene: Scene, key: jax.Array, lanes: jax.Array, rows: dict[str, jax.Array]
-) -> Inputs:
+    sources: Sources, scene: Scene, key: jax.Array, lanes: jax.Array, rows: dict[str, jax.Array]
+) -> Sources:
     """The chunk's law, velocities and gaps; `key` is the chunk's, `rows` are given samples."""
     keys = jax.vmap(lambda lane: jax.random.split(jax.random.fold_in(key, lane), 3))(lanes)
 
@@ -67,12 +67,12 @@ def draw(
 
     law = eqx.filter_vmap(sources.law)(keys[:, 0]) if sources.random["law"] else sources.law
     velocity = entries("velocity", scene.size, keys[:, 1], False)
-    return Inputs(law, velocity, entries("gaps", scene.contacts, keys[:, 2], True))
+    return Sources(law, velocity, entries("gaps", scene.contacts, keys[:, 2], True))
 
 
 @precise_jit
 def impacts(
-    drawn: Inputs, scene: Scene, random: dict[str, bool], size: int
+    drawn: Sources, scene: Scene, random: dict[str, bool], size: int
 ) -> tuple[jax.Array, jax.Array]:
     """Velocities (C, n) and statuses (C,) of a chunk; a bad draw has a code of its own."""
 
@@ -96,7 +96,7 @@ def impacts(
 class Plan:
     """Everything that determines the chunks; `plan(task)` computes one."""
 
-    sources: Inputs
+    sources: Sources
     scene: Scene
     key: np.ndarray  # of the run: its raw data
     key_kind: str
@@ -118,7 +118,7 @@ class Plan:
             samples[name] = np.asarray(getattr(drawn, source) if random[source] else empty)
         return reduced(task, samples, self.bins, self.keep_samples)
 
-    def sample(self, task: Task, lane: int) -> Inputs:
+    def sample(self, task: Task, lane: int) -> Sources:
         """Law, velocity and gaps of one sample, the same bits as in the run."""
         with self._flags():
             drawn, _ = self._drawn(task, None)
@@ -132,7 +132,7 @@ class Plan:
         with jax.enable_x64(self.x64), jax.threefry_partitionable(self.threefry_partitionable):
             yield
 
-    def _drawn(self, task: Task, device: jax.Device | None) -> tuple[Inputs, Scene]:
+    def _drawn(self, task: Task, device: jax.Device | None) -> tuple[Sources, Scene]:
         """The draws of the task; where its inputs are, there a program runs."""
         key = jax.random.wrap_key_data(jnp.asarray(self.key), impl=self.key_kind)
         key = jax.random.fold_in(key, np.uint32(task.number))
@@ -213,7 +213,7 @@ class Run:
 
 
 def planned_run(
-    sources: Inputs,
+    sources: Sources,
     scene: Scene,
     samples: int | None,
     key: Any,
@@ -254,7 +254,7 @@ def planned_run(
     return Run(plan, samples, rows)
 
 
-def _checked_sources(sources: Inputs, scene: Scene) -> Inputs:
+def _checked_sources(sources: Sources, scene: Scene) -> Sources:
     """Checked sources, all floating-point values in the widest type among them."""
     law, gaps = sources.law, sources.gaps
     if not isinstance(law, Law) and not callable(law):
@@ -262,7 +262,7 @@ def _checked_sources(sources: Inputs, scene: Scene) -> Inputs:
     velocity = as_source("velocity", sources.velocity, scene.size, non_negative=False)
     if gaps is not None:
         gaps = as_source("gaps", gaps, scene.contacts, non_negative=True)
-    checked = Inputs(law, velocity, gaps)
+    checked = Sources(law, velocity, gaps)
     if gaps is None and not any(checked.random.values()):
         raise ValueError(
             "Argument `gaps` must be given where neither the velocity nor the law is random: all "

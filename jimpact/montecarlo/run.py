@@ -19,7 +19,7 @@ import numpy as np
 from jimpact._checks import in_common_dtype, needed
 from jimpact.law import Law
 from jimpact.montecarlo.gaps import gap_scale
-from jimpact.montecarlo.plan import Inputs, Plan, Run, planned_run
+from jimpact.montecarlo.plan import Plan, Run, Sources, planned_run
 from jimpact.montecarlo.result import MonteCarlo, result_of
 from jimpact.montecarlo.statistics import Chunk, Task, joined
 from jimpact.montecarlo.store import Store
@@ -97,7 +97,7 @@ def monte_carlo(
     >>> [round(float(v), 2) for v in result.quantile(0.9)]  # one of two mirror images
     [-0.6, 0.16, 1.24]
     """
-    run = planned_run(Inputs(law, velocity, gaps), scene, samples, key, chunk, bins, keep_samples)
+    run = planned_run(Sources(law, velocity, gaps), scene, samples, key, chunk, bins, keep_samples)
     _check_executor(executor)
     if keep_samples and folder is None:
         raise ValueError("Argument `folder` must be given to keep samples, but is None.")
@@ -167,7 +167,7 @@ def _total(
     return total, resumed, (after - before) / (end - begin) if after > before else 0.0
 
 
-def _gap_scale(sources: Inputs, scene: Scene) -> np.ndarray | None:
+def _gap_scale(sources: Sources, scene: Scene) -> np.ndarray | None:
     """delta_c (m,), where law and velocity are constant and the law's contacts indent."""
     law, velocity = sources.law, sources.velocity
     if not (isinstance(law, Law) and isinstance(velocity, jax.Array)):
