@@ -23,6 +23,7 @@ from jimpact.cli import options
 from jimpact.cli.program_cache import stored_programs
 from jimpact.cli.study import Study, impact_study, without_none
 from jimpact.files.records import Column, Table, as_data
+from jimpact.files.study_file import is_motion
 from jimpact.law import with_parameter
 from jimpact.progress import Steps, waiting, wrapped
 from jimpact.registry import registered_laws
@@ -30,6 +31,7 @@ from jimpact.registry import registered_laws
 if TYPE_CHECKING:
     from matplotlib.figure import Figure  # which takes long to import
 
+    from jimpact.cli.study_motion import MotionStudy
     from jimpact.fits.report import Fit
     from jimpact.fits.selection import LawFits
     from jimpact.motion.record import Motion
@@ -149,12 +151,16 @@ def fit(command: options.FitCommand, steps: Steps) -> CommandResult:
         "seed": command.seed,
         "progress": steps.patience,
     }
+    study: Study | MotionStudy
     fits: dict[str, Fit] = {}
-    study = ji.read_study(command.study, command.law)
-    if not isinstance(study, Study):
+    if is_motion(command.study):
+        from jimpact.cli.study_motion import motion_study
+
+        study = motion_study(command.study, command.law)
         fits[RAW] = study.fit(**chosen, limit=command.limit)
         steps(_fit_in_words(RAW, fits[RAW]))
         return _fits_result(study.title, fits)
+    study = impact_study(command.study, command.law)
     end = np.inf if command.limit is None else time.monotonic() + command.limit
     chosen |= {"method": command.method}
     for name, each in _fits_of(study, command.all_free, fits):

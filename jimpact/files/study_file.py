@@ -192,6 +192,11 @@ def from_file(
         raise ValueError(f"{path}: {error}") from None
 
 
+def is_motion(path: str | Path) -> bool:
+    """Whether a study is of a motion."""
+    return from_file(path, None, None, lambda study: study.motion)
+
+
 def check_study(
     path: str | Path, law: str | None = None, motion: bool | None = None
 ) -> CheckedStudy:

@@ -12,9 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_whole, check_per_contact, check_shape, check_values
-from jimpact.compiling import full_precision, precise_jit
+from jimpact.compiling import full_precision
 from jimpact.contact import components, kinetic_angles
-from jimpact.fits.parameters import with_entries
 from jimpact.impacts import impact
 from jimpact.law import Law, check_law, free_parameters_of, options_of
 from jimpact.laws.binary import Binary
@@ -24,7 +23,14 @@ from jimpact.laws.kinematic import Moreau, Newton
 from jimpact.laws.lzb import LZB, default_rtol
 from jimpact.laws.poisson import Poisson
 from jimpact.methods.advice_report import Advice, Candidate, ContactBlock, Unknown
-from jimpact.methods.points import EnergyNorm, Outcomes, in_batches, in_turns, left_out_if_it_raises
+from jimpact.methods.points import (
+    EnergyNorm,
+    Outcomes,
+    in_batches,
+    in_turns,
+    left_out_if_it_raises,
+    varied_impacts,
+)
 from jimpact.montecarlo.gaps import gap_scale
 from jimpact.progress import counting_bar
 from jimpact.registry import ADVISED, REGISTRY, simplest_first
@@ -130,8 +136,8 @@ class Trial(NamedTuple):
         scene = self.scene
         if scene.gaps is None:  # scenes with and without gaps share one compiled program
             scene = with_gaps(scene, jnp.zeros(scene.contacts, scene.mass.dtype))
-        rows = jnp.asarray(stiffness, v.dtype) if self.has_stiffness else None
-        return _batch(self.law, scene, v, rows)
+        rows = {"stiffness": jnp.asarray(stiffness, v.dtype)} if self.has_stiffness else {}
+        return varied_impacts(self.law, scene, v, rows)
 
 
 def advise(
@@ -451,18 +457,6 @@ def trials(situation: Situation, law: LZB) -> dict[str, Trial]:
 
 
 # -------------------------------------------------------------------------- running the laws
-
-
-@precise_jit
-def _batch(law: Law, scene: Scene, velocity: jax.Array, stiffness: jax.Array | None) -> Outcomes:
-    """The law at velocities (r, n), and at rows of stiffness (r, m) if it has one."""
-
-    def one(v: jax.Array, k: jax.Array | None) -> Outcomes:
-        """One impact."""
-        tried = law if k is None else with_entries(law, ("stiffness",), k)
-        return Outcomes.of(impact(tried, scene, v))
-
-    return jax.vmap(one)(velocity, stiffness)
 
 
 def _outcomes(

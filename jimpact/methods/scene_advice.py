@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -11,14 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_whole, check_kind, check_shape, check_values
-from jimpact.compiling import precise_jit
 from jimpact.contact import delassus_matrix
 from jimpact.files.records import Column, Table, Tabular, fields_as_data, listed
-from jimpact.impacts import impact
 from jimpact.law import Law, check_law
 from jimpact.methods.advice import blocks_of
 from jimpact.methods.advice_report import ContactBlock, share
-from jimpact.methods.points import EnergyNorm, Outcomes, in_batches
+from jimpact.methods.points import EnergyNorm, Outcomes, in_batches, varied_impacts
 from jimpact.scene import Scene, as_velocity, gap_velocity, with_gaps
 from jimpact.solvers.tridiagonal import diagonal
 from jimpact.status import STATUS
@@ -207,12 +204,6 @@ class _Simpler(NamedTuple):
     law: Law
     scene: Scene
 
-    @property
-    def lanes(self) -> int:
-        """Impacts computed together."""
-        m = self.scene.contacts
-        return max(1, min(LANES, m + 1, ENTRIES // m**2))
-
     def without(self, left_out: Any) -> Scene:
         """The scene whose contacts of these indices have an infinite gap."""
         gaps = self.gaps([left_out])[0]
@@ -229,25 +220,21 @@ class _Simpler(NamedTuple):
 
     def run(self, velocity: jax.Array, left_out: Sequence[Any]) -> Outcomes:
         """An impact for each set of contacts to leave out, some at a time."""
-        run = partial(_batch, self.law, self.scene, velocity)
-        return in_batches(run, self.gaps(left_out), self.lanes)
+        m = self.scene.contacts
+        lanes = max(1, min(LANES, m + 1, ENTRIES // m**2))
+        velocities = jnp.tile(velocity, (lanes, 1))
+
+        def run(gaps: Any) -> Outcomes:
+            """Some of them."""
+            return varied_impacts(self.law, self.scene, velocities, {"gaps": jnp.asarray(gaps)})
+
+        return in_batches(run, self.gaps(left_out), lanes)
 
     def changes(
         self, velocity: jax.Array, left_out: Sequence[Any], reference: np.ndarray
     ) -> np.ndarray:
         """Changes (r, n) of v+ from the reference (n,); NaN where the law fails."""
         return self.run(velocity, left_out).where_usable().velocity - reference
-
-
-@precise_jit
-def _batch(law: Law, scene: Scene, velocity: jax.Array, gaps: Any) -> Outcomes:
-    """The impact with each row of gaps (r, m)."""
-
-    def one(gaps: jax.Array) -> Outcomes:
-        """One impact."""
-        return Outcomes.of(impact(law, with_gaps(scene, gaps), velocity))
-
-    return jax.vmap(one)(gaps)
 
 
 def _frictions(

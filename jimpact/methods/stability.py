@@ -40,22 +40,32 @@ _FEW_BALLS, _FEW = (2, 3, 10), 8
 
 
 class Axis(NamedTuple):
-    """Value of an axis at the base point of the slices, the ends of its range, default values."""
+    """Value of an axis at the base point of the slices, and the ends of its range.
+
+    `least` is the smallest value above 0 of an axis by powers; 0: it is linear.
+    """
 
     base: float
     low: float
     high: float
-    values: Callable[[int], np.ndarray]  # of so many; of balls at most six
+    least: float = 0.0
+
+    def values(self, count: int) -> np.ndarray:
+        """So many values over the range."""
+        if not self.least:
+            return np.linspace(self.low, self.high, count)
+        zero = [] if self.low else [0.0]
+        return np.append(zero, np.geomspace(self.least, self.high, count - len(zero)))
 
 
 _AXES = {  # base: three equal Hertz balls; rtol 1e-8, time step 0.05, impulse step 1e-3
-    "setting": Axis(0.6, 0.0, 1.0, lambda r: np.linspace(0, 1, r)),
-    "stiffness_ratio": Axis(1.0, 1e-8, 1e8, lambda r: np.logspace(-8, 8, r)),
-    "exponent": Axis(1.5, 1.0, 5.0, lambda r: np.linspace(1, 5, r)),
-    "restitution": Axis(0.9, 0.0, 1.0, lambda r: np.append(0.0, np.logspace(-3, 0, r - 1))),
-    "mass_ratio": Axis(1.0, 1e-6, 1e6, lambda r: np.logspace(-6, 6, r)),
-    "balls": Axis(3.0, 2.0, 1000.0, lambda r: np.array(BALLS if r >= _FEW else _FEW_BALLS, float)),
-    "friction": Axis(0.3, 0.0, 10.0, lambda r: np.append(0.0, np.logspace(-1.5, 1, r - 1))),
+    "setting": Axis(0.6, 0.0, 1.0),
+    "stiffness_ratio": Axis(1.0, 1e-8, 1e8, 1e-8),
+    "exponent": Axis(1.5, 1.0, 5.0),
+    "restitution": Axis(0.9, 0.0, 1.0, 1e-3),
+    "mass_ratio": Axis(1.0, 1e-6, 1e6, 1e-6),
+    "balls": Axis(3.0, 2.0, 1000.0),
+    "friction": Axis(0.3, 0.0, 10.0, 0.03),
 }
 AXES = tuple(_AXES)
 # kind of setting (see `jimpact.methods.contenders.Contender`): value at level 0 and at level 1
@@ -356,7 +366,8 @@ def _checked(argument: str, values: Mapping[str, Any], names: tuple[str, ...]) -
 
 def default_axes(r: int, names: tuple[str, ...] = Place().axes) -> dict[str, np.ndarray]:
     """r values of each axis (number of balls: at most six)."""
-    return {name: _AXES[name].values(r) for name in names}
+    balls = np.array(BALLS if r >= _FEW else _FEW_BALLS, float)
+    return {name: balls if name == "balls" else _AXES[name].values(r) for name in names}
 
 
 def _axis_values(

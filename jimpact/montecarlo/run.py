@@ -9,7 +9,6 @@ import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -243,25 +242,18 @@ def _shipped(plan: Plan) -> Work:
     except ImportError:
         dumps = pickle.dumps
     try:
-        return _Shipped(dumps(plan), plan.x64)
+        return functools.partial(_compute, dumps(plan), plan.x64)
     except Exception:  # objects refuse to be pickled in many ways; threads need no pickle
         return plan
 
 
-@dataclass(frozen=True)
-class _Shipped:
-    """A plan as bytes, and its precision."""
-
-    plan: bytes
-    x64: bool
-
-    def __call__(self, task: Task) -> Chunk:
-        """One chunk."""
-        return _unpacked(self)(task)
+def _compute(plan: bytes, x64: bool, task: Task) -> Chunk:
+    """One chunk of a pickled plan."""
+    return _unpacked(plan, x64)(task)
 
 
 @functools.lru_cache(maxsize=4)
-def _unpacked(shipped: _Shipped) -> Plan:
+def _unpacked(plan: bytes, x64: bool) -> Plan:
     """The same object for the same bytes, so that a worker compiles a run only once."""
-    with jax.enable_x64(shipped.x64):  # else a worker would read float64 arrays as float32
-        return pickle.loads(shipped.plan)
+    with jax.enable_x64(x64):  # else a worker would read float64 arrays as float32
+        return pickle.loads(plan)

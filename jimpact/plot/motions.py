@@ -20,7 +20,7 @@ from jimpact.plot.style import COLOURS, GREY, colour_of, new_figure, styled
 
 POINT = 0.02  # radius in which a point mass is drawn, of the range of its coordinates
 _MARKED = ("accumulation", "detachment", "friction")  # events with a line style of their kind
-_MANY = 60  # up to this number of impacts each is marked by a line
+_MANY = 20  # up to this number of impacts each is marked by a line; more are a grey block
 _BASEPOINTS = 1000  # at which a base is drawn
 _FEW = 6  # curves that one panel shows by default, each with its entry in the legend
 # Share of the scale of its unit below which what a panel shows is rounding. Ten times more would
