@@ -52,7 +52,9 @@ def three_balls(
         axes.plot(values, velocity[:, i], label=f"ball {i + 1}", **style)
     if failed.any():
         across = axes.get_xaxis_transform()
-        grey = {"color": "#dddddd", "lw": 0, "label": "flagged"}
+        names = dict.fromkeys(ji.STATUS[int(code)].name for code in status[failed])
+        why = f"flagged: {', '.join(names).replace('_', ' ')}"
+        grey = {"color": "#dddddd", "lw": 0, "label": why}
         axes.fill_between(values, 0, 1, where=failed, transform=across, **grey)
     axes.axhline(0, color="black", lw=0.6)
     axes.set_xlim(values[0], values[-1])

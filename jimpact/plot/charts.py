@@ -1,6 +1,6 @@
 """Pictures of error against time, of stability, of where laws are valid, and of advice."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -90,10 +90,10 @@ def work_precision(result: WorkPrecision, title: str = "") -> Figure:
     count, height = (4, 3.6) if gradients else (2, 4.6)
     figure, panels = new_panels(count, height, title=title)
     styles = _styles(result.points)
-    for axes, (quantity, place, x, y) in zip(panels, _PANELS):
+    for axes, (quantity, against, label) in zip(panels, _PANELS):
         for name, row in result.points.items():
-            _draw(axes, row, quantity, place, styles[name])
-        _finish(axes, result.reference.uncertainty[quantity], x, y)
+            _draw(axes, row, quantity, against, styles[name])
+        _finish(axes, result.reference.uncertainty[quantity], label, _ERRORS[quantity])
     if not gradients:
         legend_below(figure, 2, note=_note(result))
     else:  # next to the three panels
@@ -124,55 +124,35 @@ def _styles(points: Mapping[str, tuple[Point, ...]]) -> dict[str, dict[str, Any]
     return styles
 
 
-def _times(timing: Timing | None) -> tuple[float, Any]:
-    """Median [us] and the lengths of its error bar."""
-    if timing is None:
-        return float("nan"), None
-    median, low, high = 1e6 * np.array(timing)
-    return median, (median - low, high - median)
-
-
-_PANELS: tuple[tuple[str, Callable[[Point], tuple[float, Any]], str, str], ...] = (
-    (
-        "velocity",
-        lambda point: _times(point.batched),
-        "time per impact in a batch [µs]",
-        "error of v⁺, relative",
-    ),
-    (
-        "velocity",
-        lambda point: (point.evaluations, None),
-        "field evaluations per impact",
-        "error of v⁺, relative",
-    ),
-    (
-        "gradient",
-        lambda point: _times(point.gradient),
-        "time per impact with its gradient [µs]",
-        "error of ∂v⁺/∂(ln k, e)",
-    ),
+_ERRORS = {"velocity": "error of v⁺, relative", "gradient": "error of ∂v⁺/∂(ln k, e)"}
+_PANELS = (  # error, and what it is drawn against
+    ("velocity", "batched", "time per impact in a batch [µs]"),
+    ("velocity", "evaluations", "field evaluations per impact"),
+    ("gradient", "gradient", "time per impact with its gradient [µs]"),
 )
 
 
 def _draw(
-    axes: Axes,
-    row: tuple[Point, ...],
-    quantity: str,
-    place: Callable[[Point], tuple[float, Any]],
-    style: dict[str, Any],
+    axes: Axes, row: tuple[Point, ...], quantity: str, against: str, style: dict[str, Any]
 ) -> None:
     """One line; none where no point has a time or a count, and an error."""
-    places = [(point, *place(point)) for point in row]
-    drawn = [each for each in places if np.isfinite([each[1], each[0].error[quantity]]).all()]
-    if not drawn:
+    points, places, bars = [], [], []
+    for point in row:
+        x, spread = getattr(point, against), (0.0, 0.0)
+        if isinstance(x, Timing):
+            x, low, high = 1e6 * np.array(x)
+            spread = x - low, high - x
+        if x is not None and np.isfinite([x, point.error[quantity]]).all():
+            points.append(point)
+            places.append(x)
+            bars.append(spread)
+    if not points:
         return
-    points, x, bars = zip(*drawn)
-    y = [max(point.error[quantity], _LEAST) for point in points]
-    spread = None if bars[0] is None else np.array(bars).T
-    axes.errorbar(x, y, xerr=spread, label=points[0].label, elinewidth=1, capsize=2, **style)
+    x, y = np.array(places), np.maximum([p.error[quantity] for p in points], _LEAST)
+    timed = np.array(bars).T if np.any(bars) else None
+    axes.errorbar(x, y, xerr=timed, label=points[0].label, elinewidth=1, capsize=2, **style)
     failed = np.array([STATUS[CODE[point.status]].failure for point in points])
-    hollow = style | {"ls": "none", "mfc": "white", "zorder": 4}
-    axes.plot(np.array(x)[failed], np.array(y)[failed], **hollow)
+    axes.plot(x[failed], y[failed], **style | {"ls": "none", "mfc": "white", "zorder": 4})
 
 
 def _finish(axes: Axes, uncertainty: float, x: str, y: str) -> None:
