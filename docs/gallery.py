@@ -28,7 +28,7 @@ def picture(function: Callable) -> Callable:
     return function
 
 
-@styled
+@styled()
 def three_balls(
     make: Callable, values: np.ndarray, label: str, log: bool = False, shares: bool = False
 ) -> Figure:
@@ -308,7 +308,7 @@ def force_chains():
 
 
 @picture
-@styled
+@styled()
 def drops():
     """Drops of a square: median error of the predicted angle after a hit, from two flights."""
     with np.load(Path(__file__).parents[1] / "tests" / "data" / "drops.npz") as stored:

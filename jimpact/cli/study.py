@@ -87,7 +87,7 @@ def impact_study(path: str | Path, law: str | None = None) -> Study:
 
 def study_of(checked: CheckedStudy) -> Study:
     """The study of checked tables."""
-    tables, free = checked.tables, checked.free
+    tables, free = checked.tables, checked.law.free
     scene, body = _scene(tables["scene"])
     row, values = REGISTRY[checked.law.name], checked.law.arguments
     if row.law is RestitutionMatrix and "matrix" not in values:

@@ -100,7 +100,7 @@ def motion_study(path: str | Path, law: str | None = None) -> MotionStudy:
 
 def _motion_study_of(checked: CheckedStudy) -> MotionStudy:
     """The study of checked tables."""
-    tables, free = checked.tables, checked.free
+    tables, free = checked.tables, checked.law.free
     values = with_exponent(checked.law.arguments, free)
     law = REGISTRY[checked.law.name].build(**values)
     motion = tables["motion"]

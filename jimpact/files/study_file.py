@@ -110,21 +110,24 @@ def declared_laws() -> dict[str, dict[str, Any]]:
 
 
 class LawTable(NamedTuple):
-    """The table [law] of a study: the law's name, its arguments, what `fit` knows of them."""
+    """The table [law] of a study: the law's name, its arguments, what `fit` knows of them.
+
+    `free` maps names to masks.
+    """
 
     name: str
     arguments: dict[str, Any]
     bounds: dict[str, Any]
     priors: dict[str, Any]
+    free: dict[str, Any]
 
 
 class CheckedStudy(NamedTuple):
-    """A study whose keys, words and ranges are right; `free` maps names to masks."""
+    """A study whose keys, words and ranges are right."""
 
     path: Path
     tables: dict[str, Any]
     law: LawTable
-    free: dict[str, Any]
     motion: bool  # whether it is of a motion, else of one impact
     rows: int = 0  # shots or samples of its data, where these have been read
 
@@ -186,8 +189,8 @@ def from_file(
             check_scene(tables["scene"])
             check_sampling(tables.get("monte_carlo", {}))
         free = masks(tables.get("fit", {}).get("free", []))
-        checked, free = check_law(tables["law"], law, free, prepare is not None)
-        return build(CheckedStudy(path, tables, checked, free, moves))
+        checked = check_law(tables["law"], law, free, prepare is not None)
+        return build(CheckedStudy(path, tables, checked, moves))
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None
 
@@ -288,7 +291,7 @@ def body_keys(
 
 def check_law(
     table: Mapping[str, Any], other_law: str | None, free: dict[str, Any], modules: bool
-) -> tuple[LawTable, dict[str, Any]]:
+) -> LawTable:
     """The table [law], checked by the declaration of its law, and what is free of that law.
 
     `modules`: whether the module that a study names has been imported.
@@ -303,7 +306,7 @@ def check_law(
     for key in (study_law, name):
         if key not in laws:
             if "module" in table and not modules:
-                return LawTable(name, arguments, **known), free
+                return LawTable(name, arguments, **known, free=free)
             raise ValueError(
                 f"the law must be one of {', '.join(laws)}, but is {key!r}.{suggestion(key, laws)}"
             )
@@ -328,7 +331,7 @@ def check_law(
                     f"it has {', '.join(declared['free'])}."
                     f"{suggestion(parameter, declared['free'], ABBREVIATIONS)}"
                 )
-    return LawTable(name, arguments, **known), free
+    return LawTable(name, arguments, **known, free=free)
 
 
 def _field(name: str) -> str:

@@ -199,8 +199,7 @@ def advise(
     >>> advice.name, advice.reason
     ('newton', "single contact: every law is Newton's")
     """
-    v = as_velocity(scene, velocity)
-    check_values("velocity", v)
+    v = as_velocity(scene, velocity, finite=True)
     k = np.ones(()) if stiffness is None else stiffness
     parameters = {"restitution": restitution, "stiffness": k, "exponent": exponent}
     if friction is not None:

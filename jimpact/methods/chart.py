@@ -282,8 +282,7 @@ class Case(NamedTuple):
 
 def _case(scene: Scene, velocity: Any, law: LZB, batch: int) -> Case:
     """The impact in double precision, one parameter per contact, with a batch around it."""
-    v = as_velocity(scene, velocity)
-    check_values("velocity", v)
+    v = as_velocity(scene, velocity, finite=True)
     if not isinstance(law, LZB):
         raise TypeError(f"Argument `law` must be an LZB law, but is {type(law).__name__}.")
     law, scene, v = in_common_dtype(law, scene, v)

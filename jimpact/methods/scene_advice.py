@@ -161,8 +161,7 @@ def simplest_scene(
     """
     check_kind("law", law, Law)
     check_kind("scene", scene, Scene)
-    v = as_velocity(scene, velocity)
-    check_values("velocity", v)
+    v = as_velocity(scene, velocity, finite=True)
     check_law(law, scene, v.dtype)
     check_shape("tolerance", tolerance, (), "one number")
     check_values("tolerance", tolerance, low=0.0, high=1.0, open_low=True)

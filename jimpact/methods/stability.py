@@ -334,8 +334,7 @@ def _place(scene: Scene | None, velocity: Any) -> Place:
         return Place()
     if velocity is None:
         raise ValueError("Argument `velocity` must be given with a `scene`, but is None.")
-    v = as_velocity(scene, velocity)
-    check_values("velocity", v)
+    v = as_velocity(scene, velocity, finite=True)
     if not bool(LZB(1.0).contact(scene, v).happens):
         raise ValueError("Argument `velocity` must let a closed contact approach.")
     return Place(scene, v / jnp.max(jnp.abs(v)))

@@ -117,8 +117,7 @@ def validity_map(
     >>> result.velocity[0, :, 1:].round(3).tolist()  # binary, dispersed, Moreau
     [[0.0, 1.0], [0.15, 0.98], [0.666, 0.667]]
     """
-    v = as_velocity(scene, velocity)
-    check_values("velocity", v)
+    v = as_velocity(scene, velocity, finite=True)
     if not np.asarray(v).any():
         raise ValueError("Argument `velocity` must not be zero: nothing happens at rest.")
     if scene.contacts < 2 or not np.asarray(scene.closed).all():

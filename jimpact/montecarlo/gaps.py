@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import check_values, is_traced
+from jimpact._checks import is_traced
 from jimpact.contact import delassus_matrix
 from jimpact.files.records import readable_unit
 from jimpact.law import Law, check_law
@@ -88,8 +88,7 @@ def gap_scale(scene: Scene, law: Law, velocity: Any) -> GapScale:
     gap 2 is 3.18 delta_c (delta_c = 31.4 µm): wide, its collisions come one after another
     delta_c: indentation of a contact at the largest approach speed of the scene
     """
-    v = as_velocity(scene, velocity)
-    check_values("velocity", v)
+    v = as_velocity(scene, velocity, finite=True)
     force = law.contact_force
     if force is None:
         raise TypeError(

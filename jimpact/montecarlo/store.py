@@ -78,7 +78,8 @@ def _source(function: Any) -> Any:
     try:
         return inspect.getsource(function)
     except (OSError, TypeError):
-        return function.__code__.co_code, function.__code__.co_names
+        code = function.__code__
+        return code.co_code, code.co_names, [x for x in code.co_consts if not inspect.iscode(x)]
 
 
 def _name(value: Any) -> str:

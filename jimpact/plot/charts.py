@@ -9,7 +9,6 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from jimpact._checks import check_kind
 from jimpact.methods.advice_report import Advice, as_code, share
 from jimpact.methods.chart import Point, Timing, WorkPrecision
 from jimpact.methods.stability import CLASSES, Slice, StabilityMap
@@ -60,7 +59,7 @@ _STYLES = {"moreau": "--", "binary": ":"}
 _FLOOR = 1e-9  # smaller errors are drawn here
 
 
-@styled
+@styled(WorkPrecision)
 def work_precision(result: WorkPrecision, title: str = "") -> Figure:
     """Panels: error of v+ against time and against evaluations, and that of the gradient if known.
 
@@ -85,7 +84,6 @@ def work_precision(result: WorkPrecision, title: str = "") -> Figure:
     >>> len(ji.plot.work_precision(result).axes)
     2
     """
-    check_kind("result", result, WorkPrecision)
     gradients = any(point.gradient is not None for row in result.points.values() for point in row)
     count, height = (4, 3.6) if gradients else (2, 4.6)
     figure, panels = new_panels(count, height, title=title)
@@ -176,7 +174,7 @@ def _note(result: WorkPrecision) -> str:
     )
 
 
-@styled
+@styled(StabilityMap)
 def stability_map(result: StabilityMap, title: str = "") -> Figure:
     """One panel an axis: a row for each method, a column for each value; other axes at the base.
 
@@ -196,7 +194,6 @@ def stability_map(result: StabilityMap, title: str = "") -> Figure:
     >>> len(ji.plot.stability_map(result).axes)
     1
     """
-    check_kind("result", result, StabilityMap)
     names = list(result.axes)
     figure, grid = new_panels(len(names), 0.8 + 0.3 * len(result.methods), 1.2, title)
     for i, (axes, name) in enumerate(zip(grid, names)):
@@ -210,7 +207,7 @@ def stability_map(result: StabilityMap, title: str = "") -> Figure:
     return figure
 
 
-@styled
+@styled(StabilityMap)
 def stability_pairs(result: StabilityMap, method: str, title: str = "") -> Figure:
     """One panel for every pair of axes, for one method; a ring marks the base point.
 
@@ -303,7 +300,7 @@ def _legend_of_classes(figure: Figure, result: StabilityMap) -> None:
     legend_below(figure, 4, [Patch(color=CLASS_COLOURS[i], label=CLASSES[i]) for i in occurring])
 
 
-@styled
+@styled(ValidityMap)
 def validity_map(result: ValidityMap, tolerance: float = 1e-2, title: str = "") -> Figure:
     """Dispersion against the stiffness ratio, and the errors of the laws that do not know it.
 
@@ -326,7 +323,6 @@ def validity_map(result: ValidityMap, tolerance: float = 1e-2, title: str = "") 
     >>> len(ji.plot.validity_map(result).axes)
     2
     """
-    check_kind("result", result, ValidityMap)
     default = "Where the stiffness ratio may be left out"
     figure, (top, bottom) = new_figure(6.8, title or default, 2, 1, sharex=True)
     for i, eta in enumerate(result.exponents):
@@ -349,7 +345,7 @@ def validity_map(result: ValidityMap, tolerance: float = 1e-2, title: str = "") 
     return figure
 
 
-@styled
+@styled(Advice)
 def advice(result: Advice, title: str = "") -> Figure:
     """Outcomes of every law, with their range over the unknown ratios, above their errors.
 
@@ -368,7 +364,6 @@ def advice(result: Advice, title: str = "") -> Figure:
     >>> len(ji.plot.advice(result).axes)
     2
     """
-    check_kind("result", result, Advice)
     names, rows = list(result.candidates), list(result.candidates.values())
     chain = result.scene.walls is not None
     what, unit = ("body", "m/s") if chain else ("coordinate", "m/s, rad/s")

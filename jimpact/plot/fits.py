@@ -9,7 +9,6 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from jimpact._checks import check_kind
 from jimpact.fits.profiles import Contour
 from jimpact.fits.uncertainty import FitResult
 from jimpact.plot.style import (
@@ -27,7 +26,7 @@ from jimpact.plot.style import (
 _LABELLED = 16  # up to this number of shots each has a label
 
 
-@styled
+@styled(FitResult)
 def fit(fit: FitResult, others: Mapping[str, FitResult] | None = None, title: str = "") -> Figure:
     """Velocities after every shot, or what else was measured, and fitted, above the residuals.
 
@@ -51,7 +50,6 @@ def fit(fit: FitResult, others: Mapping[str, FitResult] | None = None, title: st
     >>> len(figure.axes)
     2
     """
-    check_kind("fit", fit, FitResult)
     data = fit.experiments
     measured, predicted = _in_rows(fit.problem.measured), _in_rows(fit.predicted)
     shots, bodies = predicted.shape
@@ -82,7 +80,7 @@ def fit(fit: FitResult, others: Mapping[str, FitResult] | None = None, title: st
     return figure
 
 
-@styled
+@styled(Contour)
 def contour(result: Contour, title: str = "") -> Figure:
     """The confidence region of two parameters, and how the deviance rises around the fit.
 
@@ -105,7 +103,6 @@ def contour(result: Contour, title: str = "") -> Figure:
     >>> ji.plot.contour(region).axes[0].get_xlabel()
     'e[1]'
     """
-    check_kind("result", result, Contour)
     figure, axes = new_figure(5.0, title)
     d, limit = np.where(np.isfinite(result.deviance), result.deviance, np.nan).T, result.limit
     axes.contourf(result.x, result.y, d, [0.0, limit], colors=[COLOURS[0]], alpha=0.25)

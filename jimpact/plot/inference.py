@@ -21,7 +21,7 @@ _SHARES = (0.68, 0.95)  # of the regions in it
 _TWO_SIDED = 1.96  # standard errors: 95 % of normal noise lies within
 
 
-@styled
+@styled()
 def profiles(result: tuple[Profile, ...] | list[Profile]) -> Figure:
     """Deviance over each parameter, with the limit and the interval below it.
 
@@ -60,7 +60,7 @@ def profiles(result: tuple[Profile, ...] | list[Profile]) -> Figure:
     return figure
 
 
-@styled
+@styled(FitResult)
 def correlation(fit: FitResult) -> Figure:
     """Correlations of the parameters' errors; empty where the data cannot see one of them.
 
@@ -79,7 +79,6 @@ def correlation(fit: FitResult) -> Figure:
     >>> len(ji.plot.correlation(result).axes)
     2
     """
-    check_kind("fit", fit, FitResult)
     count = len(fit.names)
     figure, axes = new_figure(float(np.clip(1.8 + 0.5 * count, 3.0, 7.2)))
     finite: Any = np.ma.masked_invalid(fit.correlation)
@@ -97,7 +96,7 @@ def correlation(fit: FitResult) -> Figure:
     return figure
 
 
-@styled
+@styled(FitResult)
 def residuals(fit: FitResult) -> Figure:
     """Measured against fitted; residuals in standard errors over the speed, and their quantiles.
 
@@ -119,7 +118,6 @@ def residuals(fit: FitResult) -> Figure:
     >>> len(ji.plot.residuals(result).axes)
     3
     """
-    check_kind("fit", fit, FitResult)
     problem = fit.problem
     measured = np.asarray(problem.measured, float)
     here = ~np.isnan(measured)
@@ -159,7 +157,7 @@ def _over(fit: FitResult) -> tuple[np.ndarray, str]:
     return data.approach_speed(scene)[:, None], "fastest approach [m/s]"
 
 
-@styled
+@styled(FitResult)
 def corner(fit: FitResult, draws: Any = None, names: Sequence[str] | None = None) -> Figure:
     """Every parameter, and every pair of them: intervals and regions of the fit, or of draws.
 
@@ -185,7 +183,6 @@ def corner(fit: FitResult, draws: Any = None, names: Sequence[str] | None = None
     >>> len(ji.plot.corner(result).axes)
     3
     """
-    check_kind("fit", fit, FitResult)
     for name in names or ():
         check_choice("names", name, fit.names)
     known = np.isfinite(fit.standard_error) & (fit.standard_error > 0)

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
-from jimpact._checks import check_kind
 from jimpact.files.records import readable_unit
 from jimpact.laws.histories import History
 from jimpact.methods.comparison import Comparison
@@ -34,7 +33,7 @@ _UPRIGHT = 8  # names that stand side by side, at most
 _OUTCOMES = 4000  # dots of a set of outcomes; ten times more would only be one area
 
 
-@styled
+@styled(Comparison)
 def comparison(result: Comparison, measured: np.ndarray | None = None, title: str = "") -> Figure:
     """Velocities after the impact by law, energy ratios T+/T- and dispersion indices.
 
@@ -57,7 +56,6 @@ def comparison(result: Comparison, measured: np.ndarray | None = None, title: st
     >>> len(ji.plot.comparison(result).axes)
     2
     """
-    check_kind("result", result, Comparison)
     if measured is not None:
         result = dataclasses.replace(result, measured=np.asarray(measured))
     entries, chain = list(result.entries.values()), result.scene.walls is not None
@@ -97,7 +95,7 @@ def comparison(result: Comparison, measured: np.ndarray | None = None, title: st
     return figure
 
 
-@styled
+@styled(Comparison)
 def energy_plane(result: Comparison, title: str = "") -> Figure:
     """Every law in the plane of energy kept (K_ER = T+/T-) and of its dispersion (C_KE).
 
@@ -119,7 +117,6 @@ def energy_plane(result: Comparison, title: str = "") -> Figure:
     >>> ji.plot.energy_plane(result).axes[0].get_xlabel()
     'energy ratio K_ER = T+/T-'
     """
-    check_kind("result", result, Comparison)
     figure, axes = new_figure(5.4, title)
     allowed = admissible_set(result.scene, result.velocity).sample(0, _OUTCOMES)
     axes.plot(
@@ -140,7 +137,7 @@ def _kept_and_spread(result: Comparison, after: np.ndarray) -> tuple[np.ndarray,
     return np.asarray(kept), np.asarray(jax.vmap(lambda x: energy_dispersion(scene, x))(v))
 
 
-@styled
+@styled()
 def forces(histories: Mapping[str, History], contact: int = -1) -> Figure:
     """Force at one contact over impact time, one line a history.
 
@@ -167,7 +164,7 @@ def forces(histories: Mapping[str, History], contact: int = -1) -> Figure:
     return figure
 
 
-@styled
+@styled(History)
 def contact_loop(result: History, contact: int = -1, title: str = "") -> Figure:
     """Force of one contact against its true approach; between the ends it encloses the lost energy.
 
@@ -211,13 +208,12 @@ def contact_loop(result: History, contact: int = -1, title: str = "") -> Figure:
 
 
 def _check_one(result: History) -> None:
-    """Refuse what is no history, and batches of them."""
-    check_kind("result", result, History)
+    """Refuse batches of impacts."""
     if np.ndim(result.status):
         raise ValueError("Argument `result` must be of one impact, but is a batch: pick one of it.")
 
 
-@styled
+@styled(History)
 def history(result: History, title: str = "") -> Figure:
     """One impact over its time: forces, gap velocities and stored energy of every contact.
 

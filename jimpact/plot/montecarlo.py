@@ -8,7 +8,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jimpact._checks import check_kind
 from jimpact.files.records import readable_unit
 from jimpact.montecarlo.result import MonteCarlo
 from jimpact.montecarlo.statistics import FAILURE
@@ -21,7 +20,7 @@ _DOT = 4.0  # area of a sample in the map [points^2]
 _TITLE = 80  # letters of a line of the title
 
 
-@styled
+@styled(MonteCarlo)
 def monte_carlo(result: MonteCarlo, title: str = "") -> Figure:
     """Histograms of every body, and the first samples over two gaps, coloured by the outcome.
 
@@ -46,7 +45,6 @@ def monte_carlo(result: MonteCarlo, title: str = "") -> Figure:
     >>> len(ji.plot.monte_carlo(result).axes)  # three bodies, map, its colour bar
     5
     """
-    check_kind("result", result, MonteCarlo)
     scattered = np.argsort(-result.std, kind="stable")
     bodies = sorted(scattered[:_BODIES].tolist())
     mapped = result.first["gaps"].shape[1] > 0

@@ -35,7 +35,7 @@ def one_motion(motion: Motion) -> None:
         raise ValueError("Argument `motion` must be one motion, but is a batch: pick one of it.")
 
 
-@styled
+@styled()
 def motion(
     motion: Motion,
     title: str = "",
@@ -309,7 +309,7 @@ def _ledger(axes: Axes, motion: Motion, course: _Course, system: System | None) 
     axes.set_ylabel("energy [J]")
 
 
-@styled
+@styled()
 def phase_portrait(
     motion: Motion,
     coordinate: int | None = None,

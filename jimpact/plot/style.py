@@ -1,6 +1,7 @@
 """What the pictures share: the style sheet, figures of panels, legends, logarithmic axes."""
 
 import functools
+import inspect
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
@@ -10,6 +11,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+
+from jimpact._checks import check_kind
 
 SHEET = Path(__file__).with_name("jimpact.mplstyle")
 _SETTINGS = matplotlib.rc_params_from_file(SHEET, use_default_template=False)
@@ -30,16 +33,23 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-def styled(picture: Callable[P, R]) -> Callable[P, R]:
-    """The function, which draws in the style sheet; matplotlib's own settings stay as they are."""
+def styled(kind: type = object) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Draw in the style sheet, and leave matplotlib's settings alone, what is of this kind."""
 
-    @functools.wraps(picture)
-    def drawn(*args: P.args, **keywords: P.kwargs) -> R:
-        """The picture."""
-        with matplotlib.style.context(SHEET):
-            return picture(*args, **keywords)
+    def decorated(picture: Callable[P, R]) -> Callable[P, R]:
+        """The function, its first argument checked."""
+        first = next(iter(inspect.signature(picture).parameters))
 
-    return drawn
+        @functools.wraps(picture)
+        def drawn(*args: P.args, **keywords: P.kwargs) -> R:
+            """The picture."""
+            check_kind(first, args[0] if args else keywords.get(first), kind)
+            with matplotlib.style.context(SHEET):
+                return picture(*args, **keywords)
+
+        return drawn
+
+    return decorated
 
 
 def colour_of(i: int) -> str:

@@ -23,7 +23,7 @@ _THICKEST = 8.0  # line of the largest impulse [points]; ten times more hides th
 _FAINT = 1e-3  # impulses over the largest one that are not drawn; ten times more breaks chains
 
 
-@styled
+@styled()
 def system(drawn: Scene | Body | System, state: Any, title: str = "") -> Figure:
     """A system as it is before an impact or a motion.
 
@@ -58,7 +58,7 @@ def system(drawn: Scene | Body | System, state: Any, title: str = "") -> Figure:
     return figure
 
 
-@styled
+@styled()
 def force_chains(pile: Pile, q: Any, scene: Scene, impulse: Any, title: str = "") -> Figure:
     """The impulses in a packing as lines between the centres, as thick as they are large.
 

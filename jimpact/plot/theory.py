@@ -26,8 +26,13 @@ from jimpact.plot.style import (
 )
 from jimpact.scene import dense_mass
 from jimpact.theory.admissible import AdmissibleSet
-from jimpact.theory.block_domains import RockingDomain
-from jimpact.theory.rocking import OUTCOMES, STAYS, RockingDispersion, critical_kinetic_angle
+from jimpact.theory.rocking import (
+    OUTCOMES,
+    STAYS,
+    RockingDispersion,
+    RockingDomain,
+    critical_kinetic_angle,
+)
 
 _FILL = "#DCE9F3"
 # Beyond two contacts: projections onto pairs of the first ones up to this number.
@@ -38,7 +43,7 @@ _SHORTEST = 0.5  # sides shorter than this part of the radius are not drawn: no 
 _OUTCOME_COLOURS = ("#999999", "#009E73", "#E69F00", "#56B4E9", "#EEEEEE")  # as OUTCOMES
 
 
-@styled
+@styled(AdmissibleSet)
 def admissible_set(
     result: AdmissibleSet, outcomes: Mapping[str, Any] | None = None, title: str = ""
 ) -> Figure:
@@ -202,7 +207,7 @@ def _gap_label(contact: int) -> str:
     return f"normalized gap velocity {contact + 1} after [√J]"
 
 
-@styled
+@styled(RockingDispersion)
 def rocking_dispersion(result: RockingDispersion, title: str = "") -> Figure:
     """|y_A'+ / y_B'-| against the kinetic angle: a panel for each mu, a line for each e.
 
@@ -234,7 +239,7 @@ def rocking_dispersion(result: RockingDispersion, title: str = "") -> Figure:
     return figure
 
 
-@styled
+@styled(RockingDispersion)
 def rocking_outcomes(
     result: RockingDispersion, title: str = "", separation_threshold: float = STAYS
 ) -> Figure:
@@ -272,7 +277,7 @@ def rocking_outcomes(
     return figure
 
 
-@styled
+@styled()
 def rocking_domains(domains: Sequence[RockingDomain], title: str = "") -> Figure:
     """Admissible restitution matrices of blocks, a panel each: own entry against cross entry.
 
