@@ -135,6 +135,15 @@ def check_choice(name: str, value: Any, choices: Iterable[Any]) -> None:
         )
 
 
+def check_word(what: str, word: Any, choices: Iterable[Any]) -> None:
+    """Raise a ValueError that begins with `what` unless the word is one of `choices`."""
+    if word not in choices:
+        known = ", ".join(map(str, choices))
+        raise ValueError(
+            f"{what} must be one of {known}, but is {word!r}.{suggestion(word, choices)}"
+        )
+
+
 # What parameters are called in papers.
 ABBREVIATIONS = {"e": "restitution", "k": "stiffness", "mu": "friction", "eta": "exponent"}
 

@@ -14,7 +14,14 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from jimpact._checks import ABBREVIATIONS, as_whole, check_choice, check_values, suggestion
+from jimpact._checks import (
+    ABBREVIATIONS,
+    as_whole,
+    check_choice,
+    check_values,
+    check_word,
+    suggestion,
+)
 from jimpact.files.shots_file import read_positions, read_shots
 
 STUDY = "study.toml"  # in a folder that `jimpact new` has made
@@ -270,12 +277,8 @@ def body_keys(
     """The class of a body, and its arguments by key; `others` are keys of another meaning."""
     check_keys(where, table, tuple(table), required=("kind",))
     bodies = {name.lower(): name for name in names()["bodies"]}
-    kind = bodies.get(str(table["kind"]).lower())
-    if kind is None:
-        raise ValueError(
-            f"`kind` in {where} must be one of {', '.join(bodies.values())}, "
-            f"but is {table['kind']!r}.{suggestion(table['kind'], bodies.values())}"
-        )
+    kind = bodies.get(str(table["kind"]).lower(), table["kind"])
+    check_word(f"`kind` in {where}", kind, bodies.values())
     arguments = names()["bodies"][kind]
     keys = {f"{name}_{_UNITS[name]}" if name in _UNITS else name: name for name in arguments}
     required = tuple(key for key, name in keys.items() if arguments[name])
@@ -304,12 +307,9 @@ def check_law(
     known = {key: table.get(key, {}) for key in ("bounds", "priors")}
     arguments = {k: x for k, x in table.items() if k not in others}
     for key in (study_law, name):
-        if key not in laws:
-            if "module" in table and not modules:
-                return LawTable(name, arguments, **known, free=free)
-            raise ValueError(
-                f"the law must be one of {', '.join(laws)}, but is {key!r}.{suggestion(key, laws)}"
-            )
+        if key not in laws and "module" in table and not modules:
+            return LawTable(name, arguments, **known, free=free)
+        check_word("the law", key, laws)
     check_keys("[law]", table, (*laws[study_law]["arguments"], *others))
     for key, pairs in known.items():
         fields = {_field(k): x for k, x in pairs.items()} if isinstance(pairs, dict) else pairs
