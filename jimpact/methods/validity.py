@@ -135,7 +135,7 @@ def validity_map(
     e = as_numbers("restitution", restitution, low=0.0, high=1.0, contacts=scene.contacts)
     shape = len(eta), len(ratio)
     exponents, ratios = (x.ravel() for x in jnp.meshgrid(eta, ratio, indexing="ij"))
-    k = ratios[:, None] ** jnp.arange(scene.contacts).astype(v.dtype)
+    k = ratios[:, None] ** jnp.arange(scene.contacts).astype(v.dtype)[None, :]
     law = LZB(e.astype(v.dtype), k[0], eta[0])
     velocities = jnp.tile(v, (len(ratios), 1))
     out = varied_impacts(law, scene, velocities, {"stiffness": k, "exponent": exponents})
