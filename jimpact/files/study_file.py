@@ -28,29 +28,76 @@ STUDY = "study.toml"  # in a folder that `jimpact new` has made
 OF_A_SCENE = ("mass", "gaps", "tilt")  # parts of a scene that a fit may have as parameters
 
 
-class TableKeys(NamedTuple):
-    """The keys that a table of a study may and must have, and what is checked of them at once."""
+Check = Callable[[str, str, Any], Any]  # of a table's head, a key and its value; raises ValueError
 
-    allowed: tuple[str, ...]
+
+class Schema(NamedTuple):
+    """The keys that a table of a study may have, with what is checked at once, and must have."""
+
+    keys: Mapping[str, Check]
     required: tuple[str, ...] = ()
-    flags: tuple[str, ...] = ()  # true or false
-    whole: Mapping[str, int] = {}  # ints, with their smallest value
-    words: Mapping[str, str] = {}  # with the group of `names` that has the choices
 
 
-CHAIN = TableKeys(("masses_kg", "wall", "gaps_m"), ("masses_kg",))
+def anything(where: str, key: str, value: Any) -> None:
+    """Nothing is checked: what gets the value does it."""
+
+
+def flag(where: str, key: str, value: Any) -> None:
+    """True or false."""
+    if not isinstance(value, bool):
+        raise ValueError(f"`{key}` in {where} must be true or false, but is {value!r}.")
+
+
+def file_name(where: str, key: str, value: Any) -> None:
+    """Text."""
+    if not isinstance(value, str):
+        raise ValueError(f"`{key}` in {where} must be a path, but is {value!r}.")
+
+
+def side(where: str, key: str, value: Any) -> None:
+    """Whether, or on which side, there is a wall."""
+    if not isinstance(value, bool | str):
+        raise ValueError(f"`{key}` must be true, false or a side, but is {value!r}.")
+
+
+def sampled(where: str, key: str, value: Any) -> None:
+    """A constant, or a table that is a distribution."""
+    if isinstance(value, dict):
+        distribution(key, value)
+
+
+def sampled_law(where: str, key: str, value: Any) -> None:
+    """A distribution for each parameter."""
+    if not isinstance(value, dict):
+        raise ValueError(f"[monte_carlo.law] must be a table, but is {value!r}.")
+    for name, each in value.items():
+        distribution(f"law.{name}", each)
+
+
+def whole(low: int) -> Check:
+    """An int of at least `low`."""
+    return lambda where, key, value: as_whole(key, value, low)
+
+
+def word(group: str) -> Check:
+    """A word of this group of `names`."""
+    return lambda where, key, value: check_choice(key, value, names()[group])
+
+
+CHAIN = Schema({"masses_kg": anything, "wall": side, "gaps_m": anything}, ("masses_kg",))
 AT_KEYS = ("q", "closed_below_m")  # of a scene that is a body in a configuration
-FIT = TableKeys(
-    ("free", "method", "loss", "starts", "seed", "max_steps", "profiles"),
-    flags=("profiles",),
-    whole={"starts": 1, "seed": 0, "max_steps": 1},
-    words={"method": "fit_methods", "loss": "losses"},
+SEARCH: dict[str, Check] = {"starts": whole(1), "seed": whole(0), "max_steps": whole(1)}
+FIT_MOTION = Schema({"free": anything, "loss": word("losses"), **SEARCH, "profiles": flag})
+FIT = Schema({"free": anything, "method": word("fit_methods"), **FIT_MOTION.keys})
+DATA = Schema(
+    {"file": file_name, "momentum_corrected": flag, "near_m": anything, "contacts": anything},
+    ("file",),
 )
-DATA = TableKeys(
-    ("file", "momentum_corrected", "near_m", "contacts"), ("file",), flags=("momentum_corrected",)
-)
-SAMPLING = TableKeys(
-    ("velocity_m_per_s", "gaps_m", "law", "samples", "seed", "chunk", "bins"),
+SAMPLING = Schema(
+    {
+        **{"velocity_m_per_s": sampled, "gaps_m": sampled, "law": sampled_law},
+        **{"samples": whole(1), "seed": anything, "chunk": whole(1), "bins": whole(1)},
+    },
     ("velocity_m_per_s",),
 )
 DISTRIBUTIONS = {("high", "low"): "Uniform", ("mean", "std"): "Normal"}
@@ -70,21 +117,17 @@ METHOD_KEYS = {  # and the options of a method that they give
     "rtol": "rtol",
     "slow": "slow",
 }
-MOTION = TableKeys(
-    (*MOTION_KEYS, *METHOD_KEYS, "t_start_s", "friction"),
+MOTION = Schema(
+    dict.fromkeys((*MOTION_KEYS, *METHOD_KEYS, "t_start_s", "friction"), anything)
+    | {"method": word("motion_methods")},
     ("q0", "v0", "t_end_s"),
-    words={"method": "motion_methods"},
 )
 BASE_KEYS = {"amplitude_m": "amplitude", "frequency_hz": "frequency", "phase_rad": "phase"}
-BASE = TableKeys((*BASE_KEYS, "direction"), ("amplitude_m", "frequency_hz"))
+BASE = Schema(dict.fromkeys((*BASE_KEYS, "direction"), anything), ("amplitude_m", "frequency_hz"))
 # Tables of a study besides title, [law] and [scene] or [system], whose keys depend on their kind.
 IMPACT_TABLES = {"fit": FIT, "data": DATA, "monte_carlo": SAMPLING}
-MOTION_TABLES = {
-    "motion": MOTION,
-    "base": BASE,
-    "fit": FIT._replace(allowed=tuple(key for key in FIT.allowed if key != "method")),
-    "data": TableKeys(("file",), ("file",)),
-}
+MOTION_DATA = Schema({"file": file_name}, ("file",))
+MOTION_TABLES = {"motion": MOTION, "base": BASE, "fit": FIT_MOTION, "data": MOTION_DATA}
 # Units of the bodies' arguments, which a study writes behind their names. Words and directions have
 # no unit here, nor have lists of points [m] or of mixed units (`corners` of a Polygon, `planes`,
 # `at`), which the classes document.
@@ -194,7 +237,6 @@ def from_file(
         else:
             check_tables(tables, ("scene", "law"), IMPACT_TABLES)
             check_scene(tables["scene"])
-            check_sampling(tables.get("monte_carlo", {}))
         free = masks(tables.get("fit", {}).get("free", []))
         checked = check_law(tables["law"], law, free, prepare is not None)
         return build(CheckedStudy(path, tables, checked, moves))
@@ -266,9 +308,6 @@ def check_scene(table: Mapping[str, Any]) -> None:
         check_keys("[scene]", table, tuple(table), ("q",))
         return
     check_table("[scene]", table, CHAIN)
-    wall = table.get("wall", False)
-    if not isinstance(wall, bool | str):
-        raise ValueError(f"`wall` must be true, false or a side, but is {wall!r}.")
 
 
 def body_keys(
@@ -362,18 +401,6 @@ def masks(free: Any) -> dict[str, Any]:
     raise ValueError(f"`free` must be a list of names or a table of masks, but is {free!r}.")
 
 
-def check_sampling(table: Mapping[str, Any]) -> None:
-    """Check the distributions in the table [monte_carlo]."""
-    random = table.get("law", {})
-    if not isinstance(random, dict):
-        raise ValueError(f"[monte_carlo.law] must be a table, but is {random!r}.")
-    for name, value in random.items():
-        distribution(f"law.{name}", value)
-    for name, value in table.items():
-        if isinstance(value, dict) and name != "law":
-            distribution(name, value)
-
-
 def distribution(name: str, value: Any) -> str:
     """Name of the distribution that a table means."""
     kind = DISTRIBUTIONS.get(tuple(sorted(value))) if isinstance(value, dict) else None
@@ -384,19 +411,11 @@ def distribution(name: str, value: Any) -> str:
     return kind
 
 
-def check_table(where: str, table: Mapping[str, Any], keys: TableKeys) -> None:
+def check_table(where: str, table: Mapping[str, Any], schema: Schema) -> None:
     """Raise a ValueError for unknown or missing keys, and for values that are not allowed."""
-    check_keys(where, table, keys.allowed, keys.required)
-    if not isinstance(table.get("file", ""), str):
-        raise ValueError(f"`file` in {where} must be a path, but is {table['file']!r}.")
-    for key in keys.flags:
-        if not isinstance(table.get(key, False), bool):
-            raise ValueError(f"`{key}` in {where} must be true or false, but is {table[key]!r}.")
-    for key, low in keys.whole.items():
-        as_whole(key, table.get(key, low), low)
-    for key, group in keys.words.items():
-        if key in table:
-            check_choice(key, table[key], names()[group])
+    check_keys(where, table, tuple(schema.keys), schema.required)
+    for key, value in table.items():
+        schema.keys[key](where, key, value)
 
 
 def check_keys(
@@ -419,10 +438,7 @@ def check_keys(
 
 
 def check_tables(
-    study: Mapping[str, Any],
-    required: tuple[str, ...],
-    tables: Mapping[str, TableKeys],
-    others: tuple[str, ...] = (),
+    study: Mapping[str, Any], required: tuple[str, ...], tables: Mapping[str, Schema]
 ) -> None:
     """Raise a ValueError for tables that are unknown, missing or wrong; a title is allowed, too."""
     for scene, system, kind in (("scene", "system", "a motion"), ("system", "scene", "one impact")):
@@ -431,11 +447,11 @@ def check_tables(
                 f"the study must be of {kind}, with [{system}], but has [{scene}]: "
                 "`jimpact simulate` takes [system], other commands [scene]."
             )
-    allowed = dict.fromkeys(("title", *required, *tables, *others))
+    allowed = dict.fromkeys(("title", *required, *tables))
     check_keys("the study", study, tuple(allowed), required)
     for name in (*required, *tables):
         if not isinstance(study.get(name, {}), dict):
             raise ValueError(f"`{name}` must be a table, but is {study[name]!r}.")
-    for name, keys in tables.items():
+    for name, schema in tables.items():
         if name in study:
-            check_table(f"[{name}]", study[name], keys)
+            check_table(f"[{name}]", study[name], schema)
