@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jimpact as ji
-from jimpact.plot.style import COLOURS, finish, legend_below, logarithmic, new_figure
+from jimpact.plot.style import COLOURS, legend_below, logarithmic, new_figure, styled
 
 PICTURES = Path(__file__).parent / "pictures"
 DRAWN: dict[str, Callable] = {}
@@ -28,6 +28,7 @@ def picture(function: Callable) -> Callable:
     return function
 
 
+@styled()
 def three_balls(
     make: Callable, values: np.ndarray, label: str, log: bool = False, shares: bool = False
 ) -> Figure:
@@ -45,14 +46,15 @@ def three_balls(
 
     velocity, status = jax.jit(jax.vmap(outcome))(jnp.asarray(values))
     failed = np.array([ji.STATUS[int(code)].failure for code in status])
-    figure = new_figure(3.4)
-    axes = figure.subplots()
+    figure, axes = new_figure(3.4)
     for i in range(3):
         style = {"color": COLOURS[i], "lw": 2, "ls": "--" if i == 2 else "-"}  # where they coincide
         axes.plot(values, velocity[:, i], label=f"ball {i + 1}", **style)
     if failed.any():
         across = axes.get_xaxis_transform()
-        grey = {"color": "#dddddd", "lw": 0, "label": "flagged"}
+        names = dict.fromkeys(ji.STATUS[int(code)].name for code in status[failed])
+        why = f"flagged: {', '.join(names).replace('_', ' ')}"
+        grey = {"color": "#dddddd", "lw": 0, "label": why}
         axes.fill_between(values, 0, 1, where=failed, transform=across, **grey)
     axes.axhline(0, color="black", lw=0.6)
     axes.set_xlim(values[0], values[-1])
@@ -60,8 +62,7 @@ def three_balls(
     axes.set_ylabel("velocity after / before" if shares else "velocity after [m/s]")
     if log:
         logarithmic(axes, "x")
-    finish(axes)
-    legend_below(figure, axes.get_legend_handles_labels()[0], 4)
+    legend_below(figure, 4)
     return figure
 
 
@@ -307,22 +308,20 @@ def force_chains():
 
 
 @picture
+@styled()
 def drops():
     """Drops of a square: median error of the predicted angle after a hit, from two flights."""
     with np.load(Path(__file__).parents[1] / "tests" / "data" / "drops.npz") as stored:
         curves = {name: stored[name] for name in stored.files}
-    figure = new_figure(3.0)
-    for axes, kind in zip(
-        figure.subplots(1, 2, sharey=True), ("first flight", "flight after an impact")
-    ):
+    figure, panels = new_figure(3.0, "", 1, 2, sharey=True)
+    for axes, kind in zip(panels, ("first flight", "flight after an impact")):
         for colour, name in zip(COLOURS, ("jimpact", "MuJoCo")):
             error = curves[f"{kind}, {name}"]
             axes.plot(4 * np.arange(len(error)), error, color=colour, lw=2, label=name)
         axes.set_title(f"from the {kind}")
         axes.set_xlabel("time after the hit [ms]")
-        finish(axes)
     figure.axes[0].set_ylabel("error of the angle [deg]")
-    legend_below(figure, figure.axes[0].get_legend_handles_labels()[0], 2)
+    legend_below(figure, 2)
     return figure
 
 

@@ -56,6 +56,27 @@ def as_float_array(name: str, value: Any) -> "jax.Array":
     return array
 
 
+def as_numbers(
+    name: str,
+    value: Any,
+    shape: tuple[int, ...] | None = None,
+    meaning: str = "",
+    *,
+    contacts: int | None = None,
+    low: float = -np.inf,
+    high: float = np.inf,
+    open_low: bool = False,
+) -> "jax.Array":
+    """`value` as a floating JAX array, checked: its shape or one entry a contact, and its range."""
+    array = as_float_array(name, value)
+    if shape is not None:
+        check_shape(name, array, shape, meaning)
+    if contacts is not None:
+        check_per_contact(name, array, contacts)
+    check_values(name, array, low=low, high=high, open_low=open_low)
+    return array
+
+
 def as_axis(name: str, value: Any) -> "jax.Array":
     """`value`, a scalar or with one axis, as a floating JAX array with one axis, not empty."""
     array = as_float_array(name, value)
@@ -111,6 +132,15 @@ def check_choice(name: str, value: Any, choices: Iterable[Any]) -> None:
         raise ValueError(
             f"Argument `{name}` must be one of {known}, but has value {value!r}."
             f"{suggestion(value, choices)}"
+        )
+
+
+def check_word(what: str, word: Any, choices: Iterable[Any]) -> None:
+    """Raise a ValueError that begins with `what` unless the word is one of `choices`."""
+    if word not in choices:
+        known = ", ".join(map(str, choices))
+        raise ValueError(
+            f"{what} must be one of {known}, but is {word!r}.{suggestion(word, choices)}"
         )
 
 

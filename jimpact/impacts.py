@@ -121,8 +121,7 @@ def impact(
     """
     check_kind("law", law, Law)
     check_kind("scene", scene, Scene)
-    v = as_velocity(scene, velocity)
-    check_values("velocity", v)
+    v = as_velocity(scene, velocity, finite=True)
     check_constrained(scene, v)
     law, scene, v = in_common_dtype(law, scene, v)
     check_law(law, scene, v.dtype)

@@ -350,10 +350,12 @@ def pad_scene(scene: Scene, contacts: int) -> PaddedScene:
     return PaddedScene(chain_scene(mass, scene.walls, gaps), slice(n), slice(m), copied)
 
 
-def as_velocity(scene: Scene, velocity: Any) -> jax.Array:
-    """`velocity` as an array; raise a ValueError unless it has one entry per coordinate."""
+def as_velocity(scene: Scene, velocity: Any, finite: bool = False) -> jax.Array:
+    """`velocity` as an array; raise a ValueError unless it has one (finite) entry a coordinate."""
     v = as_float_array("velocity", velocity)
     check_shape("velocity", v, (scene.size,), "one per coordinate of the scene")
+    if finite:
+        check_values("velocity", v)
     return v
 
 

@@ -339,18 +339,16 @@ def compare(command: options.CompareCommand, steps: Steps) -> CommandResult:
 def montecarlo(command: options.MonteCarloCommand, steps: Steps) -> CommandResult:
     """Random gaps, velocities, parameters."""
     study = impact_study(command.study)
-    result = ji.monte_carlo(**_sampling(study, command), progress=steps.patience)
+    chosen = {"samples": command.samples, "key": command.seed, "folder": command.folder}
+    result = ji.monte_carlo(
+        **study.monte_carlo | without_none(chosen),
+        executor=command.scheduler or command.executor,
+        keep_samples=command.keep_samples,
+        progress=steps.patience,
+    )
     steps(f"{result.samples:,} samples")
     picture = ji.plot.monte_carlo(result, study.title)
     return CommandResult(study.title, result, picture, result.table)
-
-
-def _sampling(study: Study, command: options.MonteCarloCommand) -> dict[str, Any]:
-    """Arguments of `monte_carlo`: the study's, or in their place those of the command line."""
-    executor = command.scheduler or command.executor
-    chosen = {"samples": command.samples, "key": command.seed, "folder": command.folder}
-    computing = {"executor": executor, "keep_samples": command.keep_samples}
-    return study.monte_carlo | without_none(chosen) | computing
 
 
 # ------------------------------------------------------------------------------------------ chart
@@ -362,16 +360,18 @@ QUICK_LAWS = ("moreau", "binary")
 
 def chart(command: options.ChartCommand, steps: Steps) -> CommandResult:
     """Speed against accuracy on one scene."""
+    from jimpact.methods.chart import shared_parameters
+    from jimpact.methods.contenders import CONTENDERS
+
     study, before, _ = _impact_of(command)
     law = _lzb(study)
-    from jimpact.methods.chart import shared_parameters
-
     laws, _ = registered_laws(shared_parameters(law))
+    quick = [name for name in QUICK_METHODS if CONTENDERS[name].supports(law) is None]
     result = ji.work_precision(
         study.scene,
         before,
         law,
-        command.methods or (None if command.full else _quick_methods(law)),
+        command.methods or (None if command.full else quick),
         laws=None if command.full else {x: laws[x] for x in QUICK_LAWS},
         batch=command.batch,
         repeats=command.repeats,
@@ -390,13 +390,6 @@ def _lzb(study: Study) -> "ji.LZB":
         return study.law
     values = {"restitution": 1.0} | study.parameters
     return ji.LZB(**{key: values[key] for key in ji.REGISTRY["lzb"].parameters if key in values})
-
-
-def _quick_methods(law: "ji.LZB") -> list[str]:
-    """Methods that compile soon and can solve the impact."""
-    from jimpact.methods.contenders import CONTENDERS
-
-    return [name for name in QUICK_METHODS if CONTENDERS[name].supports(law) is None]
 
 
 # -------------------------------------------------------------------------------------- stability

@@ -147,16 +147,13 @@ def parse(arguments: list[str]) -> Any:
 
     import tyro
 
-    from jimpact._checks import suggestion
+    from jimpact._checks import check_word
     from jimpact.cli.options import COMMANDS
 
     names = [x.name() for x in COMMANDS]
     word = arguments[0]
-    if not word.startswith("-") and word not in names:
-        raise ValueError(
-            f"the command must be one of {', '.join(names)}, but is {word!r}."
-            f"{suggestion(word, names)}"
-        )
+    if not word.startswith("-"):
+        check_word("the command", word, names)
     commands: list[Any] = [Annotated[x, tyro.conf.subcommand(x.name())] for x in COMMANDS]
     return tyro.cli(
         functools.reduce(operator.or_, commands),

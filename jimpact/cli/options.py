@@ -137,7 +137,7 @@ class ShotCommand(DrawingCommand):
     def check(self) -> None:
         """Also the study, and whether it has velocities."""
         super().check()
-        _, shots = study_file.check_study(self.study)
+        shots = study_file.check_study(self.study, motion=False).rows
         if self.velocity:
             return
         if not shots:
@@ -174,15 +174,12 @@ class FitCommand(DrawingCommand):
         if self.method is not None:
             check_choice("method", self.method, study_file.names()["fit_methods"])
         law = None if self.law == EVERY_LAW else self.law
-        if study_file.is_motion(self.study):
-            if self.method is not None or self.law == EVERY_LAW or self.all_free:
-                raise ValueError("--method, --law all, --all-free must be left out for a motion.")
-            study = study_file.check_motion_study(self.study, law)
-        else:
-            study, shots = study_file.check_study(self.study, law)
-            if self.law == EVERY_LAW and not shots:
-                raise ValueError("--law all must be left out where no shots are fitted.")
-        if not study.fitted:
+        study = study_file.check_study(self.study, law)
+        if study.motion and (self.method is not None or self.law == EVERY_LAW or self.all_free):
+            raise ValueError("--method, --law all, --all-free must be left out for a motion.")
+        if self.law == EVERY_LAW and not study.rows:
+            raise ValueError("--law all must be left out where no shots are fitted.")
+        if "data" not in study.tables:
             raise ValueError(study_file.NO_DATA)
 
 
@@ -216,7 +213,7 @@ class MonteCarloCommand(DrawingCommand):
     def check(self) -> None:
         """Also the study, which must say what is random."""
         super().check()
-        study, _ = study_file.check_study(self.study)
+        study = study_file.check_study(self.study, motion=False)
         if "monte_carlo" not in study.tables:
             raise ValueError(f"the study '{self.study}' must have a [monte_carlo] table.")
         if self.scheduler is not None and self.executor != "dask":
@@ -314,7 +311,7 @@ class SimulateCommand(DrawingCommand):
             raise ValueError(
                 f"--portrait and --out must be two files, but are both '{self.portrait}'."
             )
-        study_file.check_motion_study(self.study)
+        study_file.check_study(self.study, motion=True)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -16,7 +16,6 @@ from jimpact.files.study_file import (
     NO_DATA,
     CheckedStudy,
     body_keys,
-    check_impact_tables,
     distribution,
     from_file,
 )
@@ -83,18 +82,12 @@ class Study:
 
 def impact_study(path: str | Path, law: str | None = None) -> Study:
     """The study of one impact, see `read_study`."""
-
-    def build(tables: dict[str, Any], file: Path) -> Study:
-        """The study of these tables."""
-        import_module_of(tables, file.parent)
-        return _build(check_impact_tables(tables, file, law, modules=True))
-
-    return from_file(path, "[scene]", build)
+    return from_file(path, law, False, study_of, import_module_of)
 
 
-def _build(checked: CheckedStudy) -> Study:
+def study_of(checked: CheckedStudy) -> Study:
     """The study of checked tables."""
-    tables, free = checked.tables, checked.free
+    tables, free = checked.tables, checked.law.free
     scene, body = _scene(tables["scene"])
     row, values = REGISTRY[checked.law.name], checked.law.arguments
     if row.law is RestitutionMatrix and "matrix" not in values:

@@ -9,8 +9,8 @@ from jimpact.bodies.base import STANDARD_GRAVITY
 from jimpact.cli.study import (
     Study,
     body_of,
-    impact_study,
     import_module_of,
+    study_of,
     with_exponent,
     without_none,
 )
@@ -22,9 +22,7 @@ from jimpact.files.study_file import (
     MOTION_KEYS,
     NO_DATA,
     CheckedStudy,
-    check_motion_tables,
     from_file,
-    is_motion,
 )
 from jimpact.fits.fitting import Fit
 from jimpact.fits.parameters import default_free
@@ -97,18 +95,12 @@ class MotionStudy:
 
 def motion_study(path: str | Path, law: str | None = None) -> MotionStudy:
     """The study of a motion, see `read_study`."""
-
-    def build(tables: dict[str, Any], file: Path) -> MotionStudy:
-        """The study of these tables."""
-        import_module_of(tables, file.parent)
-        return _build(check_motion_tables(tables, file, law, modules=True))
-
-    return from_file(path, "[system]", build)
+    return from_file(path, law, True, _motion_study_of, import_module_of)
 
 
-def _build(checked: CheckedStudy) -> MotionStudy:
+def _motion_study_of(checked: CheckedStudy) -> MotionStudy:
     """The study of checked tables."""
-    tables, free = checked.tables, checked.free
+    tables, free = checked.tables, checked.law.free
     values = with_exponent(checked.law.arguments, free)
     law = REGISTRY[checked.law.name].build(**values)
     motion = tables["motion"]
@@ -211,4 +203,9 @@ def read_study(path: str | Path, law: str | None = None) -> Study | MotionStudy:
     >>> ji.read_study("three_balls.toml").title, ji.read_study("cradle_motion.toml").title
     ('Three equal hard balls, one shot', "Newton's cradle, three balls")
     """
-    return motion_study(path, law) if is_motion(path) else impact_study(path, law)
+
+    def build(checked: CheckedStudy) -> Study | MotionStudy:
+        """The study, of whatever kind it is."""
+        return _motion_study_of(checked) if checked.motion else study_of(checked)
+
+    return from_file(path, law, None, build, import_module_of)

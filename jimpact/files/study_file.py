@@ -14,36 +14,90 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from jimpact._checks import ABBREVIATIONS, as_whole, check_choice, check_values, suggestion
+from jimpact._checks import (
+    ABBREVIATIONS,
+    as_whole,
+    check_choice,
+    check_values,
+    check_word,
+    suggestion,
+)
 from jimpact.files.shots_file import read_positions, read_shots
 
 STUDY = "study.toml"  # in a folder that `jimpact new` has made
 OF_A_SCENE = ("mass", "gaps", "tilt")  # parts of a scene that a fit may have as parameters
 
 
-class TableKeys(NamedTuple):
-    """The keys that a table of a study may and must have, and what is checked of them at once."""
+Check = Callable[[str, str, Any], Any]  # of a table's head, a key and its value; raises ValueError
 
-    allowed: tuple[str, ...]
+
+class Schema(NamedTuple):
+    """The keys that a table of a study may have, with what is checked at once, and must have."""
+
+    keys: Mapping[str, Check]
     required: tuple[str, ...] = ()
-    flags: tuple[str, ...] = ()  # true or false
-    whole: Mapping[str, int] = {}  # ints, with their smallest value
-    words: Mapping[str, str] = {}  # with the group of `names` that has the choices
 
 
-CHAIN = TableKeys(("masses_kg", "wall", "gaps_m"), ("masses_kg",))
+def anything(where: str, key: str, value: Any) -> None:
+    """Nothing is checked: what gets the value does it."""
+
+
+def flag(where: str, key: str, value: Any) -> None:
+    """True or false."""
+    if not isinstance(value, bool):
+        raise ValueError(f"`{key}` in {where} must be true or false, but is {value!r}.")
+
+
+def file_name(where: str, key: str, value: Any) -> None:
+    """Text."""
+    if not isinstance(value, str):
+        raise ValueError(f"`{key}` in {where} must be a path, but is {value!r}.")
+
+
+def side(where: str, key: str, value: Any) -> None:
+    """Whether, or on which side, there is a wall."""
+    if not isinstance(value, bool | str):
+        raise ValueError(f"`{key}` must be true, false or a side, but is {value!r}.")
+
+
+def sampled(where: str, key: str, value: Any) -> None:
+    """A constant, or a table that is a distribution."""
+    if isinstance(value, dict):
+        distribution(key, value)
+
+
+def sampled_law(where: str, key: str, value: Any) -> None:
+    """A distribution for each parameter."""
+    if not isinstance(value, dict):
+        raise ValueError(f"[monte_carlo.law] must be a table, but is {value!r}.")
+    for name, each in value.items():
+        distribution(f"law.{name}", each)
+
+
+def whole(low: int) -> Check:
+    """An int of at least `low`."""
+    return lambda where, key, value: as_whole(key, value, low)
+
+
+def word(group: str) -> Check:
+    """A word of this group of `names`."""
+    return lambda where, key, value: check_choice(key, value, names()[group])
+
+
+CHAIN = Schema({"masses_kg": anything, "wall": side, "gaps_m": anything}, ("masses_kg",))
 AT_KEYS = ("q", "closed_below_m")  # of a scene that is a body in a configuration
-FIT = TableKeys(
-    ("free", "method", "loss", "starts", "seed", "max_steps", "profiles"),
-    flags=("profiles",),
-    whole={"starts": 1, "seed": 0, "max_steps": 1},
-    words={"method": "fit_methods", "loss": "losses"},
+SEARCH: dict[str, Check] = {"starts": whole(1), "seed": whole(0), "max_steps": whole(1)}
+FIT_MOTION = Schema({"free": anything, "loss": word("losses"), **SEARCH, "profiles": flag})
+FIT = Schema({"free": anything, "method": word("fit_methods"), **FIT_MOTION.keys})
+DATA = Schema(
+    {"file": file_name, "momentum_corrected": flag, "near_m": anything, "contacts": anything},
+    ("file",),
 )
-DATA = TableKeys(
-    ("file", "momentum_corrected", "near_m", "contacts"), ("file",), flags=("momentum_corrected",)
-)
-SAMPLING = TableKeys(
-    ("velocity_m_per_s", "gaps_m", "law", "samples", "seed", "chunk", "bins"),
+SAMPLING = Schema(
+    {
+        **{"velocity_m_per_s": sampled, "gaps_m": sampled, "law": sampled_law},
+        **{"samples": whole(1), "seed": anything, "chunk": whole(1), "bins": whole(1)},
+    },
     ("velocity_m_per_s",),
 )
 DISTRIBUTIONS = {("high", "low"): "Uniform", ("mean", "std"): "Normal"}
@@ -63,21 +117,17 @@ METHOD_KEYS = {  # and the options of a method that they give
     "rtol": "rtol",
     "slow": "slow",
 }
-MOTION = TableKeys(
-    (*MOTION_KEYS, *METHOD_KEYS, "t_start_s", "friction"),
+MOTION = Schema(
+    dict.fromkeys((*MOTION_KEYS, *METHOD_KEYS, "t_start_s", "friction"), anything)
+    | {"method": word("motion_methods")},
     ("q0", "v0", "t_end_s"),
-    words={"method": "motion_methods"},
 )
 BASE_KEYS = {"amplitude_m": "amplitude", "frequency_hz": "frequency", "phase_rad": "phase"}
-BASE = TableKeys((*BASE_KEYS, "direction"), ("amplitude_m", "frequency_hz"))
+BASE = Schema(dict.fromkeys((*BASE_KEYS, "direction"), anything), ("amplitude_m", "frequency_hz"))
 # Tables of a study besides title, [law] and [scene] or [system], whose keys depend on their kind.
 IMPACT_TABLES = {"fit": FIT, "data": DATA, "monte_carlo": SAMPLING}
-MOTION_TABLES = {
-    "motion": MOTION,
-    "base": BASE,
-    "fit": FIT._replace(allowed=tuple(key for key in FIT.allowed if key != "method")),
-    "data": TableKeys(("file",), ("file",)),
-}
+MOTION_DATA = Schema({"file": file_name}, ("file",))
+MOTION_TABLES = {"motion": MOTION, "base": BASE, "fit": FIT_MOTION, "data": MOTION_DATA}
 # Units of the bodies' arguments, which a study writes behind their names. Words and directions have
 # no unit here, nor have lists of points [m] or of mixed units (`corners` of a Polygon, `planes`,
 # `at`), which the classes document.
@@ -110,26 +160,26 @@ def declared_laws() -> dict[str, dict[str, Any]]:
 
 
 class LawTable(NamedTuple):
-    """The table [law] of a study: the law's name, its arguments, what `fit` knows of them."""
+    """The table [law] of a study: the law's name, its arguments, what `fit` knows of them.
+
+    `free` maps names to masks.
+    """
 
     name: str
     arguments: dict[str, Any]
     bounds: dict[str, Any]
     priors: dict[str, Any]
+    free: dict[str, Any]
 
 
 class CheckedStudy(NamedTuple):
-    """A study whose keys, words and ranges are right; `free` maps names to masks."""
+    """A study whose keys, words and ranges are right."""
 
     path: Path
     tables: dict[str, Any]
     law: LawTable
-    free: dict[str, Any]
-
-    @property
-    def fitted(self) -> bool:
-        """Whether there is something to fit."""
-        return "data" in self.tables
+    motion: bool  # whether it is of a motion, else of one impact
+    rows: int = 0  # shots or samples of its data, where these have been read
 
     @property
     def fit_options(self) -> dict[str, Any]:
@@ -150,9 +200,24 @@ class CheckedStudy(NamedTuple):
 # -------------------------------------------------------------------------- locating and reading
 
 
-def from_file(path: str | Path, table: str, build: Callable[[dict[str, Any], Path], T]) -> T:
-    """What `build` makes of a study file's tables; studies of a kind have this `table`."""
-    path = located(Path(path), table)
+def from_file(
+    path: str | Path,
+    law: str | None,
+    motion: bool | None,
+    build: Callable[[CheckedStudy], T],
+    prepare: Callable[[dict[str, Any], Path], None] | None = None,
+) -> T:
+    """What `build` makes of a study file, checked.
+
+    Args:
+        path: of the file, its folder, or the name of a bundled study.
+        law: name of a law in the place of the study's; values that it does not take are left out.
+        motion: whether it must be of a motion or of an impact; None: what it is.
+        build: of the checked study.
+        prepare: called before with the tables and the folder, to import the module that the study
+            names; None: a law that may be registered there is not checked.
+    """
+    path = located(Path(path), {True: "[system]", False: "[scene]", None: "[law]"}[motion])
     try:
         tables = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
@@ -162,10 +227,42 @@ def from_file(path: str | Path, table: str, build: Callable[[dict[str, Any], Pat
                 "my_fit` writes a study; name this file under [data] in it."
             ) from None
         raise ValueError(f"{path}: the study must be a TOML file: {_position(error)}.") from None
+    moves = "motion" in tables if motion is None else motion
     try:
-        return build(tables, path)
+        if prepare is not None:
+            prepare(tables, path.parent)
+        if moves:
+            check_tables(tables, ("system", "law", "motion"), MOTION_TABLES)
+            body_keys("[system]", tables["system"], (GRAVITY,))
+        else:
+            check_tables(tables, ("scene", "law"), IMPACT_TABLES)
+            check_scene(tables["scene"])
+        free = masks(tables.get("fit", {}).get("free", []))
+        checked = check_law(tables["law"], law, free, prepare is not None)
+        return build(CheckedStudy(path, tables, checked, moves))
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None
+
+
+def is_motion(path: str | Path) -> bool:
+    """Whether a study is of a motion."""
+    return from_file(path, None, None, lambda study: study.motion)
+
+
+def check_study(
+    path: str | Path, law: str | None = None, motion: bool | None = None
+) -> CheckedStudy:
+    """A study with its data, all checked; arguments as of `from_file`."""
+
+    def with_data(study: CheckedStudy) -> CheckedStudy:
+        """The study, after its data are read."""
+        if "data" not in study.tables:
+            return study
+        file = study.data_file
+        rows = read_positions(file).time if study.motion else read_shots(file).values["pre"]
+        return study._replace(rows=len(rows))
+
+    return from_file(path, law, motion, with_data)
 
 
 def _position(error: Exception) -> str:
@@ -201,77 +298,6 @@ def located(path: Path, table: str) -> Path:
     )
 
 
-# ---------------------------------------------------------------------------------- whole studies
-
-
-def check_study(path: str | Path, law: str | None = None) -> tuple[CheckedStudy, int]:
-    """The study of one impact and the number of its shots, all checked; see `read_study`."""
-
-    def check(tables: dict[str, Any], file: Path) -> tuple[CheckedStudy, int]:
-        """Check the tables and the shots."""
-        study = check_impact_tables(tables, file, law)
-        shots = read_shots(study.data_file).values["pre"] if "data" in tables else ()
-        return study, len(shots)
-
-    return from_file(path, "[scene]", check)
-
-
-def check_motion_study(path: str | Path, law: str | None = None) -> CheckedStudy:
-    """The study of a motion, all checked; see `read_study`."""
-
-    def check(tables: dict[str, Any], file: Path) -> CheckedStudy:
-        """Check the tables and the positions."""
-        study = check_motion_tables(tables, file, law)
-        if "data" in tables:
-            read_positions(study.data_file)
-        return study
-
-    return from_file(path, "[system]", check)
-
-
-def is_motion(path: str | Path) -> bool:
-    """Whether a study is of a motion."""
-    return from_file(path, "[law]", lambda tables, _: "motion" in tables)
-
-
-def check_impact_tables(
-    tables: dict[str, Any], path: Path, other_law: str | None, modules: bool = False
-) -> CheckedStudy:
-    """The checked tables of a study of one impact.
-
-    Args:
-        tables: as read from the file.
-        path: of the file.
-        other_law: name of a law in the place of the study's; values that it does not take are left
-            out.
-        modules: whether the module that a study names has been imported; else a law that may be
-            registered there is not checked.
-    """
-    check_tables(tables, ("scene", "law"), IMPACT_TABLES)
-    check_scene(tables["scene"])
-    if "monte_carlo" in tables:
-        check_sampling(tables["monte_carlo"])
-    return _with_law(tables, path, other_law, modules)
-
-
-def check_motion_tables(
-    tables: dict[str, Any], path: Path, other_law: str | None, modules: bool = False
-) -> CheckedStudy:
-    """The checked tables of the study of a motion; arguments as of `check_impact_tables`."""
-    check_tables(tables, ("system", "law", "motion"), MOTION_TABLES)
-    body_keys("[system]", tables["system"], (GRAVITY,))
-    return _with_law(tables, path, other_law, modules)
-
-
-def _with_law(
-    tables: dict[str, Any], path: Path, other_law: str | None, modules: bool
-) -> CheckedStudy:
-    """The study, after its law and what is free of it are checked, too."""
-    free = masks(tables.get("fit", {}).get("free", []))
-    law, free = check_law(tables["law"], other_law, free, modules)
-    return CheckedStudy(path, tables, law, free)
-
-
 # ---------------------------------------------------------------------------------- single tables
 
 
@@ -282,9 +308,6 @@ def check_scene(table: Mapping[str, Any]) -> None:
         check_keys("[scene]", table, tuple(table), ("q",))
         return
     check_table("[scene]", table, CHAIN)
-    wall = table.get("wall", False)
-    if not isinstance(wall, bool | str):
-        raise ValueError(f"`wall` must be true, false or a side, but is {wall!r}.")
 
 
 def body_keys(
@@ -293,12 +316,8 @@ def body_keys(
     """The class of a body, and its arguments by key; `others` are keys of another meaning."""
     check_keys(where, table, tuple(table), required=("kind",))
     bodies = {name.lower(): name for name in names()["bodies"]}
-    kind = bodies.get(str(table["kind"]).lower())
-    if kind is None:
-        raise ValueError(
-            f"`kind` in {where} must be one of {', '.join(bodies.values())}, "
-            f"but is {table['kind']!r}.{suggestion(table['kind'], bodies.values())}"
-        )
+    kind = bodies.get(str(table["kind"]).lower(), table["kind"])
+    check_word(f"`kind` in {where}", kind, bodies.values())
     arguments = names()["bodies"][kind]
     keys = {f"{name}_{_UNITS[name]}" if name in _UNITS else name: name for name in arguments}
     required = tuple(key for key, name in keys.items() if arguments[name])
@@ -314,10 +333,10 @@ def body_keys(
 
 def check_law(
     table: Mapping[str, Any], other_law: str | None, free: dict[str, Any], modules: bool
-) -> tuple[LawTable, dict[str, Any]]:
+) -> LawTable:
     """The table [law], checked by the declaration of its law, and what is free of that law.
 
-    The arguments are those of `check_impact_tables`.
+    `modules`: whether the module that a study names has been imported.
     """
     check_keys("[law]", table, tuple(table), required=("name",))
     laws = declared_laws()
@@ -327,12 +346,9 @@ def check_law(
     known = {key: table.get(key, {}) for key in ("bounds", "priors")}
     arguments = {k: x for k, x in table.items() if k not in others}
     for key in (study_law, name):
-        if key not in laws:
-            if "module" in table and not modules:
-                return LawTable(name, arguments, **known), free
-            raise ValueError(
-                f"the law must be one of {', '.join(laws)}, but is {key!r}.{suggestion(key, laws)}"
-            )
+        if key not in laws and "module" in table and not modules:
+            return LawTable(name, arguments, **known, free=free)
+        check_word("the law", key, laws)
     check_keys("[law]", table, (*laws[study_law]["arguments"], *others))
     for key, pairs in known.items():
         fields = {_field(k): x for k, x in pairs.items()} if isinstance(pairs, dict) else pairs
@@ -354,7 +370,7 @@ def check_law(
                     f"it has {', '.join(declared['free'])}."
                     f"{suggestion(parameter, declared['free'], ABBREVIATIONS)}"
                 )
-    return LawTable(name, arguments, **known), free
+    return LawTable(name, arguments, **known, free=free)
 
 
 def _field(name: str) -> str:
@@ -385,18 +401,6 @@ def masks(free: Any) -> dict[str, Any]:
     raise ValueError(f"`free` must be a list of names or a table of masks, but is {free!r}.")
 
 
-def check_sampling(table: Mapping[str, Any]) -> None:
-    """Check the distributions in the table [monte_carlo]."""
-    random = table.get("law", {})
-    if not isinstance(random, dict):
-        raise ValueError(f"[monte_carlo.law] must be a table, but is {random!r}.")
-    for name, value in random.items():
-        distribution(f"law.{name}", value)
-    for name, value in table.items():
-        if isinstance(value, dict) and name != "law":
-            distribution(name, value)
-
-
 def distribution(name: str, value: Any) -> str:
     """Name of the distribution that a table means."""
     kind = DISTRIBUTIONS.get(tuple(sorted(value))) if isinstance(value, dict) else None
@@ -407,19 +411,11 @@ def distribution(name: str, value: Any) -> str:
     return kind
 
 
-def check_table(where: str, table: Mapping[str, Any], keys: TableKeys) -> None:
+def check_table(where: str, table: Mapping[str, Any], schema: Schema) -> None:
     """Raise a ValueError for unknown or missing keys, and for values that are not allowed."""
-    check_keys(where, table, keys.allowed, keys.required)
-    if not isinstance(table.get("file", ""), str):
-        raise ValueError(f"`file` in {where} must be a path, but is {table['file']!r}.")
-    for key in keys.flags:
-        if not isinstance(table.get(key, False), bool):
-            raise ValueError(f"`{key}` in {where} must be true or false, but is {table[key]!r}.")
-    for key, low in keys.whole.items():
-        as_whole(key, table.get(key, low), low)
-    for key, group in keys.words.items():
-        if key in table:
-            check_choice(key, table[key], names()[group])
+    check_keys(where, table, tuple(schema.keys), schema.required)
+    for key, value in table.items():
+        schema.keys[key](where, key, value)
 
 
 def check_keys(
@@ -442,10 +438,7 @@ def check_keys(
 
 
 def check_tables(
-    study: Mapping[str, Any],
-    required: tuple[str, ...],
-    tables: Mapping[str, TableKeys],
-    others: tuple[str, ...] = (),
+    study: Mapping[str, Any], required: tuple[str, ...], tables: Mapping[str, Schema]
 ) -> None:
     """Raise a ValueError for tables that are unknown, missing or wrong; a title is allowed, too."""
     for scene, system, kind in (("scene", "system", "a motion"), ("system", "scene", "one impact")):
@@ -454,11 +447,11 @@ def check_tables(
                 f"the study must be of {kind}, with [{system}], but has [{scene}]: "
                 "`jimpact simulate` takes [system], other commands [scene]."
             )
-    allowed = dict.fromkeys(("title", *required, *tables, *others))
+    allowed = dict.fromkeys(("title", *required, *tables))
     check_keys("the study", study, tuple(allowed), required)
     for name in (*required, *tables):
         if not isinstance(study.get(name, {}), dict):
             raise ValueError(f"`{name}` must be a table, but is {study[name]!r}.")
-    for name, keys in tables.items():
+    for name, schema in tables.items():
         if name in study:
-            check_table(f"[{name}]", study[name], keys)
+            check_table(f"[{name}]", study[name], schema)

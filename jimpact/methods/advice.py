@@ -12,9 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_whole, check_per_contact, check_shape, check_values
-from jimpact.compiling import full_precision, precise_jit
+from jimpact.compiling import full_precision
 from jimpact.contact import components, kinetic_angles
-from jimpact.fits.parameters import with_entries
 from jimpact.impacts import impact
 from jimpact.law import Law, check_law, free_parameters_of, options_of
 from jimpact.laws.binary import Binary
@@ -24,7 +23,14 @@ from jimpact.laws.kinematic import Moreau, Newton
 from jimpact.laws.lzb import LZB, default_rtol
 from jimpact.laws.poisson import Poisson
 from jimpact.methods.advice_report import Advice, Candidate, ContactBlock, Unknown
-from jimpact.methods.points import EnergyNorm, Outcomes, in_batches, in_turns, left_out_if_it_raises
+from jimpact.methods.points import (
+    EnergyNorm,
+    Outcomes,
+    in_batches,
+    in_turns,
+    left_out_if_it_raises,
+    varied_impacts,
+)
 from jimpact.montecarlo.gaps import gap_scale
 from jimpact.progress import counting_bar
 from jimpact.registry import ADVISED, REGISTRY, simplest_first
@@ -77,7 +83,7 @@ class Situation(NamedTuple):
 
     `scene` is as passed, but contacts too far to take part (`far`, (m,)) have an infinite gap;
     `touching` has all contacts closed that take part; `gapped` (m,) marks the open contacts that
-    can close while others are loaded.
+    can close while others are loaded; `distance` is the norm of differences of velocities.
     """
 
     scene: Scene
@@ -87,23 +93,19 @@ class Situation(NamedTuple):
     blocks: tuple[ContactBlock, ...]
     gapped: np.ndarray
     far: np.ndarray
+    distance: EnergyNorm
 
     @property
     def coupled(self) -> tuple[ContactBlock, ...]:
         """Blocks of two contacts and more in which one approaches."""
         return tuple(b for b in self.blocks if b.approaches and len(b.contacts) > 1)
 
-    @property
-    def distance(self) -> EnergyNorm:
-        """The norm of differences of velocities."""
-        return EnergyNorm.of(self.scene, self.velocity)
-
 
 class StiffnessSamples(NamedTuple):
     """Stiffnesses (r, m) to try; row 0 is the nominal one, `random` are the last rows.
 
-    `alone[i]` are the rows in which only unknown i leaves its nominal value, `nudged[i]` the two
-    in which it does so by a little.
+    `alone` (u, places) are the rows in which only unknown u leaves its nominal value, `nudged`
+    (u, 2) those in which it does so by a little.
     """
 
     stiffness: np.ndarray
@@ -134,8 +136,8 @@ class Trial(NamedTuple):
         scene = self.scene
         if scene.gaps is None:  # scenes with and without gaps share one compiled program
             scene = with_gaps(scene, jnp.zeros(scene.contacts, scene.mass.dtype))
-        rows = jnp.asarray(stiffness, v.dtype) if self.has_stiffness else None
-        return _batch(self.law, scene, v, rows)
+        rows = {"stiffness": jnp.asarray(stiffness, v.dtype)} if self.has_stiffness else {}
+        return varied_impacts(self.law, scene, v, rows)
 
 
 def advise(
@@ -197,8 +199,7 @@ def advise(
     >>> advice.name, advice.reason
     ('newton', "single contact: every law is Newton's")
     """
-    v = as_velocity(scene, velocity)
-    check_values("velocity", v)
+    v = as_velocity(scene, velocity, finite=True)
     k = np.ones(()) if stiffness is None else stiffness
     parameters = {"restitution": restitution, "stiffness": k, "exponent": exponent}
     if friction is not None:
@@ -318,17 +319,18 @@ def situation_of(scene: Scene, velocity: np.ndarray, law: LZB, known: bool) -> S
         assert scene.gaps is not None
         scene = with_gaps(scene, jnp.where(jnp.asarray(far), jnp.inf, scene.gaps))
     blocks = blocks_of(scene, gamma, np.flatnonzero(~far), law.friction is not None)
-    acting = np.zeros(len(gamma), bool)
-    gapped = np.zeros(len(gamma), bool)
+    acting, gapped = np.zeros((2, len(gamma)), bool)
     for block in blocks:
-        acting[list(block.contacts)] = block.approaches
-        if block.approaches and len(block.contacts) > 1:
-            gapped[list(block.contacts)] = opened[list(block.contacts)]
+        contacts = list(block.contacts)
+        acting[contacts] = block.approaches
+        gapped[contacts] = opened[contacts] & block.approaches & (len(contacts) > 1)
     touching = scene
     if scene.gaps is not None:
         gaps = jnp.where(jnp.asarray(acting), 0.0, scene.gaps).astype(scene.gaps.dtype)
         touching = with_gaps(scene, gaps)
-    return Situation(scene, touching, np.asarray(velocity), gamma, blocks, gapped, far)
+    v = np.asarray(velocity)
+    norm = EnergyNorm.of(scene, v)
+    return Situation(scene, touching, v, gamma, blocks, gapped, far, norm)
 
 
 def _can_close(scene: Scene, velocity: np.ndarray, law: LZB, known: bool) -> np.ndarray:
@@ -408,22 +410,23 @@ def _samples(
         return StiffnessSamples(stiffness[None, :], (), none, none, slice(1))
     low = np.log([u.low / u.nominal for u in unknown])
     high = np.log([u.high / u.nominal for u in unknown])
-    one = np.eye(count)[:, None, :]
-    alone = (one * (low + np.array(ALONE)[:, None] * (high - low))[None]).reshape(-1, count)
-    nudged = (one * np.array([[NUDGE], [-NUDGE]])[None]).reshape(-1, count)
+    places = np.concatenate(
+        [low + np.outer(ALONE, high - low), [[NUDGE] * count, [-NUDGE] * count]]
+    )
+    single = np.concatenate([np.diag(place) for place in places])  # places, then unknowns
     if 2**count <= CORNERS:
         ends = np.array(list(itertools.product((0.0, 1.0), repeat=count)))
     else:
         ends = random.integers(0, 2, (CORNERS, count)).astype(float)
     drawn = random.uniform(0.0, 1.0, (samples, count))
     spread = low + np.concatenate([ends, drawn]) * (high - low)
-    change = np.concatenate([np.zeros((1, count)), alone, nudged, spread])
+    change = np.concatenate([np.zeros((1, count)), single, spread])
     tried = np.tile(stiffness, (len(change), 1))
     for i, u in enumerate(unknown):
         tried[:, u.contact] *= np.exp(change[:, i])
-    first = 1 + np.arange(len(alone)).reshape(count, -1)
-    second = 1 + len(alone) + np.arange(len(nudged)).reshape(count, 2)
-    return StiffnessSamples(tried, unknown, first, second, slice(len(change) - samples, None))
+    rows = 1 + np.arange(len(single)).reshape(-1, count).T
+    alone, nudged = np.split(rows, [len(ALONE)], axis=1)
+    return StiffnessSamples(tried, unknown, alone, nudged, slice(len(change) - samples, None))
 
 
 def trials(situation: Situation, law: LZB) -> dict[str, Trial]:
@@ -455,18 +458,6 @@ def trials(situation: Situation, law: LZB) -> dict[str, Trial]:
 # -------------------------------------------------------------------------- running the laws
 
 
-@precise_jit
-def _batch(law: Law, scene: Scene, velocity: jax.Array, stiffness: jax.Array | None) -> Outcomes:
-    """The law at velocities (r, n), and at rows of stiffness (r, m) if it has one."""
-
-    def one(v: jax.Array, k: jax.Array | None) -> Outcomes:
-        """One impact."""
-        tried = law if k is None else with_entries(law, ("stiffness",), k)
-        return Outcomes.of(impact(tried, scene, v))
-
-    return jax.vmap(one)(velocity, stiffness)
-
-
 def _outcomes(
     trial: Trial, velocity: np.ndarray, stiffness: np.ndarray, progress: float | None
 ) -> Outcomes:
@@ -478,8 +469,8 @@ def _outcomes(
 
 def _chunk(stiffness: np.ndarray) -> int:
     """Rows computed together: one size where impacts are cheap, so that it compiles once."""
-    r, m = stiffness.shape
-    return CHUNK if m <= FEW_CONTACTS else min(r, CHUNK)
+    rows, contacts = stiffness.shape
+    return CHUNK if contacts <= FEW_CONTACTS else min(rows, CHUNK)
 
 
 def _costs(laws: dict[str, Trial], velocity: np.ndarray, stiffness: np.ndarray) -> dict[str, float]:
@@ -554,18 +545,17 @@ def _with_simplest_laws(
     tolerance: float,
 ) -> tuple[ContactBlock, ...]:
     """The blocks, each with the simplest law whose impulses there move v+ within tolerance."""
-    scene, exact = situation.scene, _all_impulses(reference)
-    moved = jax.vmap(partial(_velocity_change, scene))
-    change = np.asarray(moved(jnp.eye(exact.shape[1], dtype=situation.velocity.dtype)))
-    contact = np.arange(scene.contacts)
-    sides = (exact.shape[1] - scene.contacts) // scene.contacts
-    contact = np.concatenate([contact, np.repeat(contact, sides)])
+    moved = jax.vmap(partial(velocity_change, situation.scene))
 
     def error(name: str, block: ContactBlock) -> float:
         """Largest distance that the impulses of a law in this block cause."""
-        entries = np.isin(contact, block.contacts)
-        wrong = _all_impulses(outcomes[name])[:1, entries] - exact[:, entries]
-        return float(np.nanmax(situation.distance(wrong @ change[entries])))
+        inside = np.isin(np.arange(situation.scene.contacts), block.contacts)
+        wrong = outcomes[name].impulse[:1] - reference.impulse
+        side, t = None, reference.tangential.shape[1]
+        if t:
+            each = np.repeat(inside, t // len(inside))
+            side = (outcomes[name].tangential[:1] - reference.tangential) * each
+        return float(np.nanmax(situation.distance(np.asarray(moved(wrong * inside, side)))))
 
     def simplest(block: ContactBlock) -> str | None:
         """The first law within tolerance."""
@@ -577,27 +567,14 @@ def _with_simplest_laws(
     return tuple(b._replace(law=simplest(b)) if b.approaches else b for b in situation.blocks)
 
 
-def _all_impulses(outcomes: Outcomes) -> np.ndarray:
-    """Normal, then tangential impulses (r, m + t)."""
-    parts = [outcomes.impulse, outcomes.tangential]
-    return np.concatenate([x for x in parts if x is not None], axis=1)
-
-
-def _velocity_change(scene: Scene, impulses: jax.Array) -> jax.Array:
-    """v+ - v- (n,) of normal, then tangential impulses (m + t,), or normal ones alone."""
-    m = scene.contacts
-    return velocity_change(scene, impulses[:m], impulses[m:] if len(impulses) > m else None)
-
-
 def _effects(
     situation: Situation, tried: StiffnessSamples, reference: Outcomes, tolerance: float
 ) -> tuple[Unknown, ...]:
     """The unknown stiffnesses with what each does by itself."""
     v, unknown = reference.velocity, []
-    for i, each in enumerate(tried.unknown):
-        alone = float(np.nanmax(situation.distance(v[tried.alone[i]] - v[0])))
-        up, down = v[tried.nudged[i]]
-        slope = float(situation.distance(up - down)) / (2 * NUDGE)
+    for each, rows, (up, down) in zip(tried.unknown, tried.alone, tried.nudged):
+        alone = float(np.nanmax(situation.distance(v[rows] - v[0])))
+        slope = float(situation.distance(v[up] - v[down])) / (2 * NUDGE)
         needed = tolerance / slope if slope > 0 else math.inf
         unknown.append(each._replace(alone=alone, slope=slope, needed=needed))
     return tuple(unknown)

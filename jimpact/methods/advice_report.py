@@ -424,15 +424,14 @@ def _gaps(advice: Advice, verb: str) -> str:
 def _undecided(advice: Advice) -> str:
     """Nothing is within tolerance, because the stiffnesses are not known."""
     moved, bound = share(advice.candidates[advice.name].worst), share(advice.tolerance)
-    most = max(advice.unknown, key=lambda u: u.alone)
-    if len(advice.unknown) > 1:
-        return (
-            f"{ratios(advice)} decide: no law is within {bound}, because they move v+ by up to "
-            f"{moved}; measure {most.name} first (alone {share(most.alone)})"
-        )
+    most, several = max(advice.unknown, key=lambda u: u.alone), len(advice.unknown) > 1
+    decide, they_move = ("decide", "they move") if several else ("decides", "it moves")
     words = (
-        f"{ratios(advice)} decides: no law is within {bound}, because it moves v+ by up to {moved}"
+        f"{ratios(advice)} {decide}: no law is within {bound}, because {they_move} v+ by up to "
+        f"{moved}"
     )
+    if several:
+        return f"{words}; measure {most.name} first (alone {share(most.alone)})"
     if most.needed < 1:
         words += f"; it would have to be known within {100 * most.needed:.2g} %"
     return words

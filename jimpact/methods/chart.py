@@ -216,10 +216,11 @@ def work_precision(
     """
     repeats = as_whole("repeats", repeats, 1)
     case = _case(scene, velocity, law, as_whole("batch", batch, 1))
-    chosen, left_out = _chosen(methods, case)
-    chosen = _with_settings(chosen, settings or {})
+    chosen, left_out = _chosen(methods, settings or {}, case)
     exact, second = _reference(reference, case), CONTENDERS["dop853"]
-    laws = _algebraic(law) if laws is None else laws
+    if laws is None:
+        built = registered_laws(shared_parameters(law))[0]
+        laws = {name: built[name] for name in ALGEBRAIC}
 
     # of one name one program, which the reference shares with its own row
     different = {m.name: m for m in (exact, second, *chosen)}
@@ -266,12 +267,6 @@ def shared_parameters(law: LZB) -> dict[str, Any]:
     return {"restitution": law.restitution} | friction
 
 
-def _algebraic(law: LZB) -> dict[str, Law]:
-    """The algebraic laws with its parameters."""
-    built = registered_laws(shared_parameters(law))[0]
-    return {name: built[name] for name in ALGEBRAIC}
-
-
 # -------------------------------------------------------------- the impact, and the contenders
 
 
@@ -287,8 +282,7 @@ class Case(NamedTuple):
 
 def _case(scene: Scene, velocity: Any, law: LZB, batch: int) -> Case:
     """The impact in double precision, one parameter per contact, with a batch around it."""
-    v = as_velocity(scene, velocity)
-    check_values("velocity", v)
+    v = as_velocity(scene, velocity, finite=True)
     if not isinstance(law, LZB):
         raise TypeError(f"Argument `law` must be an LZB law, but is {type(law).__name__}.")
     law, scene, v = in_common_dtype(law, scene, v)
@@ -311,13 +305,21 @@ def _case(scene: Scene, velocity: Any, law: LZB, batch: int) -> Case:
 
 
 def _chosen(
-    methods: Sequence[str | Contender] | None, case: Case
+    methods: Sequence[str | Contender] | None,
+    settings: Mapping[str, Sequence[float]],
+    case: Case,
 ) -> tuple[list[Contender], dict[str, str]]:
-    """Contenders by name; without names all that support the law, and why others do not."""
-    if methods is not None:
-        return [_supported("methods", each, case) for each in methods], {}
-    left_out = {n: why for n, m in CONTENDERS.items() if (why := m.supports(case.law)) is not None}
-    return [m for n, m in CONTENDERS.items() if n not in left_out], left_out
+    """Contenders with their settings; without names all that support the law, else why not."""
+    left_out: dict[str, str] = {}
+    if methods is None:
+        reasons = {name: each.supports(case.law) for name, each in CONTENDERS.items()}
+        left_out = {name: why for name, why in reasons.items() if why is not None}
+        methods = [name for name in CONTENDERS if name not in left_out]
+    chosen = [_supported("methods", each, case) for each in methods]
+    for name, values in settings.items():
+        check_choice("settings", name, [each.name for each in chosen])
+        check_values(f"settings[{name!r}]", values, low=0.0, open_low=True)
+    return [m._replace(ladder=tuple(settings.get(m.name, m.ladder))) for m in chosen], left_out
 
 
 def _supported(argument: str, contender: str | Contender, case: Case) -> Contender:
@@ -336,16 +338,6 @@ def _supported(argument: str, contender: str | Contender, case: Case) -> Contend
             f"{reason}."
         )
     return contender
-
-
-def _with_settings(
-    chosen: list[Contender], settings: Mapping[str, Sequence[float]]
-) -> list[Contender]:
-    """The contenders with these settings."""
-    for name, values in settings.items():
-        check_choice("settings", name, [contender.name for contender in chosen])
-        check_values(f"settings[{name!r}]", values, low=0.0, open_low=True)
-    return [m._replace(ladder=tuple(settings.get(m.name, m.ladder))) for m in chosen]
 
 
 def _reference(name: str | None, case: Case) -> Contender:
@@ -404,7 +396,7 @@ def _method_programs(
     """Programs of a contender at the stiffnesses of the case."""
     if not contender.jax:
         return _host_programs(contender, case)
-    names = tuple(shared_parameters(case.law))
+    names, apart = tuple(shared_parameters(case.law)), contender.duration_apart
 
     def solve(k: jax.Array, case: Case, setting: jax.Array) -> Solved:
         """The impact with stiffness k (m,)."""
@@ -413,42 +405,38 @@ def _method_programs(
     def timed(k: jax.Array, case: Case, setting: jax.Array) -> Solved:
         """The same, without a duration that would cost a run of its own."""
         solution = solve(k, case, setting)
-        without = contender.duration_apart or not durations
-        return solution._replace(duration=jnp.nan) if without else solution
+        return solution._replace(duration=jnp.nan) if apart or not durations else solution
 
     def jacobian(k: jax.Array, case: Case, setting: jax.Array) -> Any:
         """(d v+ / d ln k, d v+ / d e) (n, 2 m), with friction also d v+ / d mu (n, 3 m)."""
 
-        def velocity(log_factor: jax.Array, *values: jax.Array) -> jax.Array:
+        def velocity(at: dict[str, jax.Array]) -> jax.Array:
             """v+ (n,)."""
             law = case.law
-            for name, value in zip(names, values):
-                law = with_entries(law, (name,), value)
-            changed = case._replace(law=law)
-            return timed(k * jnp.exp(log_factor), changed, setting).out.velocity
+            for name in names:
+                law = with_entries(law, (name,), at[name])
+            factor = jnp.exp(at["ln k"])
+            return timed(k * factor, case._replace(law=law), setting).out.velocity
 
-        at = (jnp.zeros_like(k), *(getattr(case.law, name) for name in names))
-        parts = jax.jacfwd(velocity, argnums=tuple(range(len(at))))(*at)
-        return jnp.concatenate(parts, axis=-1)
+        at = {"ln k": jnp.zeros_like(k)} | {name: getattr(case.law, name) for name in names}
+        parts = jax.jacfwd(velocity)(at)
+        return jnp.concatenate([parts[name] for name in at], axis=-1)
 
-    compile_time: dict[str, float] = {}
+    k, compile_time = case.stiffness, dict[str, float]()
 
-    def program(name: str, function: Callable[..., Any], rows: int | None) -> Callable[[Any], Any]:
-        """The function of a setting, over the first stiffnesses; None: over the law's alone."""
-        k = case.stiffness[0] if rows is None else case.stiffness[:rows]
-        each = function if rows is None else jax.vmap(function, in_axes=(0, None, None))
-        return _compiled(compile_time, name, each, k, case)
+    def batch(name: str, function: Callable[..., Any], rows: int) -> Callable[[Any], Any]:
+        """The function of a setting, over the first stiffnesses."""
+        each = jax.vmap(function, in_axes=(0, None, None))
+        return _compiled(compile_time, name, each, k[:rows], case)
 
-    batched = program("batched", timed, len(case.stiffness))
-    complete = batched
-    if durations and contender.duration_apart:
-        complete = program("errors", solve, case.sample)
+    batched = batch("batched", timed, len(k))
+    complete = batch("errors", solve, case.sample) if durations and apart else batched
     return Programs(
-        single=program("single", timed, None),
+        single=_compiled(compile_time, "single", timed, k[0], case),
         batched=batched,
-        batch=len(case.stiffness),
+        batch=len(k),
         sampled=lambda setting: jax.tree.map(lambda a: a[: case.sample], complete(setting)),
-        gradient=program("gradient", jacobian, case.sample) if gradients else None,
+        gradient=batch("gradient", jacobian, case.sample) if gradients else None,
         compile_time=compile_time,
     )
 
@@ -473,28 +461,20 @@ def _compiled(
 
 def _host_programs(contender: Contender, case: Case) -> Programs:
     """The same of a contender that runs on the host: loops."""
-    rows = min(HOST_BATCH, len(case.stiffness))
-    laws = [
-        with_entries(case.law, ("stiffness",), k)
-        for k in case.stiffness[: max(HOST_BATCH, case.sample)]
-    ]
+    laws = [with_entries(case.law, ("stiffness",), k) for k in case.stiffness[:SAMPLE]]
+    rows = min(HOST_BATCH, len(laws))
 
-    def several(count: int) -> Callable[[Any], Solved]:
-        """So many impacts, one after the other."""
-
-        def run(setting: Any) -> Solved:
-            """At a setting."""
-            solved = [_solved(contender, law, case, setting) for law in laws[:count]]
-            return jax.tree.map(lambda *a: jnp.stack(a), *solved)
-
-        return run
+    def sampled(setting: Any) -> Solved:
+        """All outcomes, one after the other."""
+        solved = [_solved(contender, law, case, setting) for law in laws]
+        return jax.tree.map(lambda *a: jnp.stack(a), *solved)
 
     def alone(setting: Any, count: int = 1) -> list[Any]:
         """The solver itself, for its time."""
         return [contender.solve(law, case.scene, case.velocity, setting) for law in laws[:count]]
 
     batched = functools.partial(alone, count=rows)
-    return Programs(single=alone, batched=batched, batch=rows, sampled=several(case.sample))
+    return Programs(single=alone, batched=batched, batch=rows, sampled=sampled)
 
 
 def _law_programs(law: Law, case: Case) -> Programs:
@@ -506,9 +486,9 @@ def _law_programs(law: Law, case: Case) -> Programs:
         """One impact."""
         return Solved(impact(law, scene, v), jnp.nan, UNCOUNTED)
 
-    many = jax.vmap(run, in_axes=(0, None, None, None))
-    velocities = jnp.tile(case.velocity[None, :], (batch, 1))
-    one = _compiled(compile_time, "single", run, case.velocity, law, case.scene)
+    many, v = jax.vmap(run, in_axes=(0, None, None, None)), case.velocity
+    one = _compiled(compile_time, "single", run, v, law, case.scene)
+    velocities = jnp.tile(v, (batch, 1))
     return Programs(
         single=one,
         batched=_compiled(compile_time, "batched", many, velocities, law, case.scene),
@@ -526,20 +506,18 @@ def _errors(case: Case, solution: Solved, truth: Solved) -> dict[str, float]:
     out, exact = solution.out, truth.out
     fastest = float(jnp.max(jnp.abs(case.velocity))) or np.abs(exact.velocity).max()
     before = float(kinetic_energy(case.scene, case.velocity)) or np.abs(exact.energy_change).max()
-
-    def largest(a: Any, b: Any, scale: Any = None) -> float:
-        """Largest difference over the scale, that of the truth by default; NaN without both."""
-        if a is None or b is None:
-            return float("nan")
-        scale = np.abs(b).max() if scale is None else scale
-        return float(np.abs(a - b[: len(out.velocity)]).max() / scale)
-
+    compared = {
+        "velocity": (out.velocity, exact.velocity, fastest),
+        "impulse": (out.impulse, exact.impulse, np.abs(exact.impulse).max()),
+        "energy": (out.energy_change, exact.energy_change, before),
+        "duration": (solution.duration, truth.duration, np.abs(truth.duration).max()),
+        "gradient": (solution.jacobian, truth.jacobian, fastest),
+    }
     return {
-        "velocity": largest(out.velocity, exact.velocity, fastest),
-        "impulse": largest(out.impulse, exact.impulse),
-        "energy": largest(out.energy_change, exact.energy_change, before),
-        "duration": largest(solution.duration, truth.duration),
-        "gradient": largest(solution.jacobian, truth.jacobian, fastest),
+        name: float(np.abs(a - b[: len(a)]).max() / scale)
+        if a is not None and b is not None
+        else float("nan")
+        for name, (a, b, scale) in compared.items()
     }
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from jimpact._checks import check_kind, check_values
+from jimpact._checks import check_kind
 from jimpact.audits import Audit, audit, nothing_approaches
 from jimpact.files.records import Column, Table, Tabular, as_data, fields_as_data, microseconds
 from jimpact.impacts import Impact, impact
@@ -157,8 +157,7 @@ def compare(
     >>> [round(float(v), 4) for v in table.entries["moreau"].outcome.velocity]
     [-0.3333, 0.6667, 0.6667]
     """
-    v = as_velocity(scene, velocity)
-    check_values("velocity", v)
+    v = as_velocity(scene, velocity, finite=True)
     left_out: dict[str, str] = {}
     if laws is None:
         laws, left_out = registered_laws({"restitution": 1.0} | values)

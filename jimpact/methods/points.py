@@ -7,10 +7,14 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from jimpact.impacts import Impact
-from jimpact.scene import Scene, dense_mass
+from jimpact.compiling import precise_jit
+from jimpact.fits.parameters import with_entries
+from jimpact.impacts import Impact, impact
+from jimpact.law import Law
+from jimpact.scene import Scene, dense_mass, with_gaps
 from jimpact.status import STATUS
 
 SHORT = 2e-3  # [s]: calls that are faster are run several times for one measurement, so that the
@@ -42,6 +46,23 @@ class Outcomes(NamedTuple):
         lost = self.failed[:, None]
         v, p, side = jax.tree.map(lambda x: np.where(lost, np.nan, x), self[:3])
         return Outcomes(v, p, side, self.status)
+
+
+@precise_jit
+def varied_impacts(law: Law, scene: Scene, velocity: jax.Array, varied: dict[str, Any]) -> Outcomes:
+    """Impacts at velocities (r, n), over rows (r, ...) of parameters of the law, and of `gaps`."""
+
+    def one(v: jax.Array, values: dict[str, jax.Array]) -> Outcomes:
+        """One impact."""
+        place, tried = scene, law
+        for name, value in values.items():
+            if name == "gaps":
+                place = with_gaps(scene, value)
+            else:
+                tried = with_entries(tried, (name,), jnp.ravel(value))
+        return Outcomes.of(impact(tried, place, v))
+
+    return jax.vmap(one)(velocity, varied)
 
 
 class EnergyNorm(NamedTuple):

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -11,14 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_whole, check_kind, check_shape, check_values
-from jimpact.compiling import precise_jit
 from jimpact.contact import delassus_matrix
 from jimpact.files.records import Column, Table, Tabular, fields_as_data, listed
-from jimpact.impacts import impact
 from jimpact.law import Law, check_law
 from jimpact.methods.advice import blocks_of
 from jimpact.methods.advice_report import ContactBlock, share
-from jimpact.methods.points import EnergyNorm, Outcomes, in_batches
+from jimpact.methods.points import EnergyNorm, Outcomes, in_batches, varied_impacts
 from jimpact.scene import Scene, as_velocity, gap_velocity, with_gaps
 from jimpact.solvers.tridiagonal import diagonal
 from jimpact.status import STATUS
@@ -164,8 +161,7 @@ def simplest_scene(
     """
     check_kind("law", law, Law)
     check_kind("scene", scene, Scene)
-    v = as_velocity(scene, velocity)
-    check_values("velocity", v)
+    v = as_velocity(scene, velocity, finite=True)
     check_law(law, scene, v.dtype)
     check_shape("tolerance", tolerance, (), "one number")
     check_values("tolerance", tolerance, low=0.0, high=1.0, open_low=True)
@@ -173,14 +169,15 @@ def simplest_scene(
     labels = ("",) * scene.contacts if names is None else tuple(map(str, names))
     check_shape("names", np.empty(len(labels)), (scene.contacts,), "one per contact")
     norm = EnergyNorm.of(scene, np.asarray(v), watched)
-    whole = _Simpler(law, scene).run(v, [()])
+    trial = _Simpler(law, scene, v, norm)
+    whole = trial.run([()])
     if STATUS[int(whole.status[0])].failure:
         raise RuntimeError(
             f"The law fails on the whole scene: {STATUS[int(whole.status[0])].message}."
         )
-    friction, trial = _frictions(_Simpler(law, scene), v, whole, norm, tolerance)
-    working, errors, changes = _alone(trial, v, norm, runs)
-    kept, error = _together(trial, v, whole, norm, working, errors, tolerance, runs)
+    friction, trial = _frictions(trial, whole, tolerance)
+    working, errors, changes = _alone(trial, runs)
+    kept, error = _together(trial, whole, working, errors, tolerance, runs)
     taking = scene.closed
     if law.uses_gaps and scene.gaps is not None:
         taking = jnp.isfinite(scene.gaps)
@@ -202,16 +199,12 @@ def simplest_scene(
 
 
 class _Simpler(NamedTuple):
-    """A law on a scene of which contacts are left out."""
+    """A law on a scene of which contacts are left out, at v- (n,), with the norm of errors."""
 
     law: Law
     scene: Scene
-
-    @property
-    def lanes(self) -> int:
-        """Impacts computed together."""
-        m = self.scene.contacts
-        return max(1, min(LANES, m + 1, ENTRIES // m**2))
+    velocity: jax.Array
+    norm: EnergyNorm
 
     def without(self, left_out: Any) -> Scene:
         """The scene whose contacts of these indices have an infinite gap."""
@@ -227,43 +220,38 @@ class _Simpler(NamedTuple):
             row[list(index)] = np.inf
         return gaps
 
-    def run(self, velocity: jax.Array, left_out: Sequence[Any]) -> Outcomes:
+    def run(self, left_out: Sequence[Any]) -> Outcomes:
         """An impact for each set of contacts to leave out, some at a time."""
-        run = partial(_batch, self.law, self.scene, velocity)
-        return in_batches(run, self.gaps(left_out), self.lanes)
+        m = self.scene.contacts
+        lanes = max(1, min(LANES, m + 1, ENTRIES // m**2))
+        velocities = jnp.tile(self.velocity, (lanes, 1))
 
-    def changes(
-        self, velocity: jax.Array, left_out: Sequence[Any], reference: np.ndarray
-    ) -> np.ndarray:
-        """Changes (r, n) of v+ from the reference (n,); NaN where the law fails."""
-        return self.run(velocity, left_out).where_usable().velocity - reference
+        def run(gaps: Any) -> Outcomes:
+            """Some of them."""
+            return varied_impacts(self.law, self.scene, velocities, {"gaps": jnp.asarray(gaps)})
 
+        return in_batches(run, self.gaps(left_out), lanes)
 
-@precise_jit
-def _batch(law: Law, scene: Scene, velocity: jax.Array, gaps: Any) -> Outcomes:
-    """The impact with each row of gaps (r, m)."""
-
-    def one(gaps: jax.Array) -> Outcomes:
-        """One impact."""
-        return Outcomes.of(impact(law, with_gaps(scene, gaps), velocity))
-
-    return jax.vmap(one)(gaps)
+    def changes(self, left_out: Sequence[Any], whole: Outcomes) -> np.ndarray:
+        """Changes (r, n) of v+ from that of the whole scene; NaN where the law fails."""
+        return self.run(left_out).where_usable().velocity - whole.velocity[0]
 
 
 def _frictions(
-    trial: _Simpler, v: jax.Array, whole: Outcomes, norm: EnergyNorm, tolerance: float
+    trial: _Simpler, whole: Outcomes, tolerance: float
 ) -> tuple[dict[str, float], _Simpler]:
     """The error of each simpler friction, and the simplest that is within tolerance."""
-    law, scene = trial
+    law, scene = trial.law, trial.scene
     if getattr(law, "friction", None) is None or scene.tangents is None:
         return {}, trial
     simpler: Any = replace(law, friction=None)  # type: ignore[call-arg]
-    ways = {"none": _Simpler(simpler, _with_tangents(scene, None))}
+    ways = {"none": trial._replace(law=simpler, scene=_with_tangents(scene, None))}
     if scene.tangents.shape[1] == 2 * scene.contacts:
-        ways["one direction"] = _Simpler(law, _with_tangents(scene, _along(scene, whole)))
+        along = _with_tangents(scene, _along(scene, whole))
+        ways["one direction"] = trial._replace(scene=along)
     errors, chosen = {}, None
     for name, way in ways.items():
-        errors[name] = float(norm(way.changes(v, [()], whole.velocity[0]))[0])
+        errors[name] = float(trial.norm(way.changes([()], whole))[0])
         if chosen is None and errors[name] <= tolerance:
             chosen = way
     return errors, chosen or trial
@@ -284,14 +272,12 @@ def _along(scene: Scene, whole: Outcomes) -> jax.Array:
     return jnp.asarray(np.sum(tangents * way[None], axis=2).astype(tangents.dtype))
 
 
-def _alone(
-    trial: _Simpler, v: jax.Array, norm: EnergyNorm, runs: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _alone(trial: _Simpler, runs: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Contacts with an impulse, and of each contact (m,) the error and change of v+ without it.
 
     Without impulse a contact leaves no trace in v+, whatever the law.
     """
-    whole = trial.run(v, [()])
+    whole, norm = trial.run([()]), trial.norm
     p = np.abs(whole.impulse[0])
     working = np.flatnonzero(p)
     weight = p * np.sqrt(np.asarray(diagonal(delassus_matrix(trial.scene))))
@@ -299,7 +285,7 @@ def _alone(
     errors, changes = np.zeros(len(p)), np.zeros(len(p))
     errors[working] = changes[working] = np.nan
     if len(largest):
-        change = trial.changes(v, [(j,) for j in largest], whole.velocity[0])
+        change = trial.changes([(j,) for j in largest], whole)
         errors[largest] = norm(change)
         changes[largest] = np.abs(change[:, norm.watched]).max(axis=1)
     return working, errors, changes
@@ -307,9 +293,7 @@ def _alone(
 
 def _together(
     trial: _Simpler,
-    v: jax.Array,
     whole: Outcomes,
-    norm: EnergyNorm,
     working: np.ndarray,
     errors: np.ndarray,
     tolerance: float,
@@ -328,7 +312,7 @@ def _together(
         last = max(len(waiting) - (not kept), 0)  # one is always kept
         counts = np.unique(np.linspace(0, last, min(runs, last) + 1, dtype=int))
         sets = [left_out + waiting[:count] for count in counts]
-        error = norm(trial.changes(v, sets, whole.velocity[0]))
+        error = trial.norm(trial.changes(sets, whole))
         suffice = np.flatnonzero(error <= tolerance)
         best = int(suffice[-1]) if len(suffice) else 0
         left_out, left = sets[best], waiting[counts[best] :]

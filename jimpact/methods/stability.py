@@ -34,41 +34,46 @@ from jimpact.progress import counting_bar
 from jimpact.scene import Scene, as_velocity, chain
 from jimpact.status import CODE
 
+BALLS = (2, 3, 5, 10, 30, 100)  # numbers of balls, of the axis N of the maps
+# Each number of balls is compiled by itself: below this resolution only a few.
+_FEW_BALLS, _FEW = (2, 3, 10), 8
+
 
 class Axis(NamedTuple):
-    """Value of an axis at the base point of the slices, and the ends of its range."""
+    """Value of an axis at the base point of the slices, and the ends of its range.
+
+    `least` is the smallest value above 0 of an axis by powers; 0: it is linear.
+    """
 
     base: float
     low: float
     high: float
+    least: float = 0.0
+
+    def values(self, count: int) -> np.ndarray:
+        """So many values over the range."""
+        if not self.least:
+            return np.linspace(self.low, self.high, count)
+        zero = [] if self.low else [0.0]
+        return np.append(zero, np.geomspace(self.least, self.high, count - len(zero)))
 
 
 _AXES = {  # base: three equal Hertz balls; rtol 1e-8, time step 0.05, impulse step 1e-3
     "setting": Axis(0.6, 0.0, 1.0),
-    "stiffness_ratio": Axis(1.0, 1e-8, 1e8),
+    "stiffness_ratio": Axis(1.0, 1e-8, 1e8, 1e-8),
     "exponent": Axis(1.5, 1.0, 5.0),
-    "restitution": Axis(0.9, 0.0, 1.0),
-    "mass_ratio": Axis(1.0, 1e-6, 1e6),
+    "restitution": Axis(0.9, 0.0, 1.0, 1e-3),
+    "mass_ratio": Axis(1.0, 1e-6, 1e6, 1e-6),
     "balls": Axis(3.0, 2.0, 1000.0),
-    "friction": Axis(0.3, 0.0, 10.0),
+    "friction": Axis(0.3, 0.0, 10.0, 0.03),
 }
 AXES = tuple(_AXES)
-OF_CHAINS = tuple(name for name in AXES if name != "friction")
-OF_SCENES = tuple(name for name in AXES if name not in ("mass_ratio", "balls"))
 # kind of setting (see `jimpact.methods.contenders.Contender`): value at level 0 and at level 1
 SETTINGS = {"rtol": (1e-2, 1e-12), "step": (3.0, 3e-3), "impulse step": (0.3, 3e-5)}
 
-CLASSES = (
-    "right",
-    "flagged",
-    "wrong",
-    "gains energy",
-    "stalls",
-    "does not end",
-    "not finite",
-    "unchecked",
-)
 (RIGHT, FLAGGED, WRONG, GAINS_ENERGY, STALLS, ENDLESS, NOT_FINITE, UNCHECKED) = range(8)
+CLASSES: tuple[str, ...] = ("right", "flagged", "wrong", "gains energy", "stalls", "does not end")
+CLASSES += ("not finite", "unchecked")
 HONEST = 10.0  # a result is right up to this error over its rtol
 FIXED_STEP_RIGHT = 1e-3  # methods with a step: right up to this error of v+ over the largest |v-|
 FINER = 0.1  # a wrong result is tried again at this part of its setting,
@@ -91,9 +96,6 @@ RECLOSING = 0.1  # below this e three balls re-close (nearly) without end
 NAMES = ("default", "rk4", "verlet", "impulse_euler")
 FRICTION_NAMES = ("default", "implicit", "verlet")  # those of them that there are
 SLICES = ("one", "pairs")
-BALLS = (2, 3, 5, 10, 30, 100)  # numbers of balls, of the axis N of the maps
-# Each number of balls is compiled by itself: below this resolution only a few.
-_FEW_BALLS, _FEW = (2, 3, 10), 8
 
 
 class Slice(NamedTuple):
@@ -144,22 +146,15 @@ class StabilityMap(Tabular):
 
     def counts(self, method: str) -> dict[str, int]:
         """Points of each class of a method, over all slices and samples."""
-        codes = np.concatenate([s.codes.ravel() for s in self._all_slices(method)])
+        slices = *self.slices[method], self.sampled[method]
+        codes = np.concatenate([each.codes.ravel() for each in slices])
         return dict(zip(CLASSES, np.bincount(codes, minlength=len(CLASSES)).tolist()))
-
-    def _all_slices(self, method: str) -> tuple[Slice, ...]:
-        """Slices of a method, its samples last."""
-        return (*self.slices[method], self.sampled[method])
 
     def to_dict(self) -> dict[str, Any]:
         """Everything, as a JSON file can hold it."""
         by_method = {
-            name: {
-                "counts": self.counts(name),
-                "slices": self.slices[name],
-                "sampled": self.sampled[name],
-            }
-            for name in self.methods
+            name: {"counts": self.counts(name), "slices": self.slices[name], "sampled": sampled}
+            for name, sampled in self.sampled.items()
         }
         words = {"classes": CLASSES, "methods": by_method}
         return fields_as_data(self, "slices", "sampled") | as_data(words)
@@ -247,12 +242,11 @@ def stability_map(
     samples, max_steps = as_whole("samples", samples, 0), as_whole("max_steps", max_steps, 1)
     if not jnp.zeros(()).dtype == jnp.float64:
         raise ValueError("A stability map needs double precision: enable jax_enable_x64.")
-    place = _checked_scene(scene, velocity)
-    names = _axes_of(place)
+    place = _place(scene, velocity)
     chosen = _methods(methods, place)
-    lines = _axis_values(axes, as_whole("resolution", resolution, 2), names)
+    lines = _axis_values(axes, as_whole("resolution", resolution, 2), place.axes)
     start = {name: axis.base for name, axis in _AXES.items()}
-    start |= {name: float(x) for name, x in _checked("base", base or {}, names).items()}
+    start |= {name: float(x) for name, x in _checked("base", base or {}, place.axes).items()}
     axis_sets: list[tuple[str, ...]] = [(name,) for name in lines]
     if slices == "pairs":
         axis_sets += list(combinations(lines, 2))
@@ -261,26 +255,25 @@ def stability_map(
     points = np.concatenate([*(part.reshape(-1, len(AXES)) for part in parts), sampled])
     runners = cache(partial(runner, max_steps, place))
     total = len(points) * (len(chosen) + 1)
+    by_slice: dict[str, tuple[Slice, ...]] = {}
+    by_sample: dict[str, Slice] = {}
+    left_out: dict[str, str] = {}
+    ends = np.cumsum([part[..., 0].size for part in parts])
     with counting_bar(total, "impacts", progress) as advance:
         exact, confirmation = references(points, place, runners, advance)
-        results: dict[str, Any] = {}
-        left_out: dict[str, str] = {}
         for m in chosen:
             with left_out_if_it_raises(m.name, left_out):
-                results[m.name] = classes_of(m, points, place, exact, runners, advance)
-    ends = np.cumsum([part[..., 0].size for part in parts])
-    by_slice, by_sample = {}, {}
-    for name, columns in results.items():
-        pieces = [np.split(column, ends) for column in columns]
-        by_slice[name] = tuple(
-            Slice(names, *(piece[i].reshape(part.shape[:-1]) for piece in pieces))
-            for i, (names, part) in enumerate(zip(axis_sets, parts))
-        )
-        by_sample[name] = Slice(("samples",), *(piece[-1] for piece in pieces))
+                columns = classes_of(m, points, place, exact, runners, advance)
+                codes, errors = (np.split(column, ends) for column in columns)
+                by_slice[m.name] = tuple(
+                    Slice(names, code.reshape(part.shape[:-1]), error.reshape(part.shape[:-1]))
+                    for names, part, code, error in zip(axis_sets, parts, codes, errors)
+                )
+                by_sample[m.name] = Slice(("samples",), codes[-1], errors[-1])
     return StabilityMap(
-        methods=tuple(results),
+        methods=tuple(by_slice),
         axes=lines,
-        base={name: start[name] for name in names},
+        base={name: start[name] for name in place.axes},
         slices=by_slice,
         samples=sampled,
         sampled=by_sample,
@@ -290,47 +283,68 @@ def stability_map(
     )
 
 
-class OneScene(NamedTuple):
-    """A scene in place of chains, and its v- (n,) with 1 as the largest."""
+class Place(NamedTuple):
+    """What the points are of: one scene at v- (n,) with 1 as the largest; None: chains of balls."""
 
-    scene: Scene
-    velocity: jax.Array
+    scene: Scene | None = None
+    velocity: Any = None
 
     @property
     def friction(self) -> bool:
-        """Whether its contacts have friction."""
-        return self.scene.tangents is not None
+        """Whether contacts have friction."""
+        return self.scene is not None and self.scene.tangents is not None
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """The axes that there are."""
+        if self.scene is None:
+            return tuple(name for name in AXES if name != "friction")
+        missing = {"mass_ratio", "balls"} | (set() if self.friction else {"friction"})
+        missing |= set() if self.scene.contacts > 1 else {"stiffness_ratio"}
+        return tuple(name for name in AXES if name not in missing)
+
+    def size(self, balls: int) -> int:
+        """Number of velocities."""
+        return balls if self.scene is None else self.scene.size
+
+    def impact_at(self, point: Any, balls: int, max_steps: int) -> tuple[LZB, Scene, jax.Array]:
+        """Law, scene and v- of a point; the law's friction is None where there is none."""
+        _, kappa, eta, e, mass_ratio, _, friction = point
+        if self.scene is None:
+            mass, stiffness = chain_of(kappa, mass_ratio, balls)
+            v = jnp.zeros_like(mass).at[0].set(1.0)
+            return LZB(e, stiffness, eta, max_steps=max_steps), chain(mass), v
+        stiffness = stiffness_of(kappa, self.scene.contacts)
+        mu = friction if self.friction else None
+        law = LZB(e, stiffness, eta, friction=mu, max_steps=max_steps)
+        return law, self.scene, self.velocity
+
+    def groups(self, points: np.ndarray) -> Iterator[tuple[np.ndarray, int]]:
+        """Points (indices) of equal shapes, and their number of balls."""
+        balls = points[:, AXES.index("balls")] if self.scene is None else np.zeros(len(points))
+        for n in np.unique(balls):
+            yield np.flatnonzero(balls == n), int(n)
 
 
-def _checked_scene(scene: Scene | None, velocity: Any) -> OneScene | None:
-    """The scene with its velocity, checked; None for chains."""
+def _place(scene: Scene | None, velocity: Any) -> Place:
+    """The scene with its velocity, checked; without one chains."""
     if scene is None:
         if velocity is not None:
             raise ValueError("Argument `velocity` must be None without a `scene`.")
-        return None
+        return Place()
     if velocity is None:
         raise ValueError("Argument `velocity` must be given with a `scene`, but is None.")
-    v = as_velocity(scene, velocity)
-    check_values("velocity", v)
+    v = as_velocity(scene, velocity, finite=True)
     if not bool(LZB(1.0).contact(scene, v).happens):
         raise ValueError("Argument `velocity` must let a closed contact approach.")
-    return OneScene(scene, v / jnp.max(jnp.abs(v)))
+    return Place(scene, v / jnp.max(jnp.abs(v)))
 
 
-def _axes_of(place: OneScene | None) -> tuple[str, ...]:
-    """The axes of chains, or of a scene."""
-    if place is None:
-        return OF_CHAINS
-    missing = set() if place.scene.contacts > 1 else {"stiffness_ratio"}
-    missing |= set() if place.friction else {"friction"}
-    return tuple(name for name in OF_SCENES if name not in missing)
-
-
-def _methods(methods: Sequence[str | Contender] | None, place: OneScene | None) -> list[Contender]:
+def _methods(methods: Sequence[str | Contender] | None, place: Place) -> list[Contender]:
     """Contenders, those of these names, or those to map by default."""
     known = {"default": DEFAULT} | {name: m for name, m in CONTENDERS.items() if m.jax}
     defaults: tuple[str, ...] = NAMES
-    if place is not None and place.friction:
+    if place.friction:
         known = {name: m for name, m in known.items() if m.friction}
         defaults = FRICTION_NAMES
     chosen = defaults if methods is None else tuple(methods)
@@ -349,18 +363,10 @@ def _checked(argument: str, values: Mapping[str, Any], names: tuple[str, ...]) -
     return values
 
 
-def default_axes(r: int, names: tuple[str, ...] = OF_CHAINS) -> dict[str, np.ndarray]:
+def default_axes(r: int, names: tuple[str, ...] = Place().axes) -> dict[str, np.ndarray]:
     """r values of each axis (number of balls: at most six)."""
-    values = {
-        "setting": np.linspace(0, 1, r),
-        "stiffness_ratio": np.logspace(-8, 8, r),
-        "exponent": np.linspace(1, 5, r),
-        "restitution": np.append(0.0, np.logspace(-3, 0, r - 1)),
-        "mass_ratio": np.logspace(-6, 6, r),
-        "balls": np.array(BALLS if r >= _FEW else _FEW_BALLS, float),
-        "friction": np.append(0.0, np.logspace(-1.5, 1, r - 1)),
-    }
-    return {name: values[name] for name in names}
+    balls = np.array(BALLS if r >= _FEW else _FEW_BALLS, float)
+    return {name: balls if name == "balls" else _AXES[name].values(r) for name in names}
 
 
 def _axis_values(
@@ -370,11 +376,11 @@ def _axis_values(
     if axes is None:
         return default_axes(r, names)
     axes = _checked("axes", axes or {"": ()}, names)
-    lines = {name: np.unique(np.asarray(x, float)) for name, x in axes.items()}
+    lines = {name: np.unique(np.asarray(axes[name], float)) for name in AXES if name in axes}
     balls = lines.get("balls", np.zeros(0))
     if (balls != np.round(balls)).any():
         raise ValueError(f"Argument `axes['balls']` must hold whole numbers, but has {balls}.")
-    return {name: lines[name] for name in AXES if name in lines}
+    return lines
 
 
 def _slice_points(
@@ -445,21 +451,6 @@ def stiffness_of(kappa: Any, contacts: int) -> jax.Array:
     return jnp.where(jnp.arange(contacts) >= (contacts + 1) // 2, kappa, jnp.ones_like(kappa))
 
 
-def impact_at(
-    point: Any, balls: int, place: OneScene | None, max_steps: int
-) -> tuple[LZB, Scene, jax.Array]:
-    """Law, scene and v- of a point; the law's friction is None where there is none."""
-    _, kappa, eta, e, mass_ratio, _, friction = point
-    if place is None:
-        mass, stiffness = chain_of(kappa, mass_ratio, balls)
-        v = jnp.zeros_like(mass).at[0].set(1.0)
-        return LZB(e, stiffness, eta, max_steps=max_steps), chain(mass), v
-    mu = friction if place.friction else None
-    stiffness = stiffness_of(kappa, place.scene.contacts)
-    law = LZB(e, stiffness, eta, friction=mu, max_steps=max_steps)
-    return law, place.scene, place.velocity
-
-
 DEFAULT = CONTENDERS["dop853"]._replace(name="default")
 
 
@@ -476,12 +467,12 @@ Runner = Callable[[np.ndarray, Any], PointOutcomes]  # of points (L, 7) and sett
 Runners = Callable[[Contender, int], Runner]
 
 
-def runner(max_steps: int, place: OneScene | None, method: Contender, balls: int) -> Runner:
+def runner(max_steps: int, place: Place, method: Contender, balls: int) -> Runner:
     """A function of points (L, 7) and settings: one method on chains of N balls or a scene."""
 
     def one(point: jax.Array, setting: jax.Array) -> PointOutcomes:
         """The outcome at one point."""
-        law, scene, v = impact_at(point, balls, place, max_steps)
+        law, scene, v = place.impact_at(point, balls, max_steps)
         solution = method.solve(law, scene, v, setting)
         out, code = outcome(law, scene, v, solution), jnp.asarray(solution.code)
         return PointOutcomes(out.velocity, code, out.status, audit(scene, v, out).energy_gain)
@@ -496,50 +487,49 @@ def runner(max_steps: int, place: OneScene | None, method: Contender, balls: int
     return run
 
 
-def _groups(points: np.ndarray, place: OneScene | None) -> Iterator[tuple[np.ndarray, int]]:
-    """Points (indices) of equal shapes, and how many velocities they have: the number of balls."""
-    if place is not None:
-        yield np.arange(len(points)), place.scene.size
-        return
-    balls = points[:, AXES.index("balls")]
-    for n in np.unique(balls):
-        yield np.flatnonzero(balls == n), int(n)
-
-
 # --------------------------------------------------------------------------- the references
 
 
 def references(
-    points: np.ndarray, place: OneScene | None, runners: Runners, advance: Callable[[int], None]
+    points: np.ndarray, place: Place, runners: Runners, advance: Callable[[int], None]
 ) -> tuple[np.ndarray, Confirmation]:
     """v+ of each point (P, largest n), NaN where no run ends; how many scipy confirms."""
-    groups = list(_groups(points, place))
-    exact = np.full((len(points), max((n for _, n in groups), default=0)), np.nan)
+    groups = list(place.groups(points))
+    exact = np.full((len(points), max((place.size(n) for _, n in groups), default=0)), np.nan)
     for at, n in groups:
         unique, back = np.unique(points[at, 1:], axis=0, return_inverse=True)
         rows = np.column_stack([np.zeros(len(unique)), unique])
         out = runners(DEFAULT, n)(rows, REFERENCE_RTOL)
         ended = (out.code == CODE["ok"]) | (out.code == CODE["plastic_limit"])
-        exact[at, :n] = np.where(ended[:, None], out.velocity, np.nan)[np.ravel(back)]
+        velocity = np.where(ended[:, None], out.velocity, np.nan)[np.ravel(back)]
+        exact[at, : place.size(n)] = velocity
         advance(len(at))
     return exact, _confirm(points, place, exact)
 
 
-def _confirm(points: np.ndarray, place: OneScene | None, exact: np.ndarray) -> Confirmation:
+def _confirm(points: np.ndarray, place: Place, exact: np.ndarray) -> Confirmation:
     """Differences from scipy's integrator at points spread over those that it solves quickly."""
     quick = np.array([_is_quick(point, place) for point in points])
     candidates = np.flatnonzero(np.isfinite(exact[:, 0]) & quick)
     _, first = np.unique(points[candidates, 1:], axis=0, return_index=True)
     candidates = candidates[np.sort(first)]
     stride = max(1, -(-len(candidates) // CHECKED))
-    differences = np.array([_from_scipy(points[i], place, exact[i]) for i in candidates[::stride]])
-    largest = float(differences.max(initial=0.0)) if len(differences) else float("nan")
-    within = FRICTION_CONFIRMED if place is not None and place.friction else CONFIRMED
-    agree = int((differences <= within).sum())
+    name, rtol, within = "scipy_dop853", CHECK_RTOL, CONFIRMED
+    if place.friction:
+        name, rtol, within = "scipy_radau", FRICTION_RTOL, FRICTION_CONFIRMED
+    differences = []
+    for i in candidates[::stride]:
+        balls = int(points[i, AXES.index("balls")])
+        law, scene, v = place.impact_at(list(map(float, points[i])), balls, CHECK_STEPS)
+        result = CONTENDERS[name].solve(law, scene, v, rtol)
+        change = outcome(law, scene, v, result).velocity - exact[i, : len(v)]
+        differences.append(float(np.abs(change).max()))
+    agree = sum(x <= within for x in differences)
+    largest = max(differences, default=float("nan"))
     return Confirmation(len(points), len(differences), agree, largest, within)
 
 
-def _is_quick(point: np.ndarray, place: OneScene | None) -> bool:
+def _is_quick(point: np.ndarray, place: Place) -> bool:
     """Whether scipy solves the point soon, and does not end it too early (small e).
 
     By the largest frequency of the linearized flow, at most `sqrt(2) eta / e` of the fastest
@@ -547,19 +537,8 @@ def _is_quick(point: np.ndarray, place: OneScene | None) -> bool:
     """
     _, kappa, eta, e, mass_ratio, balls, _ = map(float, point)
     spread = max(kappa, 1 / kappa) ** (1 / (eta + 1)) * max(mass_ratio, 1 / mass_ratio) ** 0.5
-    few = (balls if place is None else place.scene.contacts) <= QUICK_BALLS
+    few = (balls if place.scene is None else place.scene.contacts) <= QUICK_BALLS
     return few and e >= RECLOSING and np.sqrt(2) * eta / e * spread < QUICK_RATIO
-
-
-def _from_scipy(point: np.ndarray, place: OneScene | None, exact: np.ndarray) -> float:
-    """Largest difference of v+ from what scipy gives."""
-    balls = int(point[AXES.index("balls")])
-    law, scene, v = impact_at(list(map(float, point)), balls, place, CHECK_STEPS)
-    name, rtol = "scipy_dop853", CHECK_RTOL
-    if law.friction is not None:
-        name, rtol = "scipy_radau", FRICTION_RTOL
-    result = CONTENDERS[name].solve(law, scene, v, rtol)
-    return float(np.abs(outcome(law, scene, v, result).velocity - exact[: len(v)]).max())
 
 
 # --------------------------------------------------------------------------------- classes
@@ -568,7 +547,7 @@ def _from_scipy(point: np.ndarray, place: OneScene | None, exact: np.ndarray) ->
 def classes_of(
     method: Contender,
     points: np.ndarray,
-    place: OneScene | None,
+    place: Place,
     exact: np.ndarray,
     runners: Runners,
     advance: Callable[[int], None],
@@ -581,18 +560,17 @@ def classes_of(
     if method.setting == "rtol":
         allowed = HONEST * setting
     e = points[:, AXES.index("restitution")]
-    for group, n in _groups(points, place):
-        run = runners(method, n)
-
+    for group, n in place.groups(points):
+        run, size = runners(method, n), place.size(n)
         at = group[e[group] > 0] if method.divides else group
         if len(at):
             out = run(points[at], setting[at])
-            errors[at] = np.abs(out.velocity - exact[at, :n]).max(axis=1)
+            errors[at] = np.abs(out.velocity - exact[at, :size]).max(axis=1)
             codes[at] = _classified(out, errors[at], allowed[at])
         wrong = at[codes[at] == WRONG]
         if len(wrong):
             finer = run(points[wrong], FINER * setting[wrong])
-            error = np.abs(finer.velocity - exact[wrong, :n]).max(axis=1)
+            error = np.abs(finer.velocity - exact[wrong, :size]).max(axis=1)
             falls = error < FALLS * errors[wrong]
             codes[wrong[(finer.code == CODE["ok"]) & ~falls]] = STALLS
         advance(len(group))

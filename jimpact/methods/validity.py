@@ -2,20 +2,21 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_axis, as_float_array, check_choice, check_per_contact, check_values
-from jimpact.compiling import precise_jit
+from jimpact._checks import as_axis, as_numbers, check_choice, check_values
 from jimpact.files.records import Column, Table, Tabular, fields_as_data
 from jimpact.impacts import impact
 from jimpact.law import Law
 from jimpact.laws.binary import Binary
 from jimpact.laws.kinematic import Moreau
 from jimpact.laws.lzb import LZB
+from jimpact.methods.points import varied_impacts
 from jimpact.scene import Scene, as_velocity
 from jimpact.status import STATUS
 from jimpact.theory.dispersion import dispersion_index
@@ -116,8 +117,7 @@ def validity_map(
     >>> result.velocity[0, :, 1:].round(3).tolist()  # binary, dispersed, Moreau
     [[0.0, 1.0], [0.15, 0.98], [0.666, 0.667]]
     """
-    v = as_velocity(scene, velocity)
-    check_values("velocity", v)
+    v = as_velocity(scene, velocity, finite=True)
     if not np.asarray(v).any():
         raise ValueError("Argument `velocity` must not be zero: nothing happens at rest.")
     if scene.contacts < 2 or not np.asarray(scene.closed).all():
@@ -132,10 +132,14 @@ def validity_map(
     check_values("exponents", eta, low=1.0)
     if (np.diff(np.asarray(ratio)) <= 0).any():
         raise ValueError("Argument `ratios` must rise, but does not.")
-    e = as_float_array("restitution", restitution)
-    check_values("restitution", e, low=0.0, high=1.0)
-    check_per_contact("restitution", e, scene.contacts)
-    velocities, spread, status = _grid(scene, v, ratio, eta, e.astype(v.dtype))
+    e = as_numbers("restitution", restitution, low=0.0, high=1.0, contacts=scene.contacts)
+    shape = len(eta), len(ratio)
+    exponents, ratios = (x.ravel() for x in jnp.meshgrid(eta, ratio, indexing="ij"))
+    k = ratios[:, None] ** jnp.arange(scene.contacts).astype(v.dtype)[None, :]
+    law = LZB(e.astype(v.dtype), k[0], eta[0])
+    velocities = jnp.tile(v, (len(ratios), 1))
+    out = varied_impacts(law, scene, velocities, {"stiffness": k, "exponent": exponents})
+    spread = jax.vmap(partial(dispersion_index, scene))(out.velocity)
     laws: dict[str, Law] = {"moreau": Moreau(e), "binary": Binary(e)}
     after = {name: impact(law, scene, v).velocity for name, law in laws.items()}
     return ValidityMap(
@@ -143,24 +147,9 @@ def validity_map(
         before=np.asarray(v),
         ratios=np.asarray(ratio),
         exponents=np.asarray(eta),
-        velocity=np.asarray(velocities),
-        dispersion=np.asarray(spread),
-        status=np.asarray(status),
+        velocity=np.asarray(out.velocity).reshape(*shape, -1),
+        dispersion=np.asarray(spread).reshape(shape),
+        status=np.asarray(out.status).reshape(shape),
         laws={name: np.asarray(x) for name, x in after.items()},
         law_dispersion={name: float(dispersion_index(scene, x)) for name, x in after.items()},
     )
-
-
-@precise_jit
-def _grid(
-    scene: Scene, v: jax.Array, ratios: jax.Array, exponents: jax.Array, e: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """v+ (x, r, n), dispersion and status (x, r) of LZB."""
-    step = jnp.arange(scene.contacts).astype(v.dtype)
-
-    def one(ratio: jax.Array, eta: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """The same at one ratio and exponent."""
-        out = impact(LZB(e, ratio**step, eta), scene, v)
-        return out.velocity, dispersion_index(scene, out.velocity), out.status
-
-    return jax.vmap(lambda eta: jax.vmap(lambda q: one(q, eta))(ratios))(exponents)

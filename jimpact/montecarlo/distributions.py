@@ -2,7 +2,6 @@
 
 import abc
 import operator
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -10,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_shape, check_values
+from jimpact._checks import as_float_array, as_numbers, check_shape
 from jimpact.law import Domain, Law, free_parameters_of
 
 OVERLAP = (
@@ -61,9 +60,7 @@ class Uniform(Distribution):
 
     def __init__(self, low: Any, high: Any):
         """Check both ends."""
-        self.low, self.high = as_float_array("low", low), as_float_array("high", high)
-        check_values("low", self.low)
-        check_values("high", self.high)
+        self.low, self.high = as_numbers("low", low), as_numbers("high", high)
         if np.any(np.asarray(self.low) > np.asarray(self.high)):
             raise ValueError(f"Argument `high` must be at least `low`, but has {self!r}.")
 
@@ -104,9 +101,8 @@ class Normal(Distribution):
 
     def __init__(self, mean: Any, std: Any):
         """Check both parameters."""
-        self.mean, self.std = as_float_array("mean", mean), as_float_array("std", std)
-        check_values("mean", self.mean)
-        check_values("std", self.std, low=0.0, open_low=True)
+        self.mean = as_numbers("mean", mean)
+        self.std = as_numbers("std", std, low=0.0, open_low=True)
 
     def sample(self, key: jax.Array, size: int, dtype: Any, non_negative: bool) -> jax.Array:
         """One draw (size,)."""
@@ -190,10 +186,7 @@ class RandomLaw(eqx.Module):
         return law
 
 
-Source = Distribution | Rows | Callable[[jax.Array], Any] | jax.Array | None
-
-
-def as_source(name: str, value: Any, size: int, non_negative: bool) -> Source:
+def as_source(name: str, value: Any, size: int, non_negative: bool) -> Any:
     """A distribution, a function of a key, rows, or a constant (size,); checked on the host."""
     if isinstance(value, Distribution):
         value.check(name, size, non_negative)
@@ -203,18 +196,16 @@ def as_source(name: str, value: Any, size: int, non_negative: bool) -> Source:
         check_shape(f"{name}(key)", drawn, (size,), "one draw")
         return value
     array = as_float_array(name, value)
-    if array.ndim == 2:
-        check_shape(name, array, (len(array), size), "one sample a row")
-    else:
-        check_shape(name, array, (size,), "or one sample a row")
-    check_values(name, array)
+    several = array.ndim == 2
+    shape = (len(array), size) if several else (size,)
+    as_numbers(name, array, shape, "one sample a row" if several else "or one sample a row")
     if non_negative and np.any(np.asarray(array) < 0):
         where = np.argwhere(np.asarray(array) < 0)[0].tolist()
         raise ValueError(
             f"Argument `{name}` must not be negative, but has value "
             f"{float(array[tuple(where)]):g} at index {where}; {OVERLAP}"
         )
-    return Rows(np.asarray(array)) if array.ndim == 2 else array
+    return Rows(np.asarray(array)) if several else array
 
 
 def _check_domain(name: str, drawn: Distribution, domain: Domain) -> None:

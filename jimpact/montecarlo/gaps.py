@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import check_values, is_traced
+from jimpact._checks import is_traced
 from jimpact.contact import delassus_matrix
 from jimpact.files.records import readable_unit
 from jimpact.law import Law, check_law
@@ -18,10 +18,6 @@ from jimpact.solvers.tridiagonal import diagonal
 # Gaps over delta_c that are described as touching (below) and as wide (above): the crossover
 # between the two is about 2 delta_c wide.
 NEARLY_TOUCHING, WIDE = 0.1, 2.0
-
-# Linearized over sampled standard deviation, less 1, up to which the outcome is called linear.
-AGREES = 0.2
-CONSTANT = 1e-12  # a standard deviation below this, relative to the velocities, is rounding
 
 
 class GapScale(eqx.Module):
@@ -92,8 +88,7 @@ def gap_scale(scene: Scene, law: Law, velocity: Any) -> GapScale:
     gap 2 is 3.18 delta_c (delta_c = 31.4 µm): wide, its collisions come one after another
     delta_c: indentation of a contact at the largest approach speed of the scene
     """
-    v = as_velocity(scene, velocity)
-    check_values("velocity", v)
+    v = as_velocity(scene, velocity, finite=True)
     force = law.contact_force
     if force is None:
         raise TypeError(

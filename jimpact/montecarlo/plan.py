@@ -23,7 +23,7 @@ from jimpact._checks import as_whole, check_kind, in_common_dtype
 from jimpact.compiling import precise_jit
 from jimpact.impacts import impact
 from jimpact.law import Law, within_domains
-from jimpact.montecarlo.distributions import Distribution, Rows, Source, as_source
+from jimpact.montecarlo.distributions import Distribution, Rows, as_source
 from jimpact.montecarlo.statistics import BAD_GAP, BAD_LAW, BAD_VELOCITY, Chunk, Task, reduced
 from jimpact.montecarlo.store import fingerprint
 from jimpact.scene import Scene, with_gaps
@@ -33,54 +33,46 @@ SAMPLES = 100_000  # default number of samples; ten times more: quantiles three 
 
 
 class Sources(eqx.Module):
-    """Where law, velocity and gaps come from; an array, a `Law` or None is a constant."""
+    """Law, velocity and gaps of the samples: sources, or what was drawn from them for a chunk.
+
+    A source is a distribution, a function of a key, `Rows`, or a constant (array, `Law`, None). Of
+    a chunk, what is random has a leading axis (C,).
+    """
 
     law: Any
-    velocity: Source
-    gaps: Source
+    velocity: Any
+    gaps: Any
 
     @property
     def random(self) -> dict[str, bool]:
-        """Which of them differ from sample to sample."""
+        """Which of the sources differ from sample to sample."""
         constant = type(None), jax.Array, Law
         return {name: not isinstance(x, constant) for name, x in vars(self).items()}
-
-
-class Drawn(eqx.Module):
-    """Law, velocities and gaps of a chunk; what is random has a leading axis (C,)."""
-
-    law: Law
-    velocity: jax.Array
-    gaps: jax.Array | None
 
 
 @precise_jit
 def draw(
     sources: Sources, scene: Scene, key: jax.Array, lanes: jax.Array, rows: dict[str, jax.Array]
-) -> Drawn:
+) -> Sources:
     """The chunk's law, velocities and gaps; `key` is the chunk's, `rows` are given samples."""
     keys = jax.vmap(lambda lane: jax.random.split(jax.random.fold_in(key, lane), 3))(lanes)
 
     def entries(name: str, size: int, each: jax.Array, non_negative: bool) -> Any:
         """Draws (C, size) of a source, its rows, or its constant."""
         source = getattr(sources, name)
-        if source is None or name in rows:
-            return rows.get(name)
         if isinstance(source, Distribution):
             dtype = jnp.result_type(*jax.tree.leaves(source))
             return jax.vmap(lambda key: source.sample(key, size, dtype, non_negative))(each)
-        if callable(source):
-            return jax.vmap(source)(each)
-        return source
+        return jax.vmap(source)(each) if callable(source) else rows.get(name, source)
 
     law = eqx.filter_vmap(sources.law)(keys[:, 0]) if sources.random["law"] else sources.law
     velocity = entries("velocity", scene.size, keys[:, 1], False)
-    return Drawn(law, velocity, entries("gaps", scene.contacts, keys[:, 2], True))
+    return Sources(law, velocity, entries("gaps", scene.contacts, keys[:, 2], True))
 
 
 @precise_jit
 def impacts(
-    drawn: Drawn, scene: Scene, random: dict[str, bool], size: int
+    drawn: Sources, scene: Scene, random: dict[str, bool], size: int
 ) -> tuple[jax.Array, jax.Array]:
     """Velocities (C, n) and statuses (C,) of a chunk; a bad draw has a code of its own."""
 
@@ -116,28 +108,23 @@ class Plan:
 
     def __call__(self, task: Task, device: jax.Device | None = None) -> Chunk:
         """Compute one chunk on a device (None: the default one)."""
+        random = self.sources.random
         with self._flags():
             drawn, scene = self._drawn(task, device)
-            velocity, status = impacts(drawn, scene, self.sources.random, self.size)
+            velocity, status = impacts(drawn, scene, random, self.size)
         empty = np.zeros((self.size, 0))
         samples = {"velocity": np.asarray(velocity), "status": np.asarray(status)}
         for name, source in (("velocity_before", "velocity"), ("gaps", "gaps")):
-            random = self.sources.random[source]
-            samples[name] = np.asarray(getattr(drawn, source) if random else empty)
+            samples[name] = np.asarray(getattr(drawn, source) if random[source] else empty)
         return reduced(task, samples, self.bins, self.keep_samples)
 
-    def sample(self, task: Task, lane: int) -> tuple[Law, jax.Array, jax.Array | None]:
+    def sample(self, task: Task, lane: int) -> Sources:
         """Law, velocity and gaps of one sample, the same bits as in the run."""
         with self._flags():
             drawn, _ = self._drawn(task, None)
-
-        def of_lane(name: str) -> Any:
-            """The entries of the sample, where they vary."""
-            random = self.sources.random[name]
-            pick = lambda x: x[lane] if random and eqx.is_array(x) else x  # noqa: E731
-            return jax.tree.map(pick, getattr(drawn, name))
-
-        return of_lane("law"), of_lane("velocity"), of_lane("gaps")
+        varying = [getattr(drawn, name) for name, random in self.sources.random.items() if random]
+        arrays = [x for x in jax.tree.leaves(varying) if eqx.is_array(x)]
+        return jax.tree.map(lambda x: x[lane] if any(x is y for y in arrays) else x, drawn)
 
     @contextlib.contextmanager
     def _flags(self) -> Iterator[None]:
@@ -145,7 +132,7 @@ class Plan:
         with jax.enable_x64(self.x64), jax.threefry_partitionable(self.threefry_partitionable):
             yield
 
-    def _drawn(self, task: Task, device: jax.Device | None) -> tuple[Drawn, Scene]:
+    def _drawn(self, task: Task, device: jax.Device | None) -> tuple[Sources, Scene]:
         """The draws of the task; where its inputs are, there a program runs."""
         key = jax.random.wrap_key_data(jnp.asarray(self.key), impl=self.key_kind)
         key = jax.random.fold_in(key, np.uint32(task.number))
@@ -182,9 +169,9 @@ class Run:
     def sample(self, index: int) -> tuple[Law, Scene, jax.Array]:
         """Law, scene and velocity of sample `index`, the same bits as in the run."""
         number, lane = divmod(index, self.plan.size)
-        law, velocity, gaps = self.plan.sample(self.task(number), lane)
-        scene = self.plan.scene
-        return law, scene if gaps is None else with_gaps(scene, gaps), velocity
+        drawn, scene = self.plan.sample(self.task(number), lane), self.plan.scene
+        place = scene if drawn.gaps is None else with_gaps(scene, drawn.gaps)
+        return drawn.law, place, drawn.velocity
 
     @property
     def identity(self) -> dict[str, str]:
@@ -200,11 +187,8 @@ class Run:
             "bins": plan.bins,
             "precision": plan.x64,
         }
-        hashes = {name: fingerprint(value) for name, value in parts.items()}
-        return hashes | {
-            "version of jimpact": jimpact.__version__,
-            "version of jax": jax.__version__,
-        }
+        versions = {"version of jimpact": jimpact.__version__, "version of jax": jax.__version__}
+        return {name: fingerprint(value) for name, value in parts.items()} | versions
 
     @property
     def description(self) -> str:
@@ -215,8 +199,10 @@ class Run:
         text = f"{name}, {scene.size} coordinates, {scene.contacts} contacts"
         for what in ("gaps", "velocity"):
             if sources.random[what]:
-                rows, source = self.rows.get(what), getattr(sources, what)
-                drawn = _named(source) if rows is None else f"{len(rows)} given rows"
+                rows = self.rows.get(what)
+                drawn = (
+                    _named(getattr(sources, what)) if rows is None else f"{len(rows)} given rows"
+                )
                 text += f"; {what}: {drawn}"
         if not sources.random["velocity"]:
             entries = [f"{x:g}" for x in np.asarray(sources.velocity)]
@@ -239,8 +225,7 @@ def planned_run(
     check_kind("scene", scene, Scene)
     sources = _checked_sources(sources, scene)
     chunk, bins = as_whole("chunk", chunk, 1), as_whole("bins", bins, 1)
-    given = {"velocity": sources.velocity, "gaps": sources.gaps}
-    rows = {name: np.asarray(x.values) for name, x in given.items() if isinstance(x, Rows)}
+    rows = {name: np.asarray(x.values) for name, x in vars(sources).items() if isinstance(x, Rows)}
     fewest = min((len(values) for values in rows.values()), default=SAMPLES)
     samples = as_whole("samples", fewest if samples is None else samples, 1)
     for name, values in rows.items():
@@ -253,7 +238,7 @@ def planned_run(
     plan = Plan(
         # the arrays of given samples travel with the tasks, not with the plan
         sources=eqx.tree_at(
-            lambda x: [s.values for s in (x.velocity, x.gaps) if isinstance(s, Rows)],
+            lambda x: [getattr(x, name).values for name in rows],
             sources,
             replace_fn=lambda x: x[:0],
         ),
@@ -278,7 +263,7 @@ def _checked_sources(sources: Sources, scene: Scene) -> Sources:
     if gaps is not None:
         gaps = as_source("gaps", gaps, scene.contacts, non_negative=True)
     checked = Sources(law, velocity, gaps)
-    if gaps is None and not (checked.random["law"] or checked.random["velocity"]):
+    if gaps is None and not any(checked.random.values()):
         raise ValueError(
             "Argument `gaps` must be given where neither the velocity nor the law is random: all "
             "samples would be the same."

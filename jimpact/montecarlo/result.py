@@ -11,6 +11,7 @@ from jimpact.files.records import Column, Table, Tabular, as_data, fields_as_dat
 from jimpact.law import Law
 from jimpact.montecarlo.plan import Run
 from jimpact.montecarlo.statistics import (
+    IN_MEMORY,
     OUTCOMES,
     Chunk,
     bin_edges,
@@ -130,15 +131,10 @@ class MonteCarlo(Tabular):
             Column("coordinate", head="[m/s]"),
             Column("mean", ".6f"),
             Column("standard_error", ".1g", "± error"),
-            *(
-                Column(name, ".5f", head)
-                for name, head in (
-                    ("std", "std"),
-                    *((f"quantile_{q:g}", f"{100 * q:g} %") for q in REPORTED),
-                    ("least", "least"),
-                    ("largest", "largest"),
-                )
-            ),
+            Column("std", ".5f"),
+            *(Column(f"quantile_{q:g}", ".5f", f"{100 * q:g} %") for q in REPORTED),
+            Column("least", ".5f"),
+            Column("largest", ".5f"),
         )
         names = [f"v{i + 1}+" for i in range(len(self.mean))]
         values = self.std, *self.quantile(REPORTED), self.minimum, self.maximum
@@ -201,7 +197,7 @@ def result_of(
         counts=total["counts"],
         statuses=named(total["statuses"]),
         bad=tuple(BadSample(int(i), OUTCOMES[code].name, *rest) for i, code, *rest in failed),
-        first=part(total, "raw"),
+        first={name: x[:IN_MEMORY] for name, x in part(total, "raw").items()},
         gap_scale=gap_scale,
         rate=rate,
         resumed=resumed,

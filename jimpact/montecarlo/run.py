@@ -9,7 +9,6 @@ import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ from jimpact.law import Law
 from jimpact.montecarlo.gaps import gap_scale
 from jimpact.montecarlo.plan import Plan, Run, Sources, planned_run
 from jimpact.montecarlo.result import MonteCarlo, result_of
-from jimpact.montecarlo.statistics import IN_MEMORY, Chunk, Task, joined
+from jimpact.montecarlo.statistics import Chunk, Task, joined
 from jimpact.montecarlo.store import Store
 from jimpact.progress import counting_bar
 from jimpact.scene import Scene
@@ -122,15 +121,16 @@ def _total(
 
     The first chunk that is computed compiles the program: it does not count for the rate.
     """
+    counts = [run.task(number).count for number in range(run.chunks)]
 
     def read(number: int) -> Chunk | None:
         """The chunk as it is stored, if it is."""
-        count, keep = run.task(number).count, run.plan.keep_samples
-        return store.read(number, count, keep) if store is not None else None
+        if store is None:
+            return None
+        return store.read(number, counts[number], run.plan.keep_samples)
 
     stored = {number for number in range(run.chunks) if read(number) is not None}
-    resumed = finished = sum(run.task(number).count for number in stored)
-    missing = (n for n in range(1, run.chunks) if n not in stored)
+    resumed = finished = sum(counts[number] for number in stored)
     times = [(resumed, time.perf_counter())]
 
     def new(chunk: Chunk) -> Chunk:
@@ -145,9 +145,9 @@ def _total(
 
     try:
         with counting_bar(run.samples, "samples", progress, resumed) as advance:
-            first = read(0) or new(run.plan(run.task(0)))  # it sets the histograms
-            tasks = (run.task(number, first["ends"]) for number in missing)
-            total = first | {k: v[:IN_MEMORY] for k, v in first.items() if k.startswith("raw.")}
+            total = read(0) or new(run.plan(run.task(0)))  # it sets the histograms
+            missing = (n for n in range(1, run.chunks) if n not in stored)
+            tasks = (run.task(number, total["ends"]) for number in missing)
             with closing(_computed(executor, run.plan, tasks)) as chunks:
                 for number in range(1, run.chunks):
                     chunk = read(number) if number in stored else new(next(chunks))
@@ -242,25 +242,18 @@ def _shipped(plan: Plan) -> Work:
     except ImportError:
         dumps = pickle.dumps
     try:
-        return _Shipped(dumps(plan), plan.x64)
+        return functools.partial(_compute, dumps(plan), plan.x64)
     except Exception:  # objects refuse to be pickled in many ways; threads need no pickle
         return plan
 
 
-@dataclass(frozen=True)
-class _Shipped:
-    """A plan as bytes, and its precision."""
-
-    plan: bytes
-    x64: bool
-
-    def __call__(self, task: Task) -> Chunk:
-        """One chunk."""
-        return _unpacked(self)(task)
+def _compute(plan: bytes, x64: bool, task: Task) -> Chunk:
+    """One chunk of a pickled plan."""
+    return _unpacked(plan, x64)(task)
 
 
 @functools.lru_cache(maxsize=4)
-def _unpacked(shipped: _Shipped) -> Plan:
+def _unpacked(plan: bytes, x64: bool) -> Plan:
     """The same object for the same bytes, so that a worker compiles a run only once."""
-    with jax.enable_x64(shipped.x64):  # else a worker would read float64 arrays as float32
-        return pickle.loads(shipped.plan)
+    with jax.enable_x64(x64):  # else a worker would read float64 arrays as float32
+        return pickle.loads(plan)

@@ -118,10 +118,8 @@ def bin_counts(values: np.ndarray, ends: np.ndarray, bins: int) -> np.ndarray:
     >>> bin_counts(np.array([[-1.0, 0.1, 0.6, 0.7, 1.0]]), np.array([[0.0, 1.0]]), 2).tolist()
     [[1, 1, 2, 1]]
     """
-    low, high = ends[:, :1], ends[:, 1:]
-    place = np.floor((values.astype(float) - low) * (bins / (high - low)))
-    place = np.clip(place, -1, bins).astype(np.int64) + 1
-    return np.array([np.bincount(row, minlength=bins + 2) for row in place])
+    rows = zip(values.astype(float), bin_edges(ends, bins))
+    return np.array([np.bincount(np.digitize(x, edges), minlength=bins + 2) for x, edges in rows])
 
 
 def bin_edges(ends: np.ndarray, bins: int) -> np.ndarray:
@@ -143,9 +141,8 @@ def binned_quantiles(
     >>> binned_quantiles(0.75, ends, counts, np.array([0.1]), np.array([0.9])).tolist()
     [0.75]
     """
-    inner = bin_edges(ends, counts.shape[1] - 2)
-    first, last = np.minimum(low, inner[:, 0]), np.maximum(high, inner[:, -1])
-    edges = np.column_stack([first, inner, last])
+    first, last = np.minimum(low, ends[:, 0]), np.maximum(high, ends[:, 1])
+    edges = np.column_stack([first, bin_edges(ends, counts.shape[1] - 2), last])
     below = np.cumsum(np.column_stack([np.zeros(len(counts)), counts]), axis=1)
     # from above: of an empty stretch between two bins the lower end is taken
     quantiles = [

@@ -4,9 +4,7 @@
 `chunk-0000012.npz` carries the hash of these, and numpy's zip files a checksum of each array.
 """
 
-import dataclasses
 import errno
-import functools
 import hashlib
 import inspect
 import io
@@ -14,7 +12,8 @@ import json
 import os
 import pickle
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,52 +35,42 @@ def fingerprint(value: Any) -> str:
     >>> fingerprint([1.0, "a"]) == fingerprint([1.0, "a"]) != fingerprint([2.0, "a"])
     True
     """
-    digest = hashlib.sha256()
-    for each in _parts(value, ()):
-        digest.update(len(each).to_bytes(8, "little") + each)
-    return digest.hexdigest()
+    return hashlib.sha256(repr(_described(value, ())).encode()).hexdigest()
 
 
-def _parts(value: Any, inside: tuple[int, ...]) -> Iterator[bytes]:
-    """The value as byte strings; `inside` are the ids of what holds it (functions may recur)."""
-    yield _name(type(value)).encode()
+def _described(value: Any, inside: tuple[int, ...]) -> Any:
+    """The value as tuples of words; `inside` are the ids of what holds it (functions may recur)."""
+    name = _name(type(value))
     if id(value) in inside:
-        yield b"itself"
-    elif isinstance(value, jax.Array | np.ndarray | np.generic):
+        return name, "itself"
+    each = partial(_described, inside=(*inside, id(value)))
+    if isinstance(value, jax.Array | np.ndarray | np.generic):
         array = np.asarray(value)
-        yield f"{array.dtype} {array.shape}".encode() + np.ascontiguousarray(array).tobytes()
-    elif (content := _content(value)) is not None:
-        for each in content:
-            yield from _parts(each, (*inside, id(value)))
-    elif value is None or isinstance(value, str | bytes | int | float | complex):
-        yield repr(value).encode()
-    else:
-        try:
-            yield pickle.dumps(value, protocol=4)
-        except Exception:  # objects refuse to be pickled in many ways
-            yield _name(value).encode()
-
-
-def _content(value: Any) -> Iterable[Any] | None:
-    """What the value consists of; None where it has no parts that are known."""
+        return name, str(array.dtype), array.shape, np.ascontiguousarray(array).tobytes()
     if isinstance(value, Mapping):
-        return sorted(value.items(), key=repr)
-    if isinstance(value, set | frozenset):
-        return sorted(value, key=repr)
+        return name, sorted(((each(k), each(x)) for k, x in value.items()), key=repr)
     if isinstance(value, list | tuple):
-        return value
-    if isinstance(value, functools.partial):
-        return value.func, value.args, value.keywords
-    if isinstance(value, type):
-        return (_name(value),)
-    if dataclasses.is_dataclass(value):
-        return [(f.name, getattr(value, f.name, None)) for f in dataclasses.fields(value)]
+        return name, [each(x) for x in value]
+    if isinstance(value, set | frozenset):
+        return name, sorted(map(each, value), key=repr)
+    if isinstance(value, partial):
+        return name, each((value.func, value.args, value.keywords))
     if inspect.ismethod(value):
-        return value.__func__, value.__self__
+        return name, each((value.__func__, value.__self__))
     if inspect.isfunction(value):
         closure = [cell.cell_contents for cell in value.__closure__ or ()]
-        return _name(value), _source(value), value.__defaults__, value.__kwdefaults__, closure
-    return None
+        parts = value.__defaults__, value.__kwdefaults__, closure
+        return name, _name(value), _source(value), each(parts)
+    if value is None or isinstance(value, str | bytes | int | float | complex):
+        return name, repr(value)
+    if isinstance(value, type):
+        return name, _name(value)
+    if hasattr(value, "__dict__"):  # a module of Equinox, a jitted function, a user's object
+        return name, each(dict(vars(value)))
+    try:
+        return name, pickle.dumps(value, protocol=4)
+    except Exception:  # objects refuse to be pickled in many ways
+        return name
 
 
 def _source(function: Any) -> Any:
@@ -90,8 +79,7 @@ def _source(function: Any) -> Any:
         return inspect.getsource(function)
     except (OSError, TypeError):
         code = function.__code__
-        constants = [c for c in code.co_consts if not inspect.iscode(c)]
-        return code.co_code, code.co_names, constants
+        return code.co_code, code.co_names, [x for x in code.co_consts if not inspect.iscode(x)]
 
 
 def _name(value: Any) -> str:

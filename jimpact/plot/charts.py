@@ -1,6 +1,6 @@
 """Pictures of error against time, of stability, of where laws are valid, and of advice."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -9,7 +9,6 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from jimpact._checks import check_kind
 from jimpact.methods.advice_report import Advice, as_code, share
 from jimpact.methods.chart import Point, Timing, WorkPrecision
 from jimpact.methods.stability import CLASSES, Slice, StabilityMap
@@ -20,15 +19,14 @@ from jimpact.plot.style import (
     GREY,
     HIGHLIGHT,
     SMALL,
-    finish,
-    heading,
+    colour_of,
     in_words,
     legend_below,
-    legend_within,
     logarithmic,
     new_figure,
     new_panels,
     side_by_side,
+    styled,
     wrapped,
 )
 from jimpact.status import CODE, STATUS
@@ -61,6 +59,7 @@ _STYLES = {"moreau": "--", "binary": ":"}
 _FLOOR = 1e-9  # smaller errors are drawn here
 
 
+@styled(WorkPrecision)
 def work_precision(result: WorkPrecision, title: str = "") -> Figure:
     """Panels: error of v+ against time and against evaluations, and that of the gradient if known.
 
@@ -85,26 +84,20 @@ def work_precision(result: WorkPrecision, title: str = "") -> Figure:
     >>> len(ji.plot.work_precision(result).axes)
     2
     """
-    check_kind("result", result, WorkPrecision)
     gradients = any(point.gradient is not None for row in result.points.values() for point in row)
-    figure, panels = new_panels(4, 3.6) if gradients else new_panels(2, 4.6)
-    handles: dict[str, Any] = {}
+    count, height = (4, 3.6) if gradients else (2, 4.6)
+    figure, panels = new_panels(count, height, title=title)
     styles = _styles(result.points)
-    for axes, (quantity, place, x, y) in zip(panels, _PANELS):
+    for axes, (quantity, against, label) in zip(panels, _PANELS):
         for name, row in result.points.items():
-            line = _draw(axes, row, quantity, place, styles[name])
-            if line is not None:
-                handles.setdefault(row[0].label, line)
-        _finish(axes, result.reference.uncertainty[quantity], x, y)
-    for label, line in handles.items():
-        line.set_label(label)
+            _draw(axes, row, quantity, against, styles[name])
+        _finish(axes, result.reference.uncertainty[quantity], label, _ERRORS[quantity])
     if not gradients:
-        legend_below(figure, list(handles.values()), 2, _note(result))
+        legend_below(figure, 2, note=_note(result))
     else:  # next to the three panels
+        lines = {x.get_label(): x for axes in panels for x in axes.get_legend_handles_labels()[0]}
         panels[3].axis("off")
-        options: dict[str, Any] = {"title": _note(result), "title_fontsize": SMALL, "loc": "center"}
-        panels[3].legend(handles=list(handles.values()), frameon=False, fontsize=SMALL, **options)
-    heading(figure, title)
+        panels[3].legend(handles=list(lines.values()), title=_note(result), loc="center")
     return figure
 
 
@@ -120,85 +113,49 @@ def _styles(points: Mapping[str, tuple[Point, ...]]) -> dict[str, dict[str, Any]
             "ms": 5,
             "ls": "-" if number < len(COLOURS) else "--",
             "lw": 2.6 if default else 1.2,
-            "color": COLOURS[number % len(COLOURS)],
+            "color": colour_of(number),
             "zorder": 3 if default else 2,
         }
     for number, name in enumerate(laws):
         marker = _LAW_MARKERS[number % len(_LAW_MARKERS)]
-        styles[name] = {"marker": marker, "ms": 8, "ls": "none", "color": GREY, "mec": "white"}
+        styles[name] = {"marker": marker, "ms": 8, "ls": "none", "color": GREY}
     return styles
 
 
-def _times(timing: Timing | None) -> tuple[float, tuple[float, float] | None]:
-    """Median [us] and the lengths of its error bar."""
-    if timing is None:
-        return float("nan"), None
-    return 1e6 * timing.median, (
-        1e6 * (timing.median - timing.low),
-        1e6 * (timing.high - timing.median),
-    )
-
-
-_PANELS: tuple[tuple[str, Callable[[Point], tuple[float, Any]], str, str], ...] = (
-    (
-        "velocity",
-        lambda point: _times(point.batched),
-        "time per impact in a batch [µs]",
-        "error of v⁺, relative",
-    ),
-    (
-        "velocity",
-        lambda point: (point.evaluations, None),
-        "field evaluations per impact",
-        "error of v⁺, relative",
-    ),
-    (
-        "gradient",
-        lambda point: _times(point.gradient),
-        "time per impact with its gradient [µs]",
-        "error of ∂v⁺/∂(ln k, e)",
-    ),
+_ERRORS = {"velocity": "error of v⁺, relative", "gradient": "error of ∂v⁺/∂(ln k, e)"}
+_PANELS = (  # error, and what it is drawn against
+    ("velocity", "batched", "time per impact in a batch [µs]"),
+    ("velocity", "evaluations", "field evaluations per impact"),
+    ("gradient", "gradient", "time per impact with its gradient [µs]"),
 )
 
 
 def _draw(
-    axes: Axes,
-    row: tuple[Point, ...],
-    quantity: str,
-    place: Callable[[Point], tuple[float, Any]],
-    style: dict[str, Any],
-) -> Any:
-    """One line; None where no point has a time or a count, and an error."""
-    rows = [
-        (x, max(point.error[quantity], _LEAST), bar, STATUS[CODE[point.status]].failure)
-        for point, (x, bar) in ((point, place(point)) for point in row)
-        if np.isfinite(x) and np.isfinite(point.error[quantity])
-    ]
-    if not rows:
-        return None
-    x, y, bars, failed = zip(*rows)
-    spread = None if bars[0] is None else np.array(bars).T
-    line = axes.plot(x, y, **style)[0]
-    bar = {"elinewidth": 1, "capsize": 2, "color": style["color"]}
-    axes.errorbar(x, y, xerr=spread, fmt="none", **bar)
-    wrong = np.array(failed)
-    axes.plot(
-        np.array(x)[wrong],
-        np.array(y)[wrong],
-        style["marker"],
-        mfc="white",
-        color=style["color"],
-        ms=style["ms"],
-        zorder=4,
-    )
-    return line
+    axes: Axes, row: tuple[Point, ...], quantity: str, against: str, style: dict[str, Any]
+) -> None:
+    """One line; none where no point has a time or a count, and an error."""
+    points, places, bars = [], [], []
+    for point in row:
+        x, spread = getattr(point, against), (0.0, 0.0)
+        if isinstance(x, Timing):
+            x, low, high = 1e6 * np.array(x)
+            spread = x - low, high - x
+        if x is not None and np.isfinite([x, point.error[quantity]]).all():
+            points.append(point)
+            places.append(x)
+            bars.append(spread)
+    if not points:
+        return
+    x, y = np.array(places), np.maximum([p.error[quantity] for p in points], _LEAST)
+    timed = np.array(bars).T if np.any(bars) else None
+    axes.errorbar(x, y, xerr=timed, label=points[0].label, elinewidth=1, capsize=2, **style)
+    failed = np.array([STATUS[CODE[point.status]].failure for point in points])
+    axes.plot(x[failed], y[failed], **style | {"ls": "none", "mfc": "white", "zorder": 4})
 
 
 def _finish(axes: Axes, uncertainty: float, x: str, y: str) -> None:
     """Logarithmic axes with labels, and the grey band up to the uncertainty of the reference."""
-    axes.set_yscale("log")
-    axes.set_xlabel(x)
-    axes.set_ylabel(y)
+    axes.set(xlabel=x, ylabel=y, yscale="log")
     low, high = axes.get_ylim()
     if np.isfinite(uncertainty) and uncertainty > 0:
         low = min(low, 0.3 * uncertainty)
@@ -206,7 +163,6 @@ def _finish(axes: Axes, uncertainty: float, x: str, y: str) -> None:
     axes.set_ylim(low, high)
     logarithmic(axes, "x")
     logarithmic(axes, "y")
-    finish(axes)
 
 
 def _note(result: WorkPrecision) -> str:
@@ -218,6 +174,7 @@ def _note(result: WorkPrecision) -> str:
     )
 
 
+@styled(StabilityMap)
 def stability_map(result: StabilityMap, title: str = "") -> Figure:
     """One panel an axis: a row for each method, a column for each value; other axes at the base.
 
@@ -237,9 +194,8 @@ def stability_map(result: StabilityMap, title: str = "") -> Figure:
     >>> len(ji.plot.stability_map(result).axes)
     1
     """
-    check_kind("result", result, StabilityMap)
     names = list(result.axes)
-    figure, grid = new_panels(len(names), 0.8 + 0.3 * len(result.methods), 1.2)
+    figure, grid = new_panels(len(names), 0.8 + 0.3 * len(result.methods), 1.2, title)
     for i, (axes, name) in enumerate(zip(grid, names)):
         _draw_classes(axes, np.array([result.slices[method][i].codes for method in result.methods]))
         _ticks(axes, "x", name, result.axes[name])
@@ -247,10 +203,11 @@ def stability_map(result: StabilityMap, title: str = "") -> Figure:
         axes.set_yticks(range(len(result.methods)), labels, fontsize=SMALL)
         axes.plot(_place(result, name), -0.62, "v", color="black", ms=5, clip_on=False)
         axes.set_ylim(len(result.methods) - 0.5, -0.5)
-    _finish_map(figure, result, title)
+    _legend_of_classes(figure, result)
     return figure
 
 
+@styled(StabilityMap)
 def stability_pairs(result: StabilityMap, method: str, title: str = "") -> Figure:
     """One panel for every pair of axes, for one method; a ring marks the base point.
 
@@ -277,13 +234,13 @@ def stability_pairs(result: StabilityMap, method: str, title: str = "") -> Figur
         raise ValueError("Argument `result` must be a map with slices='pairs', but has none.")
     names = list(result.axes)
     size = len(names) - 1
-    figure = new_figure(1.6 + 1.5 * size)
-    grid = figure.add_gridspec(size, size)
+    figure, grid = new_figure(1.6 + 1.5 * size, title or method, size, size, squeeze=False)
     for each in pairs:
         column, row = (names.index(name) for name in each.axes)
-        axes = figure.add_subplot(grid[row - 1, column])
-        _pair(axes, result, each, row == size, column == 0)
-    _finish_map(figure, result, title or method)
+        _pair(grid[row - 1, column], result, each, row == size, column == 0)
+    for above in grid[np.triu_indices(size, 1)]:
+        above.remove()
+    _legend_of_classes(figure, result)
     return figure
 
 
@@ -306,8 +263,9 @@ def _draw_classes(axes: Axes, codes: np.ndarray) -> None:
     rows, columns = codes.shape
     axes.set_xticks(np.arange(columns + 1) - 0.5, minor=True)
     axes.set_yticks(np.arange(rows + 1) - 0.5, minor=True)
-    axes.grid(which="minor", color="white", lw=0.8)
     axes.tick_params(which="both", length=0)
+    axes.grid(False)
+    axes.grid(which="minor", color="white", lw=0.8, alpha=1.0)
     axes.spines[:].set_visible(False)
 
 
@@ -335,19 +293,14 @@ def _place(result: StabilityMap, name: str) -> float:
     return float(np.interp(result.base[name], values, np.arange(len(values))))
 
 
-def _finish_map(figure: Figure, result: StabilityMap, title: str) -> None:
-    """Title, and a legend of the classes that occur."""
-    occurring = {
-        int(code)
-        for name in result.methods
-        for each in result.slices[name]
-        for code in np.unique(each.codes)
-    }
-    handles = [Patch(color=CLASS_COLOURS[code], label=CLASSES[code]) for code in sorted(occurring)]
-    legend_below(figure, handles, 4)
-    heading(figure, title)
+def _legend_of_classes(figure: Figure, result: StabilityMap) -> None:
+    """The classes that occur."""
+    codes = [each.codes.ravel() for name in result.methods for each in result.slices[name]]
+    occurring = np.unique(np.concatenate(codes)).tolist()
+    legend_below(figure, 4, [Patch(color=CLASS_COLOURS[i], label=CLASSES[i]) for i in occurring])
 
 
+@styled(ValidityMap)
 def validity_map(result: ValidityMap, tolerance: float = 1e-2, title: str = "") -> Figure:
     """Dispersion against the stiffness ratio, and the errors of the laws that do not know it.
 
@@ -370,34 +323,29 @@ def validity_map(result: ValidityMap, tolerance: float = 1e-2, title: str = "") 
     >>> len(ji.plot.validity_map(result).axes)
     2
     """
-    check_kind("result", result, ValidityMap)
-    figure = new_figure(6.8)
-    top, bottom = figure.subplots(2, 1, sharex=True)
+    default = "Where the stiffness ratio may be left out"
+    figure, (top, bottom) = new_figure(6.8, title or default, 2, 1, sharex=True)
     for i, eta in enumerate(result.exponents):
-        colour = COLOURS[i % len(COLOURS)]
-        top.plot(result.ratios, result.dispersion[i], color=colour, label=f"LZB, exponent {eta:g}")
+        top.plot(result.ratios, result.dispersion[i], label=f"LZB, exponent {eta:g}")
         for name, style in _STYLES.items():
             error = np.maximum(result.error(name)[i], _FLOOR)
-            bottom.plot(result.ratios, error, style, color=colour)
+            bottom.plot(result.ratios, error, style, color=colour_of(i))
     for name, style in _STYLES.items():
         top.axhline(result.law_dispersion[name], color="black", ls=style, lw=1, label=name)
         bottom.plot([], [], style, color="black", label=name)
     bottom.axhline(tolerance, color=GREY, lw=1, label=f"tolerance {share(tolerance)}")
     top.set_ylabel("dispersion index (0: one body has it all)")
-    bottom.set_ylabel("error of v+, relative to max |v-|")
-    bottom.set_yscale("log")
-    bottom.set_ylim(bottom=1e-5)
+    ratio = "k2/k1" if result.scene.contacts == 2 else "of neighbours"
+    bottom.set(xlabel=f"stiffness ratio {ratio}", ylabel="error of v+, relative to max |v-|")
+    bottom.set(yscale="log", ylim=(1e-5, None))
     logarithmic(bottom, "y")
     logarithmic(bottom, "x")
-    two = result.scene.contacts == 2
-    bottom.set_xlabel("stiffness ratio k2/k1" if two else "stiffness ratio of neighbours")
-    top.set_title(title or "Where the stiffness ratio may be left out", loc="left")
-    finish(top, bottom)
-    legend_within(top)
-    legend_within(bottom)
+    top.legend()
+    bottom.legend()
     return figure
 
 
+@styled(Advice)
 def advice(result: Advice, title: str = "") -> Figure:
     """Outcomes of every law, with their range over the unknown ratios, above their errors.
 
@@ -416,44 +364,33 @@ def advice(result: Advice, title: str = "") -> Figure:
     >>> len(ji.plot.advice(result).axes)
     2
     """
-    check_kind("result", result, Advice)
     names, rows = list(result.candidates), list(result.candidates.values())
     chain = result.scene.walls is not None
     what, unit = ("body", "m/s") if chain else ("coordinate", "m/s, rad/s")
     bodies, x = len(result.velocity), np.arange(len(names))
-    dodge = side_by_side(bodies)
-    figure = new_figure(6.5)
-    top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
-    for i in range(bodies):
-        colour = COLOURS[i % len(COLOURS)]
-        v = np.array([c.velocity[i] for c in rows])
-        range_ = np.array([[c.low[i], c.high[i]] for c in rows])
-        top.vlines(x + dodge[i], range_[:, 0], range_[:, 1], color=colour, lw=4, alpha=0.4)
-        top.plot(x + dodge[i], v, "o", color=colour, label=f"{what} {i + 1}")
+    verdict = f"{'within' if result.within else 'not within'} {share(result.tolerance)}"
+    figure, (top, bottom) = new_figure(6.5, "", 2, 1, sharex=True, height_ratios=(3, 2))
+    top.set_title(f"{title}\n{as_code(result.law)}: {verdict}", fontsize="large")
+    for i, offset in enumerate(side_by_side(bodies)):
+        label = f"{what} {i + 1}" if bodies <= len(COLOURS) else None
+        v, low, high = np.array([(c.velocity[i], c.low[i], c.high[i]) for c in rows]).T
+        top.vlines(x + offset, low, high, color=colour_of(i), lw=4, alpha=0.4)
+        top.plot(x + offset, v, "o", color=colour_of(i), label=label)
     chosen = names.index(result.name)
     for axes, label in ((top, None), (bottom, "advised")):
         axes.axvspan(chosen - 0.5, chosen + 0.5, color=HIGHLIGHT, lw=0, label=label)
+        axes.grid(False, axis="x")
     lowest = result.tolerance / 1000
-    worst, median = (
-        np.maximum(errors, lowest) for errors in ([c.worst for c in rows], [c.median for c in rows])
-    )
+    worst, median = np.maximum(np.array([(c.worst, c.median) for c in rows]).T, lowest)
     bottom.vlines(x, median, worst, color=GREY, lw=1)
     bottom.plot(x, worst, "s", color="black", label="worst")
     bottom.plot(x, median, "_", color="black", ms=14, label="median")
     bottom.axhline(result.tolerance, color=COLOURS[1], lw=1, label="tolerance")
-    bottom.set_yscale("log")
-    bottom.set_ylim(lowest / 2, 10)
+    bottom.set(yscale="log", ylim=(lowest / 2, 10))
     logarithmic(bottom, "y")
-    bottom.set_ylabel("error of v+ (energy norm)")
     top.set_ylabel(f"velocity after the impact [{unit}]")
+    bottom.set(xlabel="law", ylabel="error of v+ (energy norm)")
     named = [f"{name}{'' if c.usable else f' ({c.status})'}" for name, c in zip(names, rows)]
     bottom.set_xticks(x, [wrapped(name.replace(" ", "_")) for name in named], fontsize=SMALL)
-    bottom.set_xlabel("law")
-    verdict = "within" if result.within else "not within"
-    top.set_title(
-        f"{title}\n{as_code(result.law)}: {verdict} {share(result.tolerance)}", loc="left"
-    )
-    finish(top, bottom, grid="y")
-    handles = top.get_legend_handles_labels()[0] if bodies <= len(COLOURS) else []
-    legend_below(figure, [*handles, *bottom.get_legend_handles_labels()[0]], 6)
+    legend_below(figure, 6)
     return figure

@@ -26,7 +26,7 @@ from jimpact.plot.motions import (
     set_limits,
     stretch_of,
 )
-from jimpact.plot.style import COLOURS, GREY
+from jimpact.plot.style import GREY, colour_of
 from jimpact.progress import counting_bar
 
 ENDINGS = (".gif", ".mp4", ".html")
@@ -138,7 +138,7 @@ def readable_speed(duration: float) -> float:
 
 def _film(system: System, motion: Motion, title: str, speed: float | None, rate: float) -> _Film:
     """The frames of a motion."""
-    course = course_of(motion)
+    course, body = course_of(motion), system.body
     known = np.isfinite(course.q).all(axis=1) & np.isfinite(course.v).all(axis=1)
     at, q, v = course.time[known], course.q[known], course.v[known]
     if not len(at):
@@ -146,11 +146,19 @@ def _film(system: System, motion: Motion, title: str, speed: float | None, rate:
     speed = readable_speed(at[-1] - at[0]) if speed is None else float(speed)
     count = int((at[-1] - at[0]) / speed * rate + 1e-9) + 1
     time = at[0] + np.arange(count) * speed / rate
-    slopes = np.asarray(jax.vmap(system.body.rates)(jnp.asarray(q), jnp.asarray(v)))
-    places = positions(at, q, slopes, time)
-    ground = _grounds(system, time)
-    floors = [plane_of(angle, offset) for angle, offset in system.body.floors]
-    return _Film(title, time, speed, rate, _curves(system, places, time, ground), floors, ground)
+    slopes = np.asarray(jax.vmap(body.rates)(jnp.asarray(q), jnp.asarray(v)))
+    q, ground = positions(at, q, slopes, time), np.zeros((count, 2))
+    point = POINT * (np.ptp(q) or 1.0)
+    if system.base is not None:
+        q = np.asarray(jax.vmap(partial(seen_from_base, system))(jnp.asarray(q), jnp.asarray(time)))
+        ground = base_path(system, time)  # in the picture
+        if ground.shape[1] == 3:
+            ground = projected(ground)
+        elif ground.shape[1] == 1:
+            ground = np.insert(ground, 0, 0.0, axis=1)
+    curves = [[curve + moved for curve in body.outlines(x, point)] for x, moved in zip(q, ground)]
+    floors = [plane_of(angle, offset) for angle, offset in body.floors]
+    return _Film(title, time, speed, rate, curves, floors, ground)
 
 
 def positions(at: np.ndarray, q: np.ndarray, slopes: np.ndarray, time: np.ndarray) -> np.ndarray:
@@ -172,36 +180,12 @@ def positions(at: np.ndarray, q: np.ndarray, slopes: np.ndarray, time: np.ndarra
     return begin * q[k] + end * q[k + 1] + turns
 
 
-def _curves(
-    system: System, q: np.ndarray, time: np.ndarray, ground: np.ndarray
-) -> list[list[np.ndarray]]:
-    """Outlines of the body, of every frame, where they are in space."""
-    point = POINT * (np.ptp(q) or 1.0)
-    if system.base is not None:
-        q = np.asarray(jax.vmap(partial(seen_from_base, system))(jnp.asarray(q), jnp.asarray(time)))
-    return [
-        [curve + moved for curve in system.body.outlines(x, point)]
-        for x, moved in zip(q, ground, strict=True)
-    ]
-
-
-def _grounds(system: System, time: np.ndarray) -> np.ndarray:
-    """Displacement of the base in the picture (K, 2)."""
-    if system.base is None:
-        return np.zeros((len(time), 2))
-    path = base_path(system, time)
-    if path.shape[1] == 3:
-        return projected(path)
-    return np.insert(path, 0, 0.0, axis=1) if path.shape[1] == 1 else path
-
-
 def _write(film: _Film, path: Path, advance: Callable[[int], None]) -> None:
     """Frame by frame, by matplotlib."""
     figure = Figure(figsize=(4.8, 4.8), dpi=80)
     axes = figure.add_axes(_PLACE)
     set_limits(axes, film.curves, film.ground, film.floors)
-    colours = [COLOURS[i // 2 % len(COLOURS)] for i in range(len(film.curves[0]))]
-    lines = [axes.plot([], [], color=colour)[0] for colour in colours]
+    lines = [axes.plot([], [], color=colour_of(i // 2))[0] for i in range(len(film.curves[0]))]
     drawn = [axes.plot([], [], color=GREY, lw=2)[0] for _ in film.floors]
     view = np.array([axes.get_xlim(), axes.get_ylim()])
 

@@ -9,24 +9,24 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from jimpact._checks import check_kind
 from jimpact.fits.profiles import Contour
 from jimpact.fits.uncertainty import FitResult
 from jimpact.plot.style import (
     COLOURS,
     GREY,
     SPREAD,
-    finish,
-    heading,
+    colour_of,
     legend_below,
     logarithmic,
     new_figure,
     side_by_side,
+    styled,
 )
 
 _LABELLED = 16  # up to this number of shots each has a label
 
 
+@styled(FitResult)
 def fit(fit: FitResult, others: Mapping[str, FitResult] | None = None, title: str = "") -> Figure:
     """Velocities after every shot, or what else was measured, and fitted, above the residuals.
 
@@ -50,18 +50,18 @@ def fit(fit: FitResult, others: Mapping[str, FitResult] | None = None, title: st
     >>> len(figure.axes)
     2
     """
-    check_kind("fit", fit, FitResult)
     data = fit.experiments
     measured, predicted = _in_rows(fit.problem.measured), _in_rows(fit.predicted)
     shots, bodies = predicted.shape
     dodge = side_by_side(bodies)
     x = np.arange(shots)[:, None] + dodge[None, :]
     size = float(np.clip(220 / (shots * bodies), 3, 8))
-    figure = new_figure(6.0)
-    top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1.4))
+    unit = "" if data is None else " m/s"
+    heading = title or f"{type(fit.law).__name__}, rms {fit.rms:.3g}{unit}"
+    figure, (top, bottom) = new_figure(6.0, heading, 2, 1, sharex=True, height_ratios=(3, 1.4))
     error = _error_bars(fit)
     for i in range(bodies):
-        colour = COLOURS[i % len(COLOURS)]
+        colour = colour_of(i)
         bars = None if error is None else error[:, i]
         style: dict[str, Any] = {"fmt": "o", "mfc": "none", "color": colour, "ms": size, "lw": 1}
         top.errorbar(x[:, i], measured[:, i], bars, **style)
@@ -75,12 +75,12 @@ def fit(fit: FitResult, others: Mapping[str, FitResult] | None = None, title: st
     bottom.axhline(0, color=GREY, lw=0.8)
     _shot_axis(bottom, fit, dodge)
     _legend(figure, fit, others or {}, error is not None)
-    unit = "" if data is None else " m/s"
-    top.set_title(title or f"{type(fit.law).__name__}, rms {fit.rms:.3g}{unit}", loc="left")
-    finish(top, bottom, grid="y")
+    for axes in (top, bottom):
+        axes.grid(False, axis="x")
     return figure
 
 
+@styled(Contour)
 def contour(result: Contour, title: str = "") -> Figure:
     """The confidence region of two parameters, and how the deviance rises around the fit.
 
@@ -103,9 +103,7 @@ def contour(result: Contour, title: str = "") -> Figure:
     >>> ji.plot.contour(region).axes[0].get_xlabel()
     'e[1]'
     """
-    check_kind("result", result, Contour)
-    figure = new_figure(5.0)
-    axes = figure.subplots()
+    figure, axes = new_figure(5.0, title)
     d, limit = np.where(np.isfinite(result.deviance), result.deviance, np.nan).T, result.limit
     axes.contourf(result.x, result.y, d, [0.0, limit], colors=[COLOURS[0]], alpha=0.25)
     axes.contour(result.x, result.y, d, [limit], colors=[COLOURS[0]], linewidths=1.5)
@@ -114,15 +112,12 @@ def contour(result: Contour, title: str = "") -> Figure:
     for which, log in zip("xy", result.log, strict=True):
         if log:
             logarithmic(axes, which)
-    axes.set_xlabel(result.names[0])
-    axes.set_ylabel(result.names[1])
+    axes.set(xlabel=result.names[0], ylabel=result.names[1])
     handles = [
         Patch(color=COLOURS[0], alpha=0.25, label=f"{100 * result.level:g} % region"),
         Line2D([], [], marker="+", ls="none", color="black", label="fit"),
     ]
-    legend_below(figure, handles, 2)
-    heading(figure, title)
-    finish(axes)
+    legend_below(figure, 2, handles)
     return figure
 
 
@@ -175,4 +170,4 @@ def _legend(
             handles.append(
                 Line2D([], [], marker="s", ls="none", color=COLOURS[i], label=f"body {i + 1}")
             )
-    legend_below(figure, handles, 4)
+    legend_below(figure, 4, handles)

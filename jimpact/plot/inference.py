@@ -11,7 +11,7 @@ from scipy.special import chdtri, ndtri
 
 from jimpact._checks import check_choice, check_kind
 from jimpact.fits.uncertainty import FitResult, Profile
-from jimpact.plot.style import COLOURS, GREY, SMALL, finish, new_figure, new_panels
+from jimpact.plot.style import COLOURS, GREY, SMALL, new_figure, new_panels, styled
 
 _TITLE = 45  # letters of a line of a panel's title
 _TOP = 3.0  # of a profile's axis, over the limit: only what is below matters
@@ -21,6 +21,7 @@ _SHARES = (0.68, 0.95)  # of the regions in it
 _TWO_SIDED = 1.96  # standard errors: 95 % of normal noise lies within
 
 
+@styled()
 def profiles(result: tuple[Profile, ...] | list[Profile]) -> Figure:
     """Deviance over each parameter, with the limit and the interval below it.
 
@@ -54,12 +55,12 @@ def profiles(result: tuple[Profile, ...] | list[Profile]) -> Figure:
         axes.set_ylim(0, _TOP * each.limit)
         axes.set_xlabel(each.name)
         words = f"{each.words} ({100 * each.level:g} %)"
-        axes.set_title(fill(words, _TITLE), loc="left", fontsize=SMALL)
+        axes.set_title(fill(words, _TITLE), fontsize=SMALL)
         axes.set_ylabel("deviance")
-        finish(axes)
     return figure
 
 
+@styled(FitResult)
 def correlation(fit: FitResult) -> Figure:
     """Correlations of the parameters' errors; empty where the data cannot see one of them.
 
@@ -78,11 +79,10 @@ def correlation(fit: FitResult) -> Figure:
     >>> len(ji.plot.correlation(result).axes)
     2
     """
-    check_kind("fit", fit, FitResult)
     count = len(fit.names)
-    figure = new_figure(float(np.clip(1.8 + 0.5 * count, 3.0, 7.2)))
-    axes = figure.subplots()
+    figure, axes = new_figure(float(np.clip(1.8 + 0.5 * count, 3.0, 7.2)))
     finite: Any = np.ma.masked_invalid(fit.correlation)
+    axes.grid(False)
     image = axes.imshow(finite, vmin=-1, vmax=1, cmap="RdBu_r")
     axes.set_xticks(range(count), fit.names, rotation=90)
     axes.set_yticks(range(count), fit.names)
@@ -96,6 +96,7 @@ def correlation(fit: FitResult) -> Figure:
     return figure
 
 
+@styled(FitResult)
 def residuals(fit: FitResult) -> Figure:
     """Measured against fitted; residuals in standard errors over the speed, and their quantiles.
 
@@ -117,7 +118,6 @@ def residuals(fit: FitResult) -> Figure:
     >>> len(ji.plot.residuals(result).axes)
     3
     """
-    check_kind("fit", fit, FitResult)
     problem = fit.problem
     measured = np.asarray(problem.measured, float)
     here = ~np.isnan(measured)
@@ -126,32 +126,26 @@ def residuals(fit: FitResult) -> Figure:
     known = np.isfinite(noise).all() and (noise > 0).all()
     scaled = fit.residual[here] / (noise if known else 1.0)
     unit = "standard errors" if known else "as measured"
-    figure = new_figure(6.0)
-    (first, second), (third, spare) = figure.subplots(2, 2)
-    spare.remove()
+    figure, (first, second, third) = new_panels(3, 3.0)
     values = (
         "" if fit.experiments is None else f" [{', '.join(dict.fromkeys(fit.experiments.units))}]"
     )
     style: dict[str, Any] = {"ls": "none", "marker": "o", "mfc": "none", "ms": 4}
     first.axline((float(measured[here].mean()),) * 2, slope=1.0, color=GREY, lw=0.8)
     first.plot(fit.predicted[here], measured[here], color=COLOURS[0], **style)
-    first.set_xlabel(f"fitted{values}")
-    first.set_ylabel(f"measured{values}")
+    first.set(xlabel=f"fitted{values}", ylabel=f"measured{values}")
     over, label = _over(fit)
     second.axhline(0, color=GREY, lw=0.8)
     second.plot(np.broadcast_to(over, here.shape)[here], scaled, color=COLOURS[0], **style)
-    second.set_xlabel(label)
-    second.set_ylabel(f"residual [{unit}]")
+    second.set(xlabel=label, ylabel=f"residual [{unit}]")
     ordered = np.sort(scaled)
     normal = ndtri((np.arange(len(ordered)) + 0.5) / len(ordered))
     third.plot(normal, ordered, color=COLOURS[0], **style)
     third.axline((0.0, 0.0), slope=1.0 if known else float(np.std(scaled)) or 1.0, color=GREY)
-    third.set_xlabel("normal quantile [standard errors]")
-    third.set_ylabel(f"residual [{unit}]")
+    third.set(xlabel="normal quantile [standard errors]", ylabel=f"residual [{unit}]")
     if known:
         for y in (-_TWO_SIDED, _TWO_SIDED):
             second.axhline(y, color=GREY, lw=0.6, ls="--")
-    finish(first, second, third)
     return figure
 
 
@@ -163,6 +157,7 @@ def _over(fit: FitResult) -> tuple[np.ndarray, str]:
     return data.approach_speed(scene)[:, None], "fastest approach [m/s]"
 
 
+@styled(FitResult)
 def corner(fit: FitResult, draws: Any = None, names: Sequence[str] | None = None) -> Figure:
     """Every parameter, and every pair of them: intervals and regions of the fit, or of draws.
 
@@ -188,7 +183,6 @@ def corner(fit: FitResult, draws: Any = None, names: Sequence[str] | None = None
     >>> len(ji.plot.corner(result).axes)
     3
     """
-    check_kind("fit", fit, FitResult)
     for name in names or ():
         check_choice("names", name, fit.names)
     known = np.isfinite(fit.standard_error) & (fit.standard_error > 0)
@@ -198,8 +192,8 @@ def corner(fit: FitResult, draws: Any = None, names: Sequence[str] | None = None
         raise ValueError("Argument `fit` must have a standard error to show, but has none.")
     values = None if draws is None else _drawn(fit, draws)
     count = len(shown)
-    figure = new_figure(float(np.clip(1.6 * count + 0.8, 3.0, 7.2)))
-    grid = figure.subplots(count, count, squeeze=False, sharex="col")
+    height = float(np.clip(1.6 * count + 0.8, 3.0, 7.2))
+    figure, grid = new_figure(height, "", count, count, squeeze=False, sharex="col")
     for row, i in enumerate(shown):
         for column, j in enumerate(shown):
             axes = grid[row, column]
@@ -210,11 +204,10 @@ def corner(fit: FitResult, draws: Any = None, names: Sequence[str] | None = None
                 _one(axes, fit, i, values)
             else:
                 _pair(axes, fit, j, i, values)
-            if row == count - 1:
-                axes.set_xlabel(fit.names[j])
-            if column == 0:
-                axes.set_ylabel(fit.names[i] if row else "density")
-            finish(axes)
+    for axes, i in zip(grid[-1], shown):
+        axes.set_xlabel(fit.names[i])
+    for axes, name in zip(grid[:, 0], ["density", *(fit.names[i] for i in shown[1:])]):
+        axes.set_ylabel(name)
     return figure
 
 

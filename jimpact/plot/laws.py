@@ -2,14 +2,13 @@
 
 import dataclasses
 from collections.abc import Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jimpact._checks import check_kind
 from jimpact.files.records import readable_unit
 from jimpact.laws.histories import History
 from jimpact.methods.comparison import Comparison
@@ -18,24 +17,23 @@ from jimpact.plot.style import (
     GREY,
     HIGHLIGHT,
     SMALL,
-    finish,
-    heading,
+    colour_of,
     legend_below,
-    legend_within,
     mark,
     new_figure,
     side_by_side,
+    styled,
     wrapped,
     write,
 )
 from jimpact.theory.admissible import admissible_set
 from jimpact.theory.dispersion import energy_dispersion, energy_ratio
 
-_SAMPLES = 120  # points of a force-indentation loop
 _UPRIGHT = 8  # names that stand side by side, at most
 _OUTCOMES = 4000  # dots of a set of outcomes; ten times more would only be one area
 
 
+@styled(Comparison)
 def comparison(result: Comparison, measured: np.ndarray | None = None, title: str = "") -> Figure:
     """Velocities after the impact by law, energy ratios T+/T- and dispersion indices.
 
@@ -58,74 +56,46 @@ def comparison(result: Comparison, measured: np.ndarray | None = None, title: st
     >>> len(ji.plot.comparison(result).axes)
     2
     """
-    check_kind("result", result, Comparison)
     if measured is not None:
         result = dataclasses.replace(result, measured=np.asarray(measured))
-    names = list(result.entries)
-    figure = new_figure(6.0)
-    top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1.4))
-    _velocities(top, result)
-    heading(figure, title)
-    _energies(bottom, result)
-    _laws_axis(bottom, names)
-    for name in result.closest:
-        place = names.index(name)
-        label = "closest to the measured velocities" if name == result.closest[0] else None
-        for axes in (top, bottom):
+    entries, chain = list(result.entries.values()), result.scene.walls is not None
+    figure, panels = new_figure(6.0, title, 2, 1, sharex=True, height_ratios=(3, 1.4))
+    top, bottom = panels
+    velocity = np.array([entry.outcome.velocity for entry in entries])
+    laws, bodies = velocity.shape
+    at = np.arange(laws)
+    x = at[:, None] + side_by_side(bodies)
+    for i in range(bodies):
+        label = f"{'body' if chain else 'coordinate'} {i + 1}"
+        top.plot(x[:, i], velocity[:, i], "o", color=colour_of(i), label=label)
+        if result.measured is not None:
+            style: dict[str, Any] = {"lw": 1, "ls": "--", "zorder": 0, "color": colour_of(i)}
+            top.plot([-0.5, laws - 0.5], [result.measured[i]] * 2, **style)
+    top.axhline(0, color="black", lw=0.6)
+    if result.measured is not None:
+        top.plot([], [], color="black", lw=1, ls="--", label="measured")
+    wrong = ~np.array([bool(entry.audit.consistent) for entry in entries])
+    if wrong.any():
+        crosses = x[wrong].ravel(), velocity[wrong].ravel()
+        top.plot(*crosses, "x", color="black", ms=10, label="audit failed")
+    top.set_ylabel(f"velocity after the impact [{'m/s' if chain else 'm/s, rad/s'}]")
+    kept, spread = [x.energy_ratio for x in entries], [x.dispersion_index for x in entries]
+    bottom.bar(at - 0.18, kept, 0.32, color=GREY, label="energy ratio T+/T-")
+    bottom.bar(at + 0.18, spread, 0.32, color=COLOURS[4], label="dispersion index")
+    bottom.set(xlabel="law", ylabel="ratio, index")
+    many = laws > _UPRIGHT
+    labels = [name if many else wrapped(name) for name in result.entries]
+    bottom.set_xticks(at, labels, fontsize=SMALL, rotation=90 if many else 0)
+    for axes in panels:
+        axes.grid(False, axis="x")
+        for name in result.closest:
+            place, label = list(result.entries).index(name), "closest to the measured velocities"
             axes.axvspan(place - 0.48, place + 0.48, color=HIGHLIGHT, lw=0, zorder=-1, label=label)
-            label = None
-    finish(top, bottom, grid="y")
-    handles = [x for axes in (top, bottom) for x in axes.get_legend_handles_labels()[0]]
-    legend_below(figure, handles, 4)
+    legend_below(figure, 4)
     return figure
 
 
-def _velocities(axes: Axes, result: Comparison) -> None:
-    """Velocities after by law, measured ones as lines; crosses where the audit fails."""
-    chain = result.scene.walls is not None
-    x, velocity = _dots(axes, result, "body" if chain else "coordinate")
-    consistent = np.array([bool(entry.audit.consistent) for entry in result.entries.values()])
-    if not consistent.all():
-        wrong = x[~consistent].ravel(), velocity[~consistent].ravel()
-        axes.plot(*wrong, "x", color="black", ms=10, label="audit failed")
-    if result.measured is not None:
-        for i, v in enumerate(result.measured):
-            colour = COLOURS[i % len(COLOURS)]
-            axes.plot([-0.5, len(x) - 0.5], [v, v], color=colour, lw=1, ls="--", zorder=0)
-        axes.plot([], [], color="black", lw=1, ls="--", label="measured")
-    axes.set_ylabel(f"velocity after the impact [{'m/s' if chain else 'm/s, rad/s'}]")
-
-
-def _energies(axes: Axes, result: Comparison) -> None:
-    """Energy ratio T+/T- and dispersion index by law, as bars."""
-    entries, at = result.entries.values(), np.arange(len(result.entries))
-    ratio = [entry.energy_ratio for entry in entries]
-    spread = [entry.dispersion_index for entry in entries]
-    axes.bar(at - 0.18, ratio, 0.32, color=GREY, label="energy ratio T+/T-")
-    axes.bar(at + 0.18, spread, 0.32, color=COLOURS[4], label="dispersion index")
-    axes.set_ylabel("share of 1")
-
-
-def _dots(axes: Axes, result: Comparison, what: str) -> tuple[np.ndarray, np.ndarray]:
-    """Velocities after by every law (l, n), a dot each, and their places along the axis."""
-    velocity = np.array([np.asarray(entry.outcome.velocity) for entry in result.entries.values()])
-    laws, bodies = velocity.shape
-    x = np.arange(laws)[:, None] + side_by_side(bodies)[None, :]
-    for i in range(bodies):
-        colour = COLOURS[i % len(COLOURS)]
-        axes.plot(x[:, i], velocity[:, i], "o", color=colour, label=f"{what} {i + 1}")
-    axes.axhline(0, color="black", lw=0.6)
-    return x, velocity
-
-
-def _laws_axis(axes: Axes, names: list[str]) -> None:
-    """Laws by name; many stand upright."""
-    many = len(names) > _UPRIGHT
-    labels = names if many else [wrapped(name) for name in names]
-    axes.set_xticks(np.arange(len(names)), labels, fontsize=SMALL, rotation=90 if many else 0)
-    axes.set_xlabel("law")
-
-
+@styled(Comparison)
 def energy_plane(result: Comparison, title: str = "") -> Figure:
     """Every law in the plane of energy kept (K_ER = T+/T-) and of its dispersion (C_KE).
 
@@ -147,9 +117,7 @@ def energy_plane(result: Comparison, title: str = "") -> Figure:
     >>> ji.plot.energy_plane(result).axes[0].get_xlabel()
     'energy ratio K_ER = T+/T-'
     """
-    check_kind("result", result, Comparison)
-    figure = new_figure(5.4)
-    axes = figure.subplots()
+    figure, axes = new_figure(5.4, title)
     allowed = admissible_set(result.scene, result.velocity).sample(0, _OUTCOMES)
     axes.plot(
         *_kept_and_spread(result, allowed), ".", color=COLOURS[4], alpha=0.3, ms=3, label="allowed"
@@ -157,11 +125,8 @@ def energy_plane(result: Comparison, title: str = "") -> Figure:
     for i, (name, entry) in enumerate(result.entries.items()):
         at = _kept_and_spread(result, np.asarray(entry.outcome.velocity)[None])
         mark(axes, np.ravel(at), name, i, bool(entry.audit.consistent))
-    axes.set_xlabel("energy ratio K_ER = T+/T-")
-    axes.set_ylabel("energy dispersion C_KE (0: equal shares)")
-    heading(figure, title)
-    finish(axes)
-    legend_below(figure, axes.get_legend_handles_labels()[0], 4)
+    axes.set(xlabel="energy ratio K_ER = T+/T-", ylabel="energy dispersion C_KE (0: equal shares)")
+    legend_below(figure, 4)
     return figure
 
 
@@ -172,6 +137,7 @@ def _kept_and_spread(result: Comparison, after: np.ndarray) -> tuple[np.ndarray,
     return np.asarray(kept), np.asarray(jax.vmap(lambda x: energy_dispersion(scene, x))(v))
 
 
+@styled()
 def forces(histories: Mapping[str, History], contact: int = -1) -> Figure:
     """Force at one contact over impact time, one line a history.
 
@@ -187,20 +153,18 @@ def forces(histories: Mapping[str, History], contact: int = -1) -> Figure:
     >>> len(ji.plot.forces({"one ball": h}).axes[0].lines)
     1
     """
-    figure = new_figure(4.2)
-    axes = figure.subplots()
+    figure, axes = new_figure(4.2)
     unit, size = readable_unit("s", max(float(h.duration) for h in histories.values()))
     for j, (name, h) in enumerate(histories.items()):
         time, force = np.asarray(h.time) / size, np.asarray(h.force[:, contact])
-        axes.plot(time, force, color=COLOURS[j % len(COLOURS)], label=name)
-    axes.set_xlabel(f"impact time [{unit}]")
-    axes.set_ylabel("force [N]")
+        axes.plot(time, force, color=colour_of(j), label=name)
+    axes.set(xlabel=f"impact time [{unit}]", ylabel="force [N]")
     axes.set_ylim(bottom=0)
-    finish(axes)
-    legend_within(axes)
+    axes.legend()
     return figure
 
 
+@styled(History)
 def contact_loop(result: History, contact: int = -1, title: str = "") -> Figure:
     """Force of one contact against its true approach; between the ends it encloses the lost energy.
 
@@ -229,8 +193,7 @@ def contact_loop(result: History, contact: int = -1, title: str = "") -> Figure:
     until = slice(0, touching[-1] + 2 if len(touching) else 1)
     unit, size = readable_unit("m", float(np.max(np.abs(result.approach[:, contact]))))
     x, force = np.asarray(result.approach[until, contact]) / size, force[until]
-    figure = new_figure(4.4)
-    axes = figure.subplots()
+    figure, axes = new_figure(4.4, title)
     axes.plot(x, force, color=COLOURS[0], lw=1.8)
     axes.fill(x, force, color=COLOURS[4], alpha=0.2, lw=0)
     turns = np.flatnonzero(np.diff(rate[until] > 0)) if len(touching) else np.zeros(0, int)
@@ -240,20 +203,17 @@ def contact_loop(result: History, contact: int = -1, title: str = "") -> Figure:
         axes.plot(x[i], force[i], "o", color="black", ms=4)
         write(axes, (x[i], force[i]), name, xytext=above, textcoords="offset points")
     axes.margins(y=0.12)
-    axes.set_xlabel(f"approach of the bodies [{unit}]")
-    axes.set_ylabel("force [N]")
-    heading(figure, title)
-    finish(axes)
+    axes.set(xlabel=f"approach of the bodies [{unit}]", ylabel="force [N]")
     return figure
 
 
 def _check_one(result: History) -> None:
-    """Refuse what is no history, and batches of them."""
-    check_kind("result", result, History)
+    """Refuse batches of impacts."""
     if np.ndim(result.status):
         raise ValueError("Argument `result` must be of one impact, but is a batch: pick one of it.")
 
 
+@styled(History)
 def history(result: History, title: str = "") -> Figure:
     """One impact over its time: forces, gap velocities and stored energy of every contact.
 
@@ -275,22 +235,18 @@ def history(result: History, title: str = "") -> Figure:
     _check_one(result)
     unit, size = readable_unit("s", float(result.duration))
     time, rows = np.asarray(result.time) / size, [result.force, result.gap_velocity, result.energy]
-    figure = new_figure(6.8)
-    panels = figure.subplots(3, 1, sharex=True)
+    figure, panels = new_figure(6.8, title, 3, 1, sharex=True)
     words = ("force [N]", "gap velocity [m/s]", "stored energy [J]")
     for axes, values, label in zip(panels, rows, words, strict=True):
         for j, y in enumerate(np.asarray(values).T):
-            axes.plot(time, y, color=COLOURS[j % len(COLOURS)], label=f"contact {j + 1}")
+            axes.plot(time, y, color=colour_of(j), label=f"contact {j + 1}")
         axes.set_ylabel(label)
     friction = np.asarray(result.tangential_force)
     each = friction.shape[1] // result.force.shape[1]
     for j, y in enumerate(friction.T):
-        colour = COLOURS[j // each % len(COLOURS)]
+        colour = colour_of(j // each)
         panels[0].plot(time, y, "--", color=colour, label="tangential" if j == 0 else None)
     panels[1].axhline(0, color=GREY, lw=0.8)
     panels[-1].set_xlabel(f"impact time [{unit}]")
-    finish(*panels)
-    handles = panels[0].get_legend_handles_labels()[0]
-    legend_below(figure, handles[: len(COLOURS)], 5)
-    heading(figure, title)
+    legend_below(figure, 5, panels[0].get_legend_handles_labels()[0][: len(COLOURS)])
     return figure

@@ -1,17 +1,17 @@
 """Picture: distributions of the velocities, and a map of the outcome over two gaps."""
 
 import textwrap
+from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jimpact._checks import check_kind
 from jimpact.files.records import readable_unit
 from jimpact.montecarlo.result import MonteCarlo
 from jimpact.montecarlo.statistics import FAILURE
-from jimpact.plot.style import COLOURS, SMALL, finish, heading, new_figure
+from jimpact.plot.style import SMALL, WIDTH, colour_of, styled
 
 _BARS = 30  # of a histogram: each is several pixels wide
 _MEAN_AT, _TOP = 1.12, 1.25  # height of the mean, and of the axis, over that of the highest bar
@@ -20,6 +20,7 @@ _DOT = 4.0  # area of a sample in the map [points^2]
 _TITLE = 80  # letters of a line of the title
 
 
+@styled(MonteCarlo)
 def monte_carlo(result: MonteCarlo, title: str = "") -> Figure:
     """Histograms of every body, and the first samples over two gaps, coloured by the outcome.
 
@@ -44,22 +45,21 @@ def monte_carlo(result: MonteCarlo, title: str = "") -> Figure:
     >>> len(ji.plot.monte_carlo(result).axes)  # three bodies, map, its colour bar
     5
     """
-    check_kind("result", result, MonteCarlo)
     scattered = np.argsort(-result.std, kind="stable")
     bodies = sorted(scattered[:_BODIES].tolist())
     mapped = result.first["gaps"].shape[1] > 0
-    figure = new_figure(max(4.8, 1.5 * len(bodies)))
-    grid = figure.add_gridspec(len(bodies), 2 if mapped else 1)
-    shared: Axes | None = None
-    for row, body in enumerate(bodies):
-        axes = figure.add_subplot(grid[row, 0], sharex=shared)
-        shared = shared or axes
+    mosaic: Any = [[str(body), "map"] if mapped else [str(body)] for body in bodies]
+    figure = Figure(figsize=(WIDTH, max(4.8, 1.5 * len(bodies))))
+    figure.suptitle(title or textwrap.fill(result.description, _TITLE), x=0.01, ha="left")
+    panels = figure.subplot_mosaic(mosaic)
+    for body in bodies:
+        axes = panels[str(body)]
+        axes.sharex(panels[str(bodies[0])])
         _histogram(axes, result, body)
-        axes.tick_params(labelbottom=row == len(bodies) - 1)
+        axes.tick_params(labelbottom=body == bodies[-1])
     axes.set_xlabel("velocity after the impact [m/s]\n(dot: mean, bar: 5 % to 95 %)")
-    heading(figure, title or textwrap.fill(result.description, _TITLE))
     if mapped:
-        _map(figure.add_subplot(grid[:, 1]), result, int(scattered[0]))
+        _map(panels["map"], result, int(scattered[0]))
     return figure
 
 
@@ -71,7 +71,7 @@ def _histogram(axes: Axes, result: MonteCarlo, body: int) -> None:
     bars = counts[:whole].reshape(-1, each).sum(axis=1)
     bars[-1] += counts[whole:].sum()
     share = 100 * bars / max(result.count, 1)
-    colour = COLOURS[body % len(COLOURS)]
+    colour = colour_of(body)
     ends = np.append(edges[:whole:each], edges[-1])
     axes.stairs(share, ends, color=colour, fill=True)
     top = float(share.max())
@@ -80,10 +80,10 @@ def _histogram(axes: Axes, result: MonteCarlo, body: int) -> None:
     axes.plot([low, high], [height, height], "|-", color="black", ms=7, lw=1)
     axes.plot(mean, height, "o", color="black", ms=4)  # it may lie outside that range
     axes.set_ylim(0, _TOP * top)
-    label = f"body {body + 1}: {mean:.3f} ± {result.std[body]:.3f} m/s"
-    axes.set_title(label, loc="left", fontsize=SMALL, color=colour)
+    label = f"body {body + 1}: mean {mean:.3f}, std {result.std[body]:.3f} m/s"
+    axes.set_title(label, fontsize=SMALL, color=colour)
     axes.set_ylabel("samples [%]")
-    finish(axes, grid="y")
+    axes.grid(False, axis="x")
 
 
 def _map(axes: Axes, result: MonteCarlo, body: int) -> None:
@@ -95,11 +95,11 @@ def _map(axes: Axes, result: MonteCarlo, body: int) -> None:
     gaps = sorted(vary.tolist())
     x = [_in_units(result, first["gaps"][fine, gap], gap) for gap in gaps]
     axes.set_xlabel(x[0][1])
-    axes.set_title(f"{fine.sum():,} samples", loc="left", fontsize=SMALL)
-    axes.spines[["top", "right"]].set_visible(False)
+    axes.set_title(f"{fine.sum():,} samples", fontsize=SMALL)
+    axes.grid(False)
     label = f"velocity of body {body + 1} [m/s]"
     if len(gaps) == 1:
-        axes.plot(x[0][0], velocity, ".", ms=3, color=COLOURS[body % len(COLOURS)])
+        axes.plot(x[0][0], velocity, ".", ms=3, color=colour_of(body))
         axes.set_ylabel(label)
         return
     axes.set_ylabel(x[1][1])

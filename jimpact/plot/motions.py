@@ -16,11 +16,11 @@ from jimpact.bodies.base import Body, rate_of, split_name
 from jimpact.motion.dynamics import kinetic, potential
 from jimpact.motion.record import Motion
 from jimpact.motion.system import System
-from jimpact.plot.style import COLOURS, GREY, finish, heading, legend_within, new_figure
+from jimpact.plot.style import COLOURS, GREY, colour_of, new_figure, styled
 
 POINT = 0.02  # radius in which a point mass is drawn, of the range of its coordinates
 _MARKED = ("accumulation", "detachment", "friction")  # events with a line style of their kind
-_MANY = 60  # up to this number of impacts each is marked by a line
+_MANY = 20  # up to this number of impacts each is marked by a line; more are a grey block
 _BASEPOINTS = 1000  # at which a base is drawn
 _FEW = 6  # curves that one panel shows by default, each with its entry in the legend
 # Share of the scale of its unit below which what a panel shows is rounding. Ten times more would
@@ -35,6 +35,7 @@ def one_motion(motion: Motion) -> None:
         raise ValueError("Argument `motion` must be one motion, but is a batch: pick one of it.")
 
 
+@styled()
 def motion(
     motion: Motion,
     title: str = "",
@@ -79,8 +80,7 @@ def motion(
     course = course_of(motion)
     columns = [_by_unit(labels, bodies), _by_unit(rates, bodies)]
     rows = max(map(len, columns)) + 1
-    figure = new_figure(2.5 * rows)
-    panels = figure.subplots(rows, 2, sharex=True, squeeze=False)
+    figure, panels = new_figure(2.5 * rows, title, rows, 2, sharex=True, squeeze=False)
     scales = _scales(labels, motion)
     for j, (units, values) in enumerate(zip(columns, (course.q, course.v), strict=True)):
         for axes, (unit, which) in zip(panels[:, j], units.items(), strict=False):
@@ -88,7 +88,7 @@ def motion(
             if count > _FEW:
                 which = _largest(which, [_range(values[:, i]) for i, _ in which])
             for c, (i, word) in enumerate(which):
-                axes.plot(course.time, values[:, i], color=COLOURS[c % len(COLOURS)], label=word)
+                axes.plot(course.time, values[:, i], color=colour_of(c), label=word)
             if j == 0 and unit == "m" and system is not None:
                 _moving_base(axes, system, motion)
             what = which[0][1] if len(which) == 1 else ("coordinates", "velocities")[j]
@@ -100,7 +100,6 @@ def motion(
     _finish(panels[-1, 0], scales["m"], left_out)
     _ledger(panels[-1, 1], motion, course, system)
     _finish(panels[-1, 1], float(np.nanmax(np.abs(motion.energy), initial=0.0)) or 1.0)
-    heading(figure, title)
     for axes in figure.axes:
         if axes is not panels[-1, 1]:
             _event_lines(axes, motion)
@@ -110,14 +109,14 @@ def motion(
 
 
 def _finish(axes: Axes, scale: float, note: str = "") -> None:
-    """Frame, legend with a note, and limits that do not enlarge rounding, of panels of a motion."""
-    finish(axes, grid="y")
+    """Legend with a note, and limits that do not enlarge rounding, of panels of a motion."""
+    axes.grid(False, axis="x")
     low, high = axes.dataLim.intervaly
     if high - low < _FLAT * scale:
         middle = (low + high) / 2
         axes.set_ylim(middle - scale / 2, middle + scale / 2)
     if len(axes.get_legend_handles_labels()[0]) > 1:
-        legend_within(axes, 2, note)
+        axes.legend(ncols=2, title=note or None)
 
 
 def _scales(labels: list[str], motion: Motion) -> dict[str, float]:
@@ -264,7 +263,7 @@ def _gaps(axes: Axes, motion: Motion, shown: list[int] | None) -> str:
         time = np.concatenate([motion.time, np.asarray(events.time)[rows]])
         order = np.argsort(time, kind="stable")
         gap = np.concatenate([values[:, j], np.zeros(rows.sum())])[order]
-        axes.plot(time[order], gap, color=COLOURS[c % len(COLOURS)], label=f"contact {j + 1}")
+        axes.plot(time[order], gap, color=colour_of(c), label=f"contact {j + 1}")
     axes.set_ylabel("gaps [m]" if single else "least gap [m]")
     return note
 
@@ -310,6 +309,7 @@ def _ledger(axes: Axes, motion: Motion, course: _Course, system: System | None) 
     axes.set_ylabel("energy [J]")
 
 
+@styled()
 def phase_portrait(
     motion: Motion,
     coordinate: int | None = None,
@@ -356,17 +356,13 @@ def phase_portrait(
             f"Argument `coordinate` must lie in [{min(pairs)}, {max(pairs)}], but is {coordinate}."
         )
     rate = pairs[coordinate]
-    figure = new_figure(5.0)
-    axes = figure.subplots()
+    figure, axes = new_figure(5.0, title)
     position, speed = course.q[:, coordinate], course.v[:, rate]
     cut = np.flatnonzero(course.after)
     axes.plot(np.insert(position, cut, np.nan), np.insert(speed, cut, np.nan), color=COLOURS[0])
     jumps = np.stack([cut - 1, cut])
     axes.plot(position[jumps], speed[jumps], "--", color=COLOURS[1], lw=0.8, zorder=0)
-    axes.set_xlabel(labels[coordinate])
-    axes.set_ylabel(rates[rate])
-    heading(figure, title)
-    finish(axes)
+    axes.set(xlabel=labels[coordinate], ylabel=rates[rate])
     return figure
 
 
@@ -382,12 +378,11 @@ def draw_body(axes: Axes, body: Body, q: np.ndarray) -> None:
     floors, ground = [plane_of(*floor) for floor in body.floors], np.zeros((1, 2))
     set_limits(axes, curves, ground, floors)
     for i, points in enumerate(curves[0]):
-        axes.plot(*points.T, color=COLOURS[i // 2 % len(COLOURS)])
+        axes.plot(*points.T, color=colour_of(i // 2))
     view = np.array([axes.get_xlim(), axes.get_ylim()])
     for n, offset in floors:
         axes.plot(*stretch_of(n, offset, view, ground[0]), color=GREY, lw=2)
-    axes.set_xlim(view[0])
-    axes.set_ylim(view[1])
+    axes.set(xlim=view[0], ylim=view[1])
 
 
 def stretch_of(n: np.ndarray, offset: float, view: np.ndarray, ground: np.ndarray) -> np.ndarray:
@@ -411,8 +406,6 @@ def set_limits(axes: Axes, curves: list[Any], ground: np.ndarray, floors: list[A
     low, high = points.min(axis=0), points.max(axis=0)
     half = 0.55 * float((high - low).max()) or 1.0
     centre = (low + high) / 2
-    axes.set_xlim(centre[0] - half, centre[0] + half)
-    axes.set_ylim(centre[1] - half, centre[1] + half)
-    axes.set_aspect("equal")
+    (left, bottom), (right, top) = centre - half, centre + half
+    axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
     axes.locator_params(nbins=5)
-    axes.spines[["top", "right"]].set_visible(False)

@@ -1,48 +1,82 @@
-"""What the pictures share: sizes, colours, frames, legends, logarithmic axes."""
+"""What the pictures share: the style sheet, figures of panels, legends, logarithmic axes."""
 
-from collections.abc import Sequence
-from typing import Any
+import functools
+import inspect
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, ParamSpec, TypeVar
 
+import matplotlib.style
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-# Okabe and Ito's palette without yellow, distinct with every common colour blindness; then three of
-# Paul Tol's muted colours, for charts of more than seven lines.
-COLOURS = (
-    *("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000"),
-    *("#882255", "#999933", "#332288"),
-)
+from jimpact._checks import check_kind
+
+SHEET = Path(__file__).with_name("jimpact.mplstyle")
+_SETTINGS = matplotlib.rc_params_from_file(SHEET, use_default_template=False)
+COLOURS = tuple(each["color"] for each in _SETTINGS["axes.prop_cycle"])
+SMALL = _SETTINGS["legend.fontsize"]
 MARKERS = "osD^vP*X"
 GREY = "#777777"
 HIGHLIGHT = "#FFF3C4"  # behind what a picture points out
-PLATE = "white"  # behind every picture: axes and words are dark, so that dark pages need a plate
-ON_LINES = {"fc": "white", "ec": "none", "pad": 1, "alpha": 0.8}  # behind a text on lines
 SPREAD = 0.6  # width that the bodies of one group take, of the distance between groups
 
 WIDTH = 7.2  # of every picture [in]: legible at half a page's width
 COLUMNS = 2  # panels side by side
-SMALL = 8.5  # smallest font [points]
 
 _DECADES = 100.0  # an axis that spans less is labelled within its decades, too
 _PLAIN = (1e-3, 1e5)  # numbers within are written without a power of ten
 
-
-def new_figure(height: float) -> Figure:
-    """A figure of the common width, `height` [in] high."""
-    return Figure(figsize=(WIDTH, height), facecolor=PLATE, layout="constrained")
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
-def new_panels(count: int, height: float, more: float = 0.0, **shared: Any) -> tuple[Figure, Any]:
+def styled(kind: type = object) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Draw in the style sheet, and leave matplotlib's settings alone, what is of this kind."""
+
+    def decorated(picture: Callable[P, R]) -> Callable[P, R]:
+        """The function, its first argument checked."""
+        first = next(iter(inspect.signature(picture).parameters))
+
+        @functools.wraps(picture)
+        def drawn(*args: P.args, **keywords: P.kwargs) -> R:
+            """The picture."""
+            check_kind(first, args[0] if args else keywords.get(first), kind)
+            with matplotlib.style.context(SHEET):
+                return picture(*args, **keywords)
+
+        return drawn
+
+    return decorated
+
+
+def colour_of(i: int) -> str:
+    """The colour of line or body number i; after the last one the first again."""
+    return COLOURS[i % len(COLOURS)]
+
+
+def new_figure(
+    height: float, title: str = "", rows: int = 1, columns: int = 1, **grid: Any
+) -> tuple[Figure, Any]:
+    """A figure of the common width, `height` [in] high, and its axes, see `Figure.subplots`."""
+    figure = Figure(figsize=(WIDTH, height))
+    if title:
+        figure.suptitle(title, x=0.01, ha="left")
+    return figure, figure.subplots(rows, columns, **grid)
+
+
+def new_panels(
+    count: int, height: float, more: float = 0.0, title: str = "", **shared: Any
+) -> tuple[Figure, Any]:
     """A figure of `count` panels, two side by side; a row is `height` [in] high."""
     columns = min(COLUMNS, count)
     rows = -(-count // columns)
-    figure = new_figure(more + height * rows)
-    panels = figure.subplots(rows, columns, squeeze=False, **shared).ravel()
-    for spare in panels[count:]:
+    figure, panels = new_figure(more + height * rows, title, rows, columns, squeeze=False, **shared)
+    for spare in panels.ravel()[count:]:
         spare.remove()
-    return figure, panels[:count]
+    return figure, panels.ravel()[:count]
 
 
 def side_by_side(bodies: int) -> np.ndarray:
@@ -50,57 +84,29 @@ def side_by_side(bodies: int) -> np.ndarray:
     return (np.arange(bodies) - (bodies - 1) / 2) * SPREAD / bodies
 
 
-def finish(*panels: Axes, grid: Any = "both") -> None:
-    """The frame of panels: two spines, a thin grid along `grid`."""
-    for axes in panels:
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(axis=grid, lw=0.4, alpha=0.5)
-        axes.set_axisbelow(True)
-
-
-def heading(figure: Figure, title: str) -> None:
-    """The title of a figure, on its left; none where it is empty."""
-    if title:
-        figure.suptitle(title, x=0.01, ha="left", fontsize="large")
-
-
-def legend_below(figure: Figure, handles: Sequence[Any], columns: int, note: str = "") -> None:
-    """One legend for all panels, below them, with a note on how to read them."""
-    figure.legend(
-        handles=list(handles),
-        loc="outside lower center",
-        frameon=False,
-        fontsize=SMALL,
-        ncols=max(min(columns, len(handles)), 1),
-        title=note or None,
-        title_fontsize=SMALL,
-    )
-
-
-def legend_within(axes: Axes, columns: int = 1, note: str = "") -> None:
-    """The legend of one panel, where it hides little, below a note."""
-    axes.legend(
-        frameon=False,
-        fontsize=SMALL,
-        ncols=columns,
-        handlelength=1.4,
-        columnspacing=1.0,
-        title=note or None,
-        title_fontsize=SMALL,
-    )
+def legend_below(
+    figure: Figure, columns: int, handles: Iterable[Any] | None = None, note: str = ""
+) -> None:
+    """One legend for all panels, below them: of these handles, else of all labels, each once."""
+    if handles is None:
+        pairs = [pair for x in figure.axes for pair in zip(*x.get_legend_handles_labels())]
+        first = {label: handle for handle, label in reversed(pairs)}
+        handles = [first[label] for label in dict.fromkeys(label for _, label in pairs)]
+    entries = list(handles)
+    if entries:
+        place: Any = {"loc": "outside lower center", "ncols": min(columns, len(entries))}
+        figure.legend(handles=entries, title=note or None, **place)
 
 
 def mark(axes: Axes, point: Any, name: str, i: int, admissible: bool) -> None:
     """Outcome number i, hollow unless admissible; later ones smaller, so that equal ones show."""
-    colour = GREY if i < 0 else COLOURS[i % len(COLOURS)]
     axes.plot(
         *point,
         "s" if i < 0 else MARKERS[i % len(MARKERS)],
-        color=colour,
-        mfc=colour if admissible else "none",
+        color=GREY if i < 0 else colour_of(i),
+        fillstyle="full" if admissible else "none",
         ms=max(10 - i, 4),
         mew=1.6,
-        ls="none",
         label=name if admissible else f"{name} (not admissible)",
     )
 

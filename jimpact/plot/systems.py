@@ -13,7 +13,7 @@ from jimpact.bodies.base import Body
 from jimpact.bodies.piles import Pile
 from jimpact.motion.system import System
 from jimpact.plot.motions import draw_body
-from jimpact.plot.style import COLOURS, GREY, SMALL, finish, heading, new_figure
+from jimpact.plot.style import COLOURS, GREY, SMALL, colour_of, new_figure, styled
 from jimpact.scene import PairNormals, Scene, as_velocity
 
 _GAP = 0.5  # how wide an open contact is drawn, in radii of the largest body
@@ -23,6 +23,7 @@ _THICKEST = 8.0  # line of the largest impulse [points]; ten times more hides th
 _FAINT = 1e-3  # impulses over the largest one that are not drawn; ten times more breaks chains
 
 
+@styled()
 def system(drawn: Scene | Body | System, state: Any, title: str = "") -> Figure:
     """A system as it is before an impact or a motion.
 
@@ -47,21 +48,17 @@ def system(drawn: Scene | Body | System, state: Any, title: str = "") -> Figure:
     if isinstance(drawn, Scene):
         if drawn.walls is None:
             raise TypeError("Argument `drawn` must be a chain, a body or a system; draw the body.")
-        figure = new_figure(2.4)
-        axes = figure.subplots()
+        figure, axes = new_figure(2.4, title)
         _row(axes, drawn, np.asarray(as_velocity(drawn, state)))
     else:
         body = drawn.body if isinstance(drawn, System) else drawn
-        figure = new_figure(3.6)
-        axes = figure.subplots()
+        figure, axes = new_figure(3.6, title)
         draw_body(axes, body, np.asarray(state, float))
-        axes.set_xlabel("x [m]")
-        axes.set_ylabel("height [m]")
-        finish(axes)
-    heading(figure, title)
+        axes.set(xlabel="x [m]", ylabel="height [m]")
     return figure
 
 
+@styled()
 def force_chains(pile: Pile, q: Any, scene: Scene, impulse: Any, title: str = "") -> Figure:
     """The impulses in a packing as lines between the centres, as thick as they are large.
 
@@ -103,8 +100,7 @@ def force_chains(pile: Pile, q: Any, scene: Scene, impulse: Any, title: str = ""
     size = np.abs(p) / (np.abs(p).max() or 1.0)
     drawn = np.flatnonzero(size > _FAINT)
     drawn = drawn[np.argsort(size[drawn])]
-    figure = new_figure(5.0)
-    axes = figure.subplots()
+    figure, axes = new_figure(5.0, title)
     for outline in pile.outlines(np.asarray(q, float), 0.0):
         axes.plot(*outline.T, color=GREY, lw=0.4, alpha=0.5)
     lines = np.stack([centres[first], ends], axis=1)[drawn][:, :, axis]
@@ -112,12 +108,8 @@ def force_chains(pile: Pile, q: Any, scene: Scene, impulse: Any, title: str = ""
     axes.add_collection(
         LineCollection(list(lines), linewidths=widths, colors=COLOURS[0], alpha=0.8)
     )
-    axes.set_aspect("equal")
     axes.autoscale_view()
-    axes.set_xlabel("x [m]")
-    axes.set_ylabel("height [m]")
-    finish(axes)
-    heading(figure, title)
+    axes.set(xlabel="x [m]", ylabel="height [m]", aspect="equal")
     return figure
 
 
@@ -147,7 +139,7 @@ def _row(axes: Axes, scene: Scene, velocity: np.ndarray) -> None:
     end = centre[-1] + radius[-1]
     fastest = np.abs(velocity).max() or 1.0
     for i, (x, r, v) in enumerate(zip(centre, radius, velocity, strict=True)):
-        colour = COLOURS[i % len(COLOURS)]
+        colour = colour_of(i)
         axes.add_patch(Circle((x, 0.0), r, fc=colour, alpha=0.35, ec=colour))
         axes.text(x, 0.0, f"{i + 1}", ha="center", va="center")
         axes.text(x, -1.35, f"{mass[i]:.3g} kg", ha="center", va="center", fontsize=SMALL)
@@ -160,7 +152,5 @@ def _row(axes: Axes, scene: Scene, velocity: np.ndarray) -> None:
         if wall:
             axes.add_patch(Rectangle((x, -1.1), 0.3, 2.2, color=GREY, alpha=0.5, lw=0))
     margin = max(1.2, (12.0 - end) / 2)  # a single body is not as wide as the picture
-    axes.set_xlim(-margin, end + margin)
-    axes.set_ylim(-1.7, 2.1)
-    axes.set_aspect("equal")
+    axes.set(xlim=(-margin, end + margin), ylim=(-1.7, 2.1), aspect="equal")
     axes.axis("off")

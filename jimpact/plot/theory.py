@@ -16,29 +16,34 @@ from jimpact.plot.style import (
     COLUMNS,
     GREY,
     SMALL,
-    finish,
-    heading,
+    colour_of,
     legend_below,
     mark,
     new_figure,
     new_panels,
+    styled,
     write,
 )
 from jimpact.scene import dense_mass
 from jimpact.theory.admissible import AdmissibleSet
-from jimpact.theory.block_domains import RockingDomain
-from jimpact.theory.rocking import OUTCOMES, STAYS, RockingDispersion, critical_kinetic_angle
+from jimpact.theory.rocking import (
+    OUTCOMES,
+    STAYS,
+    RockingDispersion,
+    RockingDomain,
+    critical_kinetic_angle,
+)
 
 _FILL = "#DCE9F3"
-_MOST_CONTACTS = (
-    4  # beyond two contacts: projections onto pairs of the first ones up to this number
-)
+# Beyond two contacts: projections onto pairs of the first ones up to this number.
+_MOST_CONTACTS = 4
 _SAMPLES = 2000  # points drawn of a set of outcomes
 _SHORTEST = 0.5  # sides shorter than this part of the radius are not drawn: no space for a name
 
 _OUTCOME_COLOURS = ("#999999", "#009E73", "#E69F00", "#56B4E9", "#EEEEEE")  # as OUTCOMES
 
 
+@styled(AdmissibleSet)
 def admissible_set(
     result: AdmissibleSet, outcomes: Mapping[str, Any] | None = None, title: str = ""
 ) -> Figure:
@@ -78,27 +83,26 @@ def admissible_set(
     closed = np.flatnonzero(np.asarray(result.scene.closed))
     plane = result.dimension == 2 and len(closed) == 2
     closed = closed if len(closed) else np.arange(result.scene.contacts)
-    figure = _plane(result, marked, closed) if plane else _projections(result, marked, closed)
+    draw = _plane if plane else _projections
     default = "Admissible: unilateral contact, pushing impulses, no energy gained"
-    heading(figure, title or default)
-    return figure
+    return draw(result, marked, closed, title or default)
 
 
-def _plane(result: AdmissibleSet, marked: Mapping[str, np.ndarray], closed: np.ndarray) -> Figure:
+def _plane(
+    result: AdmissibleSet, marked: Mapping[str, np.ndarray], closed: np.ndarray, title: str
+) -> Figure:
     """The set in the plane of kinetic coordinates."""
     frame = _Plane(result, closed)
-    figure = new_figure(7.6)
-    axes = figure.subplots()
+    figure, axes = new_figure(7.6, title)
     circle = np.linspace(0, 2 * np.pi, 400)
     r = frame.radius
     axes.plot(r * np.cos(circle), r * np.sin(circle), color=GREY, lw=0.8, ls=(0, (4, 3)))
     axes.fill(*frame(result.boundary(400)).T, color=_FILL, lw=0)
     for k in (0, 1):
-        _line(
-            axes, frame, np.zeros(2), frame.walls[k], f"contact {closed[k] + 1} remains closed", "-"
-        )
+        number = closed[k] + 1
+        _line(axes, frame, np.zeros(2), frame.walls[k], f"contact {number} remains closed", "-")
         away = frame.push[1 - k]
-        _line(axes, frame, frame.before, away, f"no impulse at contact {closed[k] + 1}", ":")
+        _line(axes, frame, frame.before, away, f"no impulse at contact {number}", ":")
     arc = frame(result.conserving_arc(200))
     axes.plot(*arc.T, color="black", lw=2.4, solid_capstyle="round")
     write(axes, arc[len(arc) // 2] * 1.13, "$T^+ = T^-$", fontsize="medium")
@@ -108,21 +112,12 @@ def _plane(result: AdmissibleSet, marked: Mapping[str, np.ndarray], closed: np.n
     mark(axes, frame(result.plastic), "plastic, least energy", -1, True)
     for i, (name, v) in enumerate(marked.items()):
         mark(axes, frame(v), name, i, bool(result.contains(v)))
-    axes.set_aspect("equal")
-    axes.set_xlim(-1.22 * r, 1.22 * r)
-    axes.set_ylim(-1.22 * r, 1.22 * r)
+    axes.grid(False)
+    axes.set(aspect="equal", xlim=(-1.22 * r, 1.22 * r), ylim=(-1.22 * r, 1.22 * r))
     axes.set_xlabel("kinetic coordinate $u_1$ [√J];  energy is $T^+ = T_c + |u|^2/2$")
     axes.set_ylabel("kinetic coordinate $u_2$ [√J]")
-    axes.spines[["top", "right"]].set_visible(False)
-    _legend(figure, axes, 3)
+    legend_below(figure, 3)
     return figure
-
-
-def _legend(figure: Figure, axes: Axes, columns: int) -> None:
-    """The entries of one panel, below the figure."""
-    handles = axes.get_legend_handles_labels()[0]
-    if handles:
-        legend_below(figure, handles, columns)
 
 
 class _Plane:
@@ -174,7 +169,7 @@ def _line(
 
 
 def _projections(
-    result: AdmissibleSet, marked: Mapping[str, np.ndarray], closed: np.ndarray
+    result: AdmissibleSet, marked: Mapping[str, np.ndarray], closed: np.ndarray, title: str
 ) -> Figure:
     """Samples of the set in pairs of normalized gap velocities."""
     contacts = closed[:_MOST_CONTACTS]
@@ -184,7 +179,7 @@ def _projections(
     ]
     cloud, energies = samples @ unit, _energy_ratio(result, samples)
     pairs = list(combinations(range(len(contacts)), 2)) or [(0, 0)]
-    figure, grid = new_panels(len(pairs), 3.1, 0.8)
+    figure, grid = new_panels(len(pairs), 3.1, 0.8, title)
     for axes, (i, j) in zip(grid, pairs):
         single = i == j
         y = energies if single else cloud[:, j]
@@ -196,9 +191,8 @@ def _projections(
         axes.set_xlabel(_gap_label(contacts[i]), fontsize=SMALL)
         energy = "energy ratio $T^+ / T^-$"
         axes.set_ylabel(energy if single else _gap_label(contacts[j]), fontsize=SMALL)
-        finish(axes)
     figure.colorbar(dots, ax=grid.tolist(), label="energy ratio $T^+ / T^-$")
-    _legend(figure, grid[0], 4)
+    legend_below(figure, 4)
     return figure
 
 
@@ -213,6 +207,7 @@ def _gap_label(contact: int) -> str:
     return f"normalized gap velocity {contact + 1} after [√J]"
 
 
+@styled(RockingDispersion)
 def rocking_dispersion(result: RockingDispersion, title: str = "") -> Figure:
     """|y_A'+ / y_B'-| against the kinetic angle: a panel for each mu, a line for each e.
 
@@ -233,19 +228,18 @@ def rocking_dispersion(result: RockingDispersion, title: str = "") -> Figure:
     >>> len(ji.plot.rocking_dispersion(d).axes)
     1
     """
-    figure, panels = _panels(result, title)
+    figure, panels = _panels(result, title, r"dispersion $|\dot y_A^+ / \dot y_B^-|$")
     theta, size = np.degrees(result.kinetic_angle), np.abs(result.dispersion)
     for j, axes in enumerate(panels):
         for k, e in enumerate(np.asarray(result.restitution)):
-            colour = COLOURS[k % len(COLOURS)]
-            axes.plot(theta, size[:, j, k], color=colour, lw=1.6, label=f"e = {e:g}")
+            axes.plot(theta, size[:, j, k], color=colour_of(k), lw=1.6, label=f"e = {e:g}")
+    _critical_lines(panels, result)
     panels[0].set_ylim(bottom=0)  # shared by all, so last
-    finish(*panels)
-    _angle_axes(result, panels, r"dispersion $|\dot y_A^+ / \dot y_B^-|$")
-    legend_below(figure, panels[0].get_legend_handles_labels()[0], 6)
+    legend_below(figure, 6)
     return figure
 
 
+@styled(RockingDispersion)
 def rocking_outcomes(
     result: RockingDispersion, title: str = "", separation_threshold: float = STAYS
 ) -> Figure:
@@ -269,19 +263,21 @@ def rocking_outcomes(
     >>> len(ji.plot.rocking_outcomes(d).axes)
     1
     """
-    figure, panels = _panels(result, title)
+    figure, panels = _panels(result, title, "restitution e")
     codes = result.outcomes(separation_threshold)
     colours = ListedColormap(_OUTCOME_COLOURS)
     norm = BoundaryNorm(np.arange(len(OUTCOMES) + 1) - 0.5, len(OUTCOMES))
     theta, e = np.degrees(result.kinetic_angle), np.asarray(result.restitution)
     for j, axes in enumerate(panels):
+        axes.grid(False)
         axes.pcolormesh(theta, e, codes[:, j].T, cmap=colours, norm=norm, shading="nearest")
-    _angle_axes(result, panels, "restitution e")
+    _critical_lines(panels, result)
     handles = [Patch(color=_OUTCOME_COLOURS[i], label=OUTCOMES[i]) for i in np.unique(codes)]
-    legend_below(figure, handles, 5)
+    legend_below(figure, 5, handles)
     return figure
 
 
+@styled()
 def rocking_domains(domains: Sequence[RockingDomain], title: str = "") -> Figure:
     """Admissible restitution matrices of blocks, a panel each: own entry against cross entry.
 
@@ -301,45 +297,40 @@ def rocking_domains(domains: Sequence[RockingDomain], title: str = "") -> Figure
     """
     if not len(domains):
         raise ValueError("Argument `domains` must hold at least one domain, but is empty.")
-    figure, panels = new_panels(len(domains), 3.2, 0.6, sharex=True, sharey=True)
+    default = "Admissible restitution matrices of a block"
+    figure, panels = new_panels(len(domains), 3.2, 0.6, title or default, sharex=True, sharey=True)
     for axes, domain in zip(panels, domains):
         axes.fill(*domain.corners.T, color=_FILL, lw=0, label="free: both corners leave")
         axes.plot([0, 0], domain.rocking, color=COLOURS[0], lw=4, label="rocking")
         if domain.half_rocking is not None:
             axes.plot(domain.half_rocking, [0, 0], color=COLOURS[1], lw=4, label="half-rocking")
         way = "sliding" if domain.sliding else "sticking"
-        axes.set_title(f"height / width {domain.aspect:g}, {way}", loc="left", fontsize="medium")
-        axes.set_aspect("equal")
-        axes.set_xlim(-0.05, 1.1)
-        axes.set_ylim(-0.05, 1.1)
-    finish(*panels)
-    for axes in panels[::COLUMNS]:
-        axes.set_ylabel("restitution, other corner")
-    for axes in panels[-COLUMNS:]:
-        axes.set_xlabel("restitution, corner that hits")
-        axes.tick_params(labelbottom=True)
-    handles = {k: h for axes in panels for h, k in zip(*axes.get_legend_handles_labels())}
-    legend_below(figure, list(handles.values()), 3)
-    heading(figure, title or "Admissible restitution matrices of a block")
+        axes.set_title(f"height / width {domain.aspect:g}, {way}")
+        axes.set(aspect="equal", xlim=(-0.05, 1.1), ylim=(-0.05, 1.1))
+    _label_outer(panels, "restitution, corner that hits", "restitution, other corner")
+    legend_below(figure, 3)
     return figure
 
 
-def _panels(result: RockingDispersion, title: str) -> tuple[Figure, Any]:
+def _panels(result: RockingDispersion, title: str, label: str) -> tuple[Figure, Any]:
     """A panel for each mu."""
-    figure, panels = new_panels(len(result.friction), 2.8, 0.6, sharex=True, sharey=True)
+    figure, panels = new_panels(len(result.friction), 2.8, 0.6, title, sharex=True, sharey=True)
     for axes, mu in zip(panels, np.asarray(result.friction)):
-        axes.set_title(f"mu = {mu:g}", loc="left", fontsize="medium")
-    heading(figure, title)
+        axes.set_title(f"mu = {mu:g}")
+    _label_outer(panels, r"kinetic angle $\theta_{12}$ [degrees]", label)
     return figure, panels
 
 
-def _angle_axes(result: RockingDispersion, panels: np.ndarray, label: str) -> None:
-    """Critical angles; labels on the left, and below the last panel of each column."""
-    for axes, mu in zip(panels, np.asarray(result.friction)):
-        critical = float(np.degrees(critical_kinetic_angle(mu)))
-        axes.axvline(critical, color="black", ls=":", lw=1)
+def _critical_lines(panels: np.ndarray, result: RockingDispersion) -> None:
+    """The critical angle of each mu."""
+    for axes, angle in zip(panels, np.degrees(critical_kinetic_angle(result.friction))):
+        axes.axvline(float(angle), color="black", ls=":", lw=1)
+
+
+def _label_outer(panels: np.ndarray, x: str, y: str) -> None:
+    """Labels on the left, and below the last panel of each column."""
     for axes in panels[::COLUMNS]:
-        axes.set_ylabel(label)
+        axes.set_ylabel(y)
     for axes in panels[-COLUMNS:]:
-        axes.set_xlabel(r"kinetic angle $\theta_{12}$ [degrees]")
+        axes.set_xlabel(x)
         axes.tick_params(labelbottom=True)

@@ -2,7 +2,14 @@
 
 from .accelerations import contact_problem as contact_problem, quasi_lagrange as quasi_lagrange
 from .admissible import AdmissibleSet as AdmissibleSet, admissible_set as admissible_set
-from .block_domains import RockingDomain as RockingDomain, rocking_domain as rocking_domain
+from .chains import (
+    SeparationTimes as SeparationTimes,
+    bilateral_motion as bilateral_motion,
+    nesterenko_speed as nesterenko_speed,
+    newby_ratio as newby_ratio,
+    reinsch_chain as reinsch_chain,
+    separation_times as separation_times,
+)
 from .corners import (
     CornerOutcome as CornerOutcome,
     reentrant_corner as reentrant_corner,
@@ -31,12 +38,6 @@ from .impulse_ratios import (
     distributing_rule as distributing_rule,
     precompression_energy as precompression_energy,
 )
-from .linear_chain import (
-    SeparationTimes as SeparationTimes,
-    bilateral_motion as bilateral_motion,
-    newby_ratio as newby_ratio,
-    separation_times as separation_times,
-)
 from .quasi_velocities import (
     ContactPower as ContactPower,
     contact_power as contact_power,
@@ -47,13 +48,11 @@ from .quasi_velocities import (
     quasi_basis as quasi_basis,
     to_quasi_velocities as to_quasi_velocities,
 )
-from .restitution_coefficients import (
-    CoefficientAudit as CoefficientAudit,
-    audit_coefficients as audit_coefficients,
-)
 from .restitution_matrices import (
+    CoefficientAudit as CoefficientAudit,
     Copositivity as Copositivity,
     MatrixAudit as MatrixAudit,
+    audit_coefficients as audit_coefficients,
     audit_matrix as audit_matrix,
     carnot_energy_loss as carnot_energy_loss,
     copositivity as copositivity,
@@ -61,13 +60,14 @@ from .restitution_matrices import (
 )
 from .rocking import (
     RockingDispersion as RockingDispersion,
+    RockingDomain as RockingDomain,
     RockingRatio as RockingRatio,
     critical_kinetic_angle as critical_kinetic_angle,
     housner_restitution as housner_restitution,
     rocking_dispersion as rocking_dispersion,
+    rocking_domain as rocking_domain,
     rocking_kinetic_angle as rocking_kinetic_angle,
     rocking_matrix as rocking_matrix,
     rocking_ratios as rocking_ratios,
     search_critical_angle as search_critical_angle,
 )
-from .waves import nesterenko_speed as nesterenko_speed, reinsch_chain as reinsch_chain

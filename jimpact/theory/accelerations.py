@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jimpact._checks import as_float_array, check_shape, check_values
+from jimpact._checks import as_float_array, as_numbers
 from jimpact.compiling import full_precision, quick_jit
 from jimpact.motion.dynamics import free_acceleration, mass_at, user_force
 from jimpact.motion.persistent_contact import contacts_at
@@ -90,11 +90,8 @@ def quasi_lagrange(
     """
     if system.base is not None:
         raise ValueError("Argument `system` must not have a moving base for quasi-velocities.")
-    at, v = as_float_array("q", q), as_float_array("velocity", velocity)
-    check_values("q", at)
-    check_values("velocity", v)
-    t = as_float_array("time", time)
-    check_shape("time", t, (), "one instant; vmap over many")
+    at, v = as_numbers("q", q), as_numbers("velocity", velocity)
+    t = as_numbers("time", time, (), "one instant; vmap over many")
     fixed = 0 if constraints is None else jax.eval_shape(constraints, at).shape[0]
     chosen = None if contacts is None else tuple(contacts)
     return QuasiLagrange(*_terms(system, constraints, chosen, at, v, t), fixed)
@@ -192,12 +189,9 @@ def contact_problem(system: System, q: Any, velocity: Any, time: Any = 0.0) -> C
     >>> problem.forces().round(6).tolist()  # half of its weight each
     [5.0, 5.0]
     """
-    at, v, t = (
-        as_float_array(name, x) for name, x in (("q", q), ("velocity", velocity), ("time", time))
-    )
-    for name, value in (("q", at), ("velocity", v), ("time", t)):
-        check_values(name, value)
-    return ContactProblem(*_problem(system, at, v, t))
+    arguments = {"q": q, "velocity": velocity, "time": time}
+    state = (as_numbers(name, x) for name, x in arguments.items())
+    return ContactProblem(*_problem(system, *state))
 
 
 @quick_jit

@@ -187,8 +187,7 @@ def admissible_set(scene: Scene, velocity: Any) -> AdmissibleSet:
     >>> result.contains([0.1, 0.3, 0.6]), result.contains([0.5, 0.25, 0.25])
     (True, False)
     """
-    v = as_velocity(scene, velocity)
-    check_values("velocity", v)
+    v = as_velocity(scene, velocity, finite=True)
     tolerance = sign_tolerance(scene.mass.dtype)
     start, closed = np.asarray(v, float), np.asarray(scene.closed)
     root = np.linalg.cholesky(dense_mass(scene))  # y = root^T v has T = |y|^2 / 2

@@ -181,7 +181,8 @@ def capped_polyhedron(
 def least_squares(matrix: np.ndarray, target: np.ndarray) -> np.ndarray:
     """`x >= 0` of least `|matrix x - target|` (Lawson and Hanson 1974, ch. 23).
 
-    scipy.optimize.nnls (1.17) misses the minimum of some degenerate problems met here.
+    Of scipy (1.17), `nnls` and the method `bvls` of `lsq_linear` both miss the minimum of some
+    degenerate problems met here.
     """
     count = matrix.shape[1]
     x, passive, barred = np.zeros(count), np.zeros(count, bool), np.zeros(count, bool)

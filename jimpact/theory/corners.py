@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jimpact._checks import as_float_array, check_per_contact, check_values
+from jimpact._checks import as_numbers
 from jimpact.contact import kinetic_norm, normalized_gap_velocity
 from jimpact.scene import Scene, as_velocity, velocity_change
 
@@ -53,11 +53,8 @@ def reentrant_corner(scene: Scene, velocity: Any, restitution: Any) -> list[Corn
     [-1.   0.2] 1 True
     [ 0.5 -0.4] 0 False
     """
-    v = as_velocity(scene, velocity)
-    check_values("velocity", v)
-    e = as_float_array("restitution", restitution)
-    check_values("restitution", e, low=0.0, high=1.0)
-    check_per_contact("restitution", e, scene.contacts)
+    v = as_velocity(scene, velocity, finite=True)
+    e = as_numbers("restitution", restitution, low=0.0, high=1.0, contacts=scene.contacts)
     approach = -np.asarray(normalized_gap_velocity(scene, v), float)
     if (approach <= 0).any():
         return []

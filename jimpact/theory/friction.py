@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_per_contact, check_shape, check_values
+from jimpact._checks import as_float_array, as_numbers, check_shape
 from jimpact.compiling import full_precision
 from jimpact.contact import kinetic_norm, normalized_delassus, normalized_gap_velocity
 from jimpact.scene import Scene, velocity_change
@@ -90,19 +90,18 @@ def restitution_inclusion(
     >>> float(out.velocity[0])
     1.0
     """
-    gbar, p = as_float_array("coupling", coupling), as_float_array("metric", metric)
-    v, lam = as_float_array("velocity", velocity), as_float_array("restitution", restitution)
-    low, high = as_float_array("low", low), as_float_array("high", high)
+    gbar, lam = as_numbers("coupling", coupling), as_numbers("restitution", restitution)
     if gbar.ndim != 2:
         raise ValueError(f"Argument `coupling` must be a matrix, but has shape {gbar.shape}.")
     n, c = gbar.shape
-    check_shape("velocity", v, (n,), "one per row of `coupling`")
-    check_shape("metric", p, (n, n), "square, one row per row of `coupling`")
-    for name, value in (("coupling", gbar), ("metric", p), ("restitution", lam), ("velocity", v)):
-        check_values(name, value)
+    v = as_numbers("velocity", velocity, (n,), "one per row of `coupling`")
+    p = as_numbers("metric", metric, (n, n), "square, one row per row of `coupling`")
     lam = lam * jnp.eye(n, dtype=lam.dtype) if lam.ndim == 0 else lam
     check_shape("restitution", lam, (n, n), "or a scalar")
-    low, high = jnp.broadcast_to(low, (c,)), jnp.broadcast_to(high, (c,))
+    low, high = (
+        jnp.broadcast_to(as_float_array(name, x), (c,))
+        for name, x in (("low", low), ("high", high))
+    )
     gamma = gbar.T @ p
     y = gamma @ (v + lam @ v)
     percussion, code = _in_box(gamma @ gbar, y, low, high)
@@ -320,10 +319,10 @@ def friction_energy_change(
     -1.4475
     """
     coupling = _coupling(scene, 0.0, 0.0)
-    p = as_float_array("impulse", impulse)
-    p_t = as_float_array("tangential_impulse", tangential_impulse)
-    for name, value in (("impulse", p), ("tangential_impulse", p_t)):
-        check_shape(name, value, (scene.contacts,), "one per contact")
+    p, p_t = (
+        as_numbers(name, value, (scene.contacts,), "one per contact")
+        for name, value in (("impulse", impulse), ("tangential_impulse", tangential_impulse))
+    )
     qn, qt = to_quasi_velocities(scene, velocity)
     pbar = kinetic_norm(scene) * p
     qn_plus = qn + coupling.delassus @ pbar + coupling.normal @ p_t
@@ -339,9 +338,7 @@ def _norm(matrix: Any) -> float:
 
 def _restitution(scene: Scene, matrix: Any) -> np.ndarray:
     """E (m, m) on the host, checked."""
-    e = as_float_array("matrix", matrix)
-    check_shape("matrix", e, (scene.contacts,) * 2, "one row and one column per contact")
-    check_values("matrix", e)
+    e = as_numbers("matrix", matrix, (scene.contacts,) * 2, "one row and one column per contact")
     return np.asarray(e, float)
 
 
@@ -354,11 +351,8 @@ def _coupling(scene: Scene, friction: Any, slip: Any) -> _Coupling:
         )
     if not bool(np.all(scene.closed)):
         raise ValueError("Argument `scene` must have closed contacts only: leave open ones out.")
-    mu, xi = as_float_array("friction", friction), as_float_array("slip", slip)
-    check_per_contact("friction", mu, m)
-    check_per_contact("slip", xi, m)
-    check_values("friction", mu, low=0.0)
-    check_values("slip", xi, low=-1.0, high=1.0)
+    mu = as_numbers("friction", friction, contacts=m, low=0.0)
+    xi = as_numbers("slip", slip, contacts=m, low=-1.0, high=1.0)
     _, tangent = quasi_basis(scene)
     unit = jnp.eye(m, dtype=scene.mass.dtype)
     none = jnp.zeros(m, scene.mass.dtype)

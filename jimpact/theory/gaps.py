@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_shape, check_values
+from jimpact._checks import as_float_array, as_numbers, check_shape
 from jimpact.impacts import impact
 from jimpact.law import Law
 from jimpact.montecarlo.gaps import gap_scale as gap_scale
@@ -62,10 +62,9 @@ def crossover(scene: Scene, law: Law, velocity: Any, offset: Any) -> Crossover:
         raise TypeError(
             f"Argument `law` must use gaps and have a `contact_force` (Compliant), but is {law!r}."
         )
-    s = as_float_array("offset", offset)
+    s = as_numbers("offset", offset)
     if s.ndim != 1:
         raise ValueError(f"Argument `offset` must have shape (s,), but has shape {s.shape}.")
-    check_values("offset", s)
     scale = gap_scale(scene, law, velocity)
     delta = jnp.max(scale.delta)
     mean = jnp.maximum(jnp.mean(scale.gaps), 0.5 * delta * jnp.max(jnp.abs(s)))
@@ -174,9 +173,8 @@ def gap_sensitivity(
     >>> found.velocity.round(6).tolist()
     [-0.6, -0.16, 1.24]
     """
-    at, v = as_float_array("gaps", gaps), as_float_array("velocity", velocity)
-    check_shape("gaps", at, (scene.contacts,), "one gap per contact")
-    check_values("gaps", at, low=0.0)
+    at = as_numbers("gaps", gaps, (scene.contacts,), "one gap per contact", low=0.0)
+    v = as_float_array("velocity", velocity)
 
     def outcome(gaps: jax.Array) -> tuple[jax.Array, Any]:
         """v+, and v+ and status again as auxiliary data."""

@@ -45,12 +45,19 @@ class _Node:
 
 @dataclasses.dataclass(frozen=True)
 class _Problem:
-    """Normalized W of normals and tangents (m + t, m + t), e, mu and whether closed (m,)."""
+    """Normalized W of normals and tangents (m + t, m + t), e, mu and whether closed (m,).
+
+    `rows` (n, m + t) are normals and tangents, `mobility` M^-1 times these, `root` (m + t,) what
+    velocities and impulses are normalized by, sqrt(W_jj).
+    """
 
     matrix: np.ndarray
     restitution: np.ndarray
     friction: np.ndarray | None
     closed: np.ndarray
+    rows: np.ndarray
+    mobility: np.ndarray
+    root: np.ndarray
 
     @property
     def contacts(self) -> int:
@@ -136,9 +143,12 @@ def han_gilmore(
     [-0.333333  0.666667  0.666667] 1
     [0. 0. 1.] 2
     """
-    v = _checked(scene, velocity, max_depth)
-    problem, rows, mobility, root = _problem(scene, restitution, friction)
-    m, state = problem.contacts, rows.T @ v / root
+    if is_traced((scene, velocity)):
+        raise TypeError("`han_gilmore` is a host function: it cannot be traced (jit, vmap, grad).")
+    check_values("velocity", as_velocity(scene, velocity))
+    as_whole("max_depth", max_depth, 1)
+    v, problem = np.asarray(velocity, float), _problem(scene, restitution, friction)
+    m, state = problem.contacts, problem.rows.T @ v / problem.root
     size = float(np.max(-state[:m][problem.closed], initial=0.0))
     if size == 0.0:
         return [HanGilmoreOutcome(v, np.zeros(m), (), np.zeros(len(state) - m))]
@@ -167,18 +177,14 @@ def han_gilmore(
         frontier = following
     outcomes = []
     for node, without_end in zip(found, endless):
-        p = node.p * size / root
-        outcomes.append(HanGilmoreOutcome(v + mobility @ p, p[:m], node.rules, p[m:], without_end))
+        p = node.p * size / problem.root
+        after = v + problem.mobility @ p
+        outcomes.append(HanGilmoreOutcome(after, p[:m], node.rules, p[m:], without_end))
     return outcomes
 
 
-def _problem(
-    scene: Scene, restitution: Any, friction: Any
-) -> tuple[_Problem, np.ndarray, np.ndarray, np.ndarray]:
-    """The problem, normals and tangents (n, m + t), M^-1 times these, and sqrt(W_jj) (m + t,).
-
-    In double precision always: whether a contact is at rest decides the tree.
-    """
+def _problem(scene: Scene, restitution: Any, friction: Any) -> _Problem:
+    """The problem, in double precision always: whether a contact is at rest decides the tree."""
     m = scene.contacts
     check_per_contact("restitution", restitution, m)
     check_values("restitution", restitution, low=0.0, high=1.0)
@@ -201,18 +207,8 @@ def _problem(
     w = rows.T @ mobility
     root = np.tile(np.sqrt(np.diag(w)[:m]), len(w) // m)
     e = np.broadcast_to(np.asarray(restitution, float), (m,))
-    problem = _Problem(w / np.outer(root, root), e, mu, np.asarray(scene.closed))
-    return problem, rows, mobility, root
-
-
-def _checked(scene: Scene, velocity: Any, max_depth: int) -> np.ndarray:
-    """v- (n,) on the host, all arguments checked."""
-    if is_traced((scene, velocity)):
-        raise TypeError("`han_gilmore` is a host function: it cannot be traced (jit, vmap, grad).")
-    v = as_velocity(scene, velocity)
-    check_values("velocity", v)
-    as_whole("max_depth", max_depth, 1)
-    return np.asarray(velocity, float)
+    closed = np.asarray(scene.closed)
+    return _Problem(w / np.outer(root, root), e, mu, closed, rows, mobility, root)
 
 
 def _impacts(problem: _Problem, node: _Node) -> Iterator[_Node]:

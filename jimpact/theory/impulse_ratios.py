@@ -5,7 +5,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jimpact._checks import as_float_array, check_per_contact, check_values
+from jimpact._checks import as_numbers
 from jimpact.laws.impulse_correlation import interval
 from jimpact.scene import Scene
 
@@ -34,12 +34,9 @@ def distributing_rule(energy: Any, stiffness: Any, exponent: Any) -> jax.Array:
     >>> round(float(ji.theory.distributing_rule([1.0, 0.3], [1.0, 2.0], 1.5)[1, 0]), 5)
     0.64074
     """
-    energy = as_float_array("energy", energy)
-    stiffness = as_float_array("stiffness", stiffness)
-    eta = as_float_array("exponent", exponent)
-    check_values("energy", energy, low=0.0)
-    check_values("stiffness", stiffness, low=0.0, open_low=True)
-    check_values("exponent", eta, low=1.0)
+    energy = as_numbers("energy", energy, low=0.0)
+    stiffness = as_numbers("stiffness", stiffness, low=0.0, open_low=True)
+    eta = as_numbers("exponent", exponent, low=1.0)
     force = ((1 + eta) * energy) ** (eta / (1 + eta)) * stiffness ** (1 / (1 + eta))
     return force[:, None] / force[None, :]
 
@@ -72,9 +69,7 @@ def correlation_interval(scene: Scene, restitution: Any) -> tuple[np.ndarray, np
     >>> round(float(low[0, 1]), 6), round(float(high[0, 1]), 6)
     (0.5, 0.948753)
     """
-    e = as_float_array("restitution", restitution)
-    check_values("restitution", e, low=0.0, high=1.0)
-    check_per_contact("restitution", e, scene.contacts)
+    e = as_numbers("restitution", restitution, low=0.0, high=1.0, contacts=scene.contacts)
     return interval(scene, e)
 
 
@@ -101,10 +96,7 @@ def precompression_energy(force: Any, stiffness: Any, exponent: Any = 1.5) -> ja
     >>> float(ji.theory.precompression_energy(2.0, stiffness=8.0, exponent=1.0))  # F^2 / (2 k)
     0.25
     """
-    force = as_float_array("force", force)
-    stiffness = as_float_array("stiffness", stiffness)
-    eta = as_float_array("exponent", exponent)
-    check_values("force", force, low=0.0)
-    check_values("stiffness", stiffness, low=0.0, open_low=True)
-    check_values("exponent", eta, low=1.0)
+    force = as_numbers("force", force, low=0.0)
+    stiffness = as_numbers("stiffness", stiffness, low=0.0, open_low=True)
+    eta = as_numbers("exponent", exponent, low=1.0)
     return force ** ((eta + 1) / eta) / ((eta + 1) * stiffness ** (1 / eta))

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jimpact._checks import as_float_array, check_shape
+from jimpact._checks import as_numbers
 from jimpact.compiling import full_precision
 from jimpact.contact import (
     kinetic_norm,
@@ -78,10 +78,9 @@ def from_quasi_velocities(scene: Scene, normal: Any, tangential: Any) -> jax.Arr
     >>> [round(float(each), 6) for each in v]
     [1.5, 0.5]
     """
-    qn, qt = as_float_array("normal", normal), as_float_array("tangential", tangential)
-    check_shape("normal", qn, (scene.contacts,), "one per contact")
+    qn = as_numbers("normal", normal, (scene.contacts,), "one per contact")
     _, tangent = quasi_basis(scene)
-    check_shape("tangential", qt, tangent.shape[1:], "one per tangent of `quasi_basis`")
+    qt = as_numbers("tangential", tangential, tangent.shape[1:], "one per tangent of `quasi_basis`")
     impulse = jnp.linalg.solve(as_matrix(normalized_delassus(scene)), qn) / kinetic_norm(scene)
     return velocity_change(scene, impulse) + tangent @ qt
 
@@ -143,8 +142,8 @@ def contact_power(
     >>> float(ji.theory.contact_power(ji.chain([2.0, 2.0]), [1.5, 0.5], [3.0]).total)
     -3.0
     """
-    v, normal_force = as_float_array("velocity", velocity), as_float_array("force", force)
-    check_shape("force", normal_force, (scene.contacts,), "one per contact")
+    normal_force = as_numbers("force", force, (scene.contacts,), "one per contact")
+    v = as_velocity(scene, velocity)
     qn, qt = to_quasi_velocities(scene, v)
     normal = normal_force @ gap_velocity(scene, v)
     if tangential_force is None:
@@ -152,8 +151,9 @@ def contact_power(
         return ContactPower(normal, zero, zero, normal)
     if scene.tangents is None:
         raise ValueError("Argument `scene` must have tangents where tangential forces act.")
-    side = as_float_array("tangential_force", tangential_force)
-    check_shape("tangential_force", side, scene.tangents.shape[1:], "one per tangent")
+    side = as_numbers(
+        "tangential_force", tangential_force, scene.tangents.shape[1:], "one per tangent"
+    )
     _, tangent = quasi_basis(scene)
     pushed = velocity_change(scene, jnp.zeros_like(normal_force), side)
     pushed_normal = normalized_gap_velocity(scene, pushed)
