@@ -1,10 +1,9 @@
 """Measured shots: velocities before and after impacts, read from CSV files."""
 
-import functools
 import operator
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -150,11 +149,11 @@ class Experiments(eqx.Module):
 
     def scene_of(self, scene: Scene | None, shot: int) -> Scene:
         """The scene of one shot (counted from 0): its own, or else the given common one."""
-        return _scene_of(self, scene, shot)
+        return self.each(scene, lambda each: each)[shot]
 
     def largest_scene(self, scene: Scene | None) -> Scene:
         """The first of the scenes (or the given common scene) with the most contacts."""
-        return max(self.each(scene, lambda s: s), key=lambda each: each.contacts)
+        return max(self.each(scene, lambda each: each), key=lambda each: each.contacts)
 
     def momentum_excess(self, scene: Scene | None = None) -> np.ndarray:
         """Momentum that the contacts cannot have changed, but the data did: (K, c) [N s].
@@ -330,26 +329,21 @@ class Experiments(eqx.Module):
         return [(rows, a, b) for rows, a, b in zip(self.each(scene, conserved_momenta), pre, post)]
 
     def each(self, scene: Scene | None, function: Callable[[Scene], Any]) -> list[Any]:
-        """`function` of the scene of every shot; of a common one only once."""
-        if self.scenes is None:
-            return [function(_scene_of(self, scene, 0))] * len(self.shots)
-        return [function(_scene_of(self, scene, k)) for k in range(len(self.shots))]
-
-
-def _scene_of(data: Experiments, scene: Scene | None, shot: int) -> Scene:
-    """`Experiments.scene_of`. Calling a method would go through all arrays of `data`."""
-    if data.scenes is not None:
-        scene = data.scenes[shot]
-    if scene is None:
-        raise ValueError(
-            "Argument `scene` must be a Scene where the experiments carry none, but is None."
-        )
-    if scene.size != data.pre.shape[1]:
-        raise ValueError(
-            "Argument `experiments` must have one velocity per body of the scene: it has "
-            f"{data.pre.shape[1]} a shot, but the scene has {scene.size}."
-        )
-    return scene
+        """`function` of the scene of every shot; of one that several shots have only once."""
+        if self.scenes is not None:
+            different = {id(own): own for own in self.scenes}
+            values = {key: function(own) for key, own in different.items()}
+            return [values[id(own)] for own in self.scenes]
+        if scene is None:
+            raise ValueError(
+                "Argument `scene` must be a Scene where the experiments carry none, but is None."
+            )
+        if scene.size != self.pre.shape[1]:
+            raise ValueError(
+                "Argument `experiments` must have one velocity per body of the scene: it has "
+                f"{self.pre.shape[1]} a shot, but the scene has {scene.size}."
+            )
+        return [function(scene)] * len(self.shots)
 
 
 def _smallest_change(data: Experiments, k: int, rows: np.ndarray) -> np.ndarray:
@@ -381,25 +375,6 @@ def _filled(rows: list[np.ndarray]) -> np.ndarray:
     return filled
 
 
-class _Same(NamedTuple):
-    """A scene that is equal to itself only."""
-
-    scene: Scene
-
-    def __hash__(self) -> int:
-        return id(self.scene)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Same) and self.scene is other.scene
-
-
-def _remembered(function: Callable[[Scene], np.ndarray]) -> Callable[[Scene], np.ndarray]:
-    """The function, which need not compute again for the scenes it was called with last."""
-    last = functools.lru_cache(maxsize=4)(lambda same: function(same.scene))
-    return functools.wraps(function)(lambda scene: last(_Same(scene)))
-
-
-@_remembered
 def conserved_momenta(scene: Scene) -> np.ndarray:
     """`C^T M` (c, n): C spans the complement of all contact and constraint directions."""
     others = [x for x in (scene.tangents, scene.constraints) if x is not None]
@@ -411,7 +386,6 @@ def conserved_momenta(scene: Scene) -> np.ndarray:
     return (complement / complement[largest, np.arange(complement.shape[1])]).T @ dense_mass(scene)
 
 
-@_remembered
 def closed_normals(scene: Scene) -> np.ndarray:
     """Normals (n, c) of the closed contacts."""
     return np.asarray(scene.normals, float)[:, np.asarray(scene.closed)]
