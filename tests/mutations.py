@@ -156,7 +156,7 @@ MUTATIONS = [
     Mutation("a basis that does not turn", "_terms.quasi", "s * v", "0 * s * v", ("test_accelerations.py",)),
     Mutation("one-sided confidence intervals", "FitResult.quantile", "0.5 + 0.5 * level", "level", ("test_fit.py::test_errors_from_the_residual_are_those_of_linear_regression",)),
     Mutation("bootstrap without the noise", "bootstrap", "fit.noise * np.moveaxis(z, 0, -1)", "np.moveaxis(z, 0, -1)", ("test_fit.py::test_bootstrap_scatters_as_much_as_the_standard_error",)),
-    Mutation("a prior is no measured value", "_build", "int(here.sum()) + len(priors)", "int(here.sum())", ("test_fit.py::test_a_prior_weighs_like_one_more_measured_value",)),
+    Mutation("a prior is no measured value", "FitProblem.values", "int(here.sum() - lost) + len(self.priors)", "int(here.sum() - lost)", ("test_fit.py::test_a_prior_weighs_like_one_more_measured_value",)),
     Mutation("Akaike's criterion without the noise", "FitResult.aic", "len(self.names) + 1", "len(self.names)", ("test_fit.py::test_parameters_by_name_and_criteria",)),
     Mutation("small-sample correction of AIC", "_aicc", "2 * k * (k + 1) / (n - k - 1)", "2 * k * (k + 1) / (n - k)", ("test_selection.py::test_the_criterion_without_sigma_is_corrected_for_few_values",)),
     Mutation("spheres of the inertia of discs", "Sphere", "0.4 * self.radius ** 2", "0.5 * self.radius ** 2", ("test_piles.py::test_spheres_are_a_body_like_others",)),

@@ -18,18 +18,18 @@ from jimpact.fits.profiles import needs_profiles, profile, profiles_of
 from jimpact.fits.report import Fit
 from jimpact.fits.solve import (
     DEFAULT_STEPS,
+    HARDLY_WORSE,
     Ends,
     FitMinimum,
     Method,
     Search,
     Solution,
-    check_method,
     default_steps,
     find_minima,
     minimize,
-    repeated,
     settled,
     solution,
+    stacked,
     start_points,
 )
 from jimpact.fits.uncertainty import (
@@ -42,9 +42,6 @@ from jimpact.fits.uncertainty import (
 from jimpact.progress import progress_bar
 from jimpact.scene import Scene
 
-# A minimum gets standard errors up to a sum of squares this many noise standard deviations above
-# the best: intervals of all levels end before. With ten times more, only time is lost.
-HARDLY_WORSE = 10.0
 QUICK_LEVEL = 0.95  # of the profiles that `fit` computes by default
 HUBER = 1.345  # sigmas up to which a residual counts squared: 95 % of the efficiency
 STUDENT = 4.0  # degrees of freedom of the tails
@@ -137,8 +134,8 @@ def fit(
     >>> round(float(result.law.restitution), 4)
     0.4
     """
-    check_method(method)
-    steps = default_steps(method) if max_steps is None else max_steps
+    default = default_steps(method)
+    steps = default if max_steps is None else max_steps
     if starts is not None:
         as_whole("starts", starts, 1)
     for name, count, least in (("max_steps", steps, 1), ("seed", seed, 0)):
@@ -289,7 +286,7 @@ def _standard_error(
     if minimum is found.minima[0]:
         return best.standard_error
     more = minimum.sum_of_squares - found.minima[0].sum_of_squares
-    if not more <= (HARDLY_WORSE * best.noise) ** 2:
+    if not more <= HARDLY_WORSE * best.noise**2:
         return None
     return uncertainty(problem, minimum, best.noise).standard_error
 
@@ -329,7 +326,7 @@ def _robust(
         share, slope = LOSSES[loss](error / scale)
         factor, before = np.sqrt(share), problem.point(found.value)
         weighed = problem.weighed(factor)
-        found = solution(weighed, minimize(repeated(weighed, 1), before[None], search))
+        found = solution(weighed, minimize(stacked([weighed]), before[None], search))
         if np.abs(problem.point(found.value) - before).max() <= SAME:
             break
     else:
@@ -437,17 +434,8 @@ def _problems(
 ) -> list[FitProblem]:
     """The problem of each data set; those in a common scene differ in their shots only."""
     first = of_shots(law, scene, many[0], *choice)
-    problems = [first]
-    for data in many[1:]:
-        same = data.scenes is None and first.scene is not None and data.units == many[0].units
-        exact = data.sigma_pre is None and first.mixing is None
-        # of a coarser law, where the noise allows it, each set decides by itself
-        coarse = any("computed with `rtol`" in note for note in first.notes)
-        if same and exact and not coarse:
-            problems.append(first.with_shots(data))
-        else:
-            problems.append(of_shots(law, scene, data, *choice))
-    return problems
+    others = (first.with_shots(data) or of_shots(law, scene, data, *choice) for data in many[1:])
+    return [first, *others]
 
 
 def _alike(many: Sequence[Experiments]) -> list[list[int]]:

@@ -37,7 +37,6 @@ _REDUNDANT = 100.0  # G with an eigenvalue below this multiple of m eps has no i
 _CUTS = 60  # rounds of cutting planes, mostly 10 to 20
 _FLAT = 1e-9  # share of the longest derivative below which a condition does not depend on y
 _WORST = 2  # new cuts of each scene and contact
-_HALVINGS = 40  # from a start on the boundary towards the inside
 _FACES = ("E >= 0", "G^-1 (I + E) >= 0", "G^-1 - E^T G^-1 E copositive (energy)")
 
 
@@ -245,14 +244,19 @@ def matrix_region(
     _check_start(region, slack)
     moving = np.any(rows[:, used] != 0, axis=1) & np.isfinite(slack)
     region = eqx.tree_at(lambda r: r.moving, region, jnp.asarray(moving[: len(region.moving)]))
-    return eqx.tree_at(lambda r: r.center, region, _center(region, slack, rows, moving))
+    center = _inner_point(region, np.asarray(start, float))
+    if center is None:
+        raise ValueError(
+            "Argument `free` must leave an admissible choice: with the fixed entries every "
+            "free entry is at the edge already."
+        )
+    return eqx.tree_at(lambda r: r.center, region, jnp.asarray(center, dtype))
 
 
 def admissible_start(scenes: list[Scene]) -> np.ndarray:
-    """A matrix E (m, m) strictly inside the admissible ones of all scenes.
+    """A matrix E (m, m) that is admissible in all scenes.
 
-    `I / 2` where it will do (chains); else the point from which the conditions, all of them
-    concave, are farthest, found by cutting planes.
+    `I / 2` where it will do (chains); else one from which all conditions are far.
 
     Raises:
         ValueError: redundant or too many contacts, or no matrix that is admissible.
@@ -262,33 +266,18 @@ def admissible_start(scenes: list[Scene]) -> np.ndarray:
     >>> admissible_start([ji.chain([1.0, 1.0, 1.0])]).tolist()
     [[0.5, 0.0], [0.0, 0.5]]
     """
-    from scipy.optimize import linprog  # late: slow to import
-
     m = scenes[0].contacts
     dtype = scenes[0].mass.dtype
-    region = _region(scenes, dtype, np.zeros(m * m), np.eye(m * m), None, np.zeros(m * m))
-    e, planes = 0.5 * np.eye(m).ravel(), np.zeros((0, m * m + 2))
-    for _ in range(_CUTS):
-        slack, rows = _host_conditions(region, e)
-        moving = np.any(rows != 0, axis=1)
-        if slack[moving].min() >= -_rounding(region):
-            return e.reshape(m, m)
-        # t <= slack + rows (E - e): least slack t at E, below all tangents so far
-        new = np.column_stack([-rows, np.ones(len(rows)), slack - rows @ e])[moving]
-        planes = np.vstack([planes, new])
-        farthest = linprog(
-            np.append(np.zeros(m * m), -1.0),
-            A_ub=planes[:, :-1],
-            b_ub=planes[:, -1],
-            bounds=[*[(0.0, None)] * (m * m), (None, 1.0)],
+    half = 0.5 * np.eye(m).ravel()
+    region = _region(scenes, dtype, np.zeros(m * m), np.eye(m * m), None, half)
+    will_do = _host_conditions(region, half)[0].min() >= -_rounding(region)
+    e = half if will_do else _inner_point(region, half)
+    if e is None:
+        raise ValueError(
+            "Argument `scene` must have an admissible restitution matrix to start from, but none "
+            "was found: give one, or RestitutionMatrix(matrix, admissible=False)."
         )
-        if not farthest.success or farthest.x[-1] <= 0:
-            break
-        e = farthest.x[:-1]
-    raise ValueError(
-        "Argument `scene` must have an admissible restitution matrix to start from, but none was "
-        "found: give one, or RestitutionMatrix(matrix, admissible=False)."
-    )
+    return e.reshape(m, m)
 
 
 def _region(
@@ -385,29 +374,31 @@ def _check_start(region: AdmissibleMatrices, slack: np.ndarray) -> None:
             )
 
 
-def _center(
-    region: AdmissibleMatrices, slack: np.ndarray, rows: np.ndarray, moving: np.ndarray
-) -> jax.Array:
-    """A point strictly inside: from the start, in the direction that all conditions like best."""
+def _inner_point(region: AdmissibleMatrices, start: np.ndarray) -> np.ndarray | None:
+    """y near the start, from which all conditions are half as far as possible, or farther.
+
+    By cutting planes: the least condition, concave in y, lies below all tangents so far, and the
+    next y is where these leave most. None: there is no such y.
+    """
     from scipy.optimize import linprog  # late: slow to import
 
-    start = np.asarray(region.center, float)
-    used = np.any(rows[moving] != 0, axis=0)
-    solution = linprog(
-        np.append(np.zeros(len(start)), -1.0),  # the least slack after the step is to be large
-        A_ub=np.hstack([-rows, np.ones((len(rows), 1))])[moving],
-        b_ub=slack[moving],
-        bounds=[*((-int(free), int(free)) for free in used), (None, 1.0)],
-    )
-    move = solution.x[:-1] if solution.success else np.zeros(len(start))
-    for halving in range(_HALVINGS):
-        center = start + 0.5**halving * move
-        if _host_conditions(region, center)[0][moving].min() > _rounding(region):
-            return jnp.asarray(center, region.center.dtype)
-    raise ValueError(
-        "Argument `free` must leave an admissible choice: with the fixed entries every "
-        "free entry is at the edge already."
-    )
+    free = np.any(np.asarray(region.map) != 0, axis=0)
+    box = [*((x - moves, x + moves) for x, moves in zip(start, free)), (None, 1.0)]
+    y, most, planes = start, np.inf, np.zeros((0, len(start) + 2))
+    for _ in range(_CUTS):
+        slack, rows = _host_conditions(region, y)
+        moving = np.any(rows != 0, axis=1) & np.isfinite(slack)
+        if slack[moving].min() > max(0.5 * most, _rounding(region)):
+            return y
+        # t <= slack + rows (z - y)
+        new = np.column_stack([-rows, np.ones(len(rows)), slack - rows @ y])[moving]
+        planes = np.vstack([planes, new])
+        cost = np.append(np.zeros(len(start)), -1.0)
+        farthest = linprog(cost, A_ub=planes[:, :-1], b_ub=planes[:, -1], bounds=box)
+        if not farthest.success or farthest.x[-1] <= 0:
+            return None
+        y, most = farthest.x[:-1], farthest.x[-1]
+    return None
 
 
 def boundary(region: AdmissibleMatrices | None, y: np.ndarray) -> tuple[str, ...]:

@@ -7,7 +7,7 @@ plane, is filled from the minima outwards.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 from typing import NamedTuple
 
@@ -19,15 +19,14 @@ from jimpact.fits.solve import (
     SAME_VALUE,
     START_SCALES,
     Ends,
-    FitMinimum,
     Search,
     Solution,
     find_minima,
-    minimize_with,
-    repeated,
+    minimize,
     solution,
+    stacked,
 )
-from jimpact.fits.uncertainty import FitResult, Profile, check_level, uncertainty
+from jimpact.fits.uncertainty import FitResult, Profile, check_level
 from jimpact.progress import Show, progress_bar
 
 # Deviances are right to this (see `solve.FINE`): the ends of an interval move by less than END. A
@@ -48,20 +47,12 @@ _BEYOND = 1.3  # how far a contour's picture goes, in half-widths of the region 
 _FROM_BEST = -1  # the branch of what was searched from the best minimum
 
 
-class Start(NamedTuple):
-    """A minimum: its sum of squares, y (Q,), and standard errors of y (P,)."""
-
-    squares: float
-    y: np.ndarray
-    error: np.ndarray
-
-
-class Cell(NamedTuple):
+class Point(NamedTuple):
     """The least sum of squares that is known with values fixed, where, from which start."""
 
     squares: float
     y: np.ndarray
-    branch: int
+    branch: int = _FROM_BEST
 
 
 Index = tuple[int, ...]
@@ -73,11 +64,9 @@ class Grid(NamedTuple):
     which: tuple[int, ...]
     values: tuple[np.ndarray, ...]
 
-    def fixed(self, y: np.ndarray, cell: Index) -> np.ndarray:
-        """A copy of y with the values of a cell."""
-        point = np.array(y, float)
-        point[list(self.which)] = [values[k] for values, k in zip(self.values, cell)]
-        return point
+    def at(self, cell: Index) -> list[float]:
+        """The values of a cell."""
+        return [float(values[k]) for values, k in zip(self.values, cell)]
 
     def nearest(self, y: np.ndarray) -> Index:
         """The cell next to y."""
@@ -98,26 +87,26 @@ class Deviances:
         # if the noise is undetermined, that of an exact fit up to rounding
         known = np.isfinite(fit.noise) and fit.noise > 0
         self.variance = float(fit.noise**2) if known else self.problem.exact_squares
-        self.starts = [self.start(end) for end in fit.starts]
+        self.starts = [
+            Point(end.sum_of_squares, self.problem.point(end.value)) for end in fit.starts
+        ]
         self.best = self.lowest = self.starts[0]
+        self.error = fit.standard_error / self.problem.steps_at(fit.value)
 
-    def start(self, end: FitMinimum) -> Start:
-        """A minimum in the solver's scale."""
-        steps = self.problem.steps_at(end.value)
-        error = np.full(len(steps), np.nan) if end.standard_error is None else end.standard_error
-        return Start(end.sum_of_squares, self.problem.point(end.value), error / steps)
-
-    def minimize(self, fixed: Sequence[tuple[int, ...]], y: Sequence[np.ndarray]) -> Ends:
-        """Minima from each y (A, Q) with these of its parameters fixed, all side by side."""
-        held = np.zeros((len(y), len(self.best.y)), bool)
-        for row, which in zip(held, fixed):
-            row[list(which)] = True
-        held[:, len(self.fit.names) :] = True
+    def minimize(self, trials: Sequence[tuple[Index, Sequence[float], np.ndarray]]) -> Ends:
+        """Minima with some parameters fixed at values, from y (Q,) each, all side by side."""
+        points = np.array([y for _, _, y in trials])
+        fixed = np.zeros(points.shape, bool)
+        fixed[:, len(self.fit.names) :] = True
+        for k, (which, values, _) in enumerate(trials):
+            points[k, list(which)] = values
+            fixed[k, list(which)] = True
         search = Search(max_steps=PASSES, show=self.show, damping=NEAR)
-        ends = minimize_with(repeated(self.problem, len(y)), np.array(y), held, search, _STOP)
+        many = stacked([self.problem], len(points))
+        ends = minimize(many, points, search, _STOP, what="fixed values", fixed=fixed)
         least = int(np.argmin(ends.squares))
         if self._is_below(ends.squares[least], self.lowest.squares):
-            self.lowest = Start(float(ends.squares[least]), ends.y[least], self.best.error)
+            self.lowest = Point(float(ends.squares[least]), ends.y[least])
         return ends
 
     def _is_below(self, squares: float, other: float) -> bool:
@@ -140,27 +129,28 @@ class Deviances:
         low = low if np.isfinite(low) else best - START_SCALES
         return float(low), float(high if np.isfinite(high) else best + START_SCALES)
 
-    def fill(self, grids: Sequence[Grid], limit: float) -> list[dict[Index, Cell]]:
+    def fill(self, grids: Sequence[Grid], limit: float) -> list[dict[Index, Point]]:
         """Cells of grids, from the minima outwards until beyond the limit, many side by side.
 
         Each cell below the limit starts its neighbours from its own minimum, also those that were
         reached from another start. One above may lie on a ridge: once more from the best.
         """
-        known: list[dict[Index, Cell]] = [{} for _ in grids]
+        known: list[dict[Index, Point]] = [{} for _ in grids]
         ahead = {
             (g, grid.nearest(start.y), branch): start.y
             for g, grid in enumerate(grids)
             for branch, start in enumerate(self.starts)
         }
         while ahead:
-            points = [grids[g].fixed(y, cell) for (g, cell, _), y in ahead.items()]
-            ends = self.minimize([grids[g].which for g, _, _ in ahead], points)
+            ends = self.minimize(
+                [(grids[g].which, grids[g].at(cell), y) for (g, cell, _), y in ahead.items()]
+            )
             trials, ahead = list(ahead), {}
             for (g, cell, branch), squares, y in zip(trials, ends.squares.tolist(), ends.y):
                 cells = known[g]
                 if cell in cells and not squares < (1 - SAME) * cells[cell].squares:
                     continue
-                cells[cell] = Cell(squares, y, branch)
+                cells[cell] = Point(squares, y, branch)
                 if self.of(squares) > limit:
                     if branch != _FROM_BEST:
                         ahead[g, cell, _FROM_BEST] = self.best.y
@@ -243,15 +233,8 @@ def profiles_of(
             profiles = lines.profiles()
             if lines.lowest is lines.best:
                 break
-            lines.add_starts(solution(fit.problem, lines.minimize([()], [lines.lowest.y])))
+            lines.add_starts(solution(fit.problem, lines.minimize([((), (), lines.lowest.y)])))
     return profiles
-
-
-def with_entry(y: np.ndarray, i: int, value: float) -> np.ndarray:
-    """A copy of y with another i-th entry."""
-    changed = np.array(y, float)
-    changed[i] = value
-    return changed
 
 
 class _Lines(Deviances):
@@ -263,7 +246,7 @@ class _Lines(Deviances):
         self.limit = fit.quantile(level) ** 2
         self._choose(self.starts)
 
-    def _choose(self, starts: Sequence[Start]) -> None:
+    def _choose(self, starts: Sequence[Point]) -> None:
         """Take the lowest of these starts, and others near it that are apart from each other."""
         self.best, self.starts = starts[0], []
         for start in starts:
@@ -279,24 +262,23 @@ class _Lines(Deviances):
 
     def add_starts(self, found: Solution) -> None:
         """Start from these minima, too."""
-        starts = []
-        for minimum in found.minima:
-            error = uncertainty(self.problem, minimum, self.fit.noise).standard_error
-            starts.append(self.start(replace(minimum, standard_error=error)))
-        self._choose([*self.starts, *starts])
+        y = self.problem.point(np.array([minimum.value for minimum in found.minima]))
+        squares = [minimum.sum_of_squares for minimum in found.minima]
+        self._choose([*self.starts, *map(Point, squares, y)])
 
     def grid(self, i: int) -> Grid:
         """Values of the i-th parameter, the denser the nearer to a start."""
         low, high = self.reach(i)
         centres = np.array([start.y[i] for start in self.starts])
         values = [centres, np.array([low, high])]
-        for k, start in enumerate(self.starts):
-            first = STEP * np.sqrt(self.limit) * start.error[i]
-            widest = FIRST_SHARE * (high - low)
-            first = min(first, (high - low) / 2) if np.isfinite(first) and first > 0 else widest
-            count = np.log(1 + (GROWTH - 1) * (high - low) / first) / np.log(GROWTH)
-            away = first * (GROWTH ** np.arange(1, count + 1) - 1) / (GROWTH - 1)
-            near = start.y[i] + np.concatenate([-away, away])
+        first = STEP * np.sqrt(self.limit) * self.error[i]
+        if not (np.isfinite(first) and first > 0):
+            first = FIRST_SHARE * (high - low)
+        first = min(first, (high - low) / 2)
+        count = np.log(1 + (GROWTH - 1) * (high - low) / first) / np.log(GROWTH)
+        away = first * (GROWTH ** np.arange(1, count + 1) - 1) / (GROWTH - 1)
+        for k, centre in enumerate(centres):
+            near = centre + np.concatenate([-away, away])
             owner = np.abs(near[:, None] - centres).argmin(axis=1)
             values.append(near[(owner == k) & (near > low) & (near < high)])
         return Grid((i,), (np.unique(np.concatenate(values)),))
@@ -311,23 +293,21 @@ class _Lines(Deviances):
         self.find_ends(lines)
         return tuple(self.profile(i, line) for i, line in zip(self.which, lines))
 
-    def find_ends(self, lines: Sequence[dict[float, Cell]]) -> None:
+    def find_ends(self, lines: Sequence[dict[float, Point]]) -> None:
         """Where deviances pass the limit: regula falsi in their roots, all ends side by side."""
         for turn in range(ROUNDS):
             trials = []
             for n, line in enumerate(lines):
                 for inside, outside, p, q in self._crossings(line):
                     share = np.clip(p / (p - q), 0.02, 0.98) if turn % 3 < 2 else 0.5
-                    trials.append((n, line[inside].y, inside + share * (outside - inside)))
+                    trials.append((n, inside + share * (outside - inside), line[inside].y))
             if not trials:
                 return
-            which = [self.which[n] for n, _, _ in trials]
-            points = [with_entry(y, i, value) for i, (_, y, value) in zip(which, trials)]
-            ends = self.minimize([(i,) for i in which], points)
-            for (n, _, value), squares, y in zip(trials, ends.squares.tolist(), ends.y):
-                lines[n][float(value)] = Cell(squares, y, _FROM_BEST)
+            ends = self.minimize([((self.which[n],), (value,), y) for n, value, y in trials])
+            for (n, value, _), squares, y in zip(trials, ends.squares.tolist(), ends.y):
+                lines[n][float(value)] = Point(squares, y)
 
-    def _crossings(self, line: dict[float, Cell]) -> Iterator[tuple[float, float, float, float]]:
+    def _crossings(self, line: dict[float, Point]) -> Iterator[tuple[float, float, float, float]]:
         """Ends that are not settled: values inside and outside, and by how much they pass.
 
         That is the root of the deviance over that of the limit, less 1.
@@ -340,12 +320,12 @@ class _Lines(Deviances):
             if min(-height[a], height[b]) > END and abs(values[b] - values[a]) > least:
                 yield values[a], values[b], height[a], height[b]
 
-    def deviance(self, line: dict[float, Cell]) -> tuple[np.ndarray, np.ndarray]:
+    def deviance(self, line: dict[float, Point]) -> tuple[np.ndarray, np.ndarray]:
         """Fixed values in order, and their deviances."""
         values = sorted(line)
         return np.array(values), np.array([self.of(line[y].squares) for y in values])
 
-    def profile(self, i: int, line: dict[float, Cell]) -> Profile:
+    def profile(self, i: int, line: dict[float, Point]) -> Profile:
         """The profile of a parameter from all that was solved."""
         y, deviance = self.deviance(line)
         deviance = deviance - deviance.min()

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 
 import jimpact
-from jimpact._checks import needed
 from jimpact.files.records import Column, Table, Tabular, as_data, with_error
 from jimpact.fits.parameters import AnyLaw, value_of
 from jimpact.fits.problem import FitProblem
@@ -340,45 +339,34 @@ class Fit(FitResult[AnyLaw], Tabular):
 
     def to_dict(self) -> dict[str, Any]:
         """Everything a JSON file can hold; numbers that are not finite become None."""
-        interval = self.confidence_interval()
+        as_they_are = (
+            *("method", "rms", "noise", "degrees_of_freedom", "rank", "identifiability"),
+            *("warnings", "verdict", "reservations", "seed", "converged", "covariance"),
+            *("correlation", "predicted", "residual"),
+        )
         parameters = [
             {
                 "name": name,
-                "value": as_data(self.value[i]),
-                "standard_error": as_data(self.standard_error[i]),
-                "confidence_interval_95": as_data(interval[i]),
-                "at_bound": bool(self.at_bound[i]),
-                "seen": bool(self.determined[i]),
-                "profile_95": as_data(self.profiles[i].intervals) if self.profiles else None,
+                "value": self.value[i],
+                "standard_error": self.standard_error[i],
+                "confidence_interval_95": ends,
+                "at_bound": self.at_bound[i],
+                "seen": self.determined[i],
+                "profile_95": self.profiles[i].intervals if self.profiles else None,
             }
-            for i, name in enumerate(self.names)
+            for i, (name, ends) in enumerate(zip(self.names, self.confidence_interval()))
         ]
-        starts = [
-            {"sum_of_squares": s.sum_of_squares, "value": as_data(s.value), "count": s.count}
-            for s in self.starts
-        ]
-        return {
+        record = {
             "law": type(self.law).__name__,
-            "method": self.method,
             "parameters": parameters,
-            "rms": self.rms,
-            "noise": as_data(self.noise),
-            "degrees_of_freedom": self.degrees_of_freedom,
-            "rank": self.rank,
-            "identifiability": list(self.identifiability),
-            "warnings": list(self.warnings),
-            "verdict": self.verdict,
-            "reservations": list(self.reservations),
-            "seed": self.seed,
-            "converged": self.converged,
-            "covariance": as_data(self.covariance),
-            "correlation": as_data(self.correlation),
-            "starts": starts,
-            "shots": [] if self.experiments is None else list(self.experiments.shots),
-            "predicted": as_data(self.predicted),
-            "residual": as_data(self.residual),
+            "starts": [
+                {"sum_of_squares": s.sum_of_squares, "value": s.value, "count": s.count}
+                for s in self.starts
+            ],
+            "shots": [] if self.experiments is None else self.experiments.shots,
             "status": [STATUS[code].name for code in self.status],
         }
+        return as_data(record | {name: getattr(self, name) for name in as_they_are})
 
     @property
     def verdict(self) -> str:
@@ -435,38 +423,6 @@ class Fit(FitResult[AnyLaw], Tabular):
         path = Path(path)
         path.write_text(json.dumps(record, allow_nan=False, indent=1) + "\n", encoding="utf-8")
         return path
-
-    def to_pandas(self) -> Any:
-        """The parameters as a `pandas.DataFrame`, which must be installed."""
-        return super().to_pandas().set_index("parameter")
-
-    def to_xarray(self) -> Any:
-        """Parameters, covariance, every shot as an `xarray.Dataset`, which must be installed."""
-        pair = ("parameter", "parameter_2")
-        arrays: dict[str, Any] = {
-            "value": ("parameter", self.value),
-            "standard_error": ("parameter", self.standard_error),
-            "determined": ("parameter", self.determined),
-            "covariance": (pair, self.covariance),
-            "correlation": (pair, self.correlation),
-        }
-        coordinates: dict[str, Any] = {axis: list(self.names) for axis in pair}
-        measured, data = np.asarray(self.problem.measured, float), self.experiments
-        axes: tuple[str, ...] = tuple(f"value_{i + 1}" for i in range(measured.ndim))
-        if data is not None:
-            axes = ("shot", "velocity")
-            units = data.units
-            coordinates |= {"shot": list(data.shots), "unit": ("velocity", list(units))}
-            arrays["before"] = (axes, np.asarray(data.pre))
-            arrays["status"] = ("shot", [STATUS[code].name for code in self.status])
-        for name, values in (
-            ("measured", measured),
-            ("predicted", self.predicted),
-            ("residual", self.residual),
-        ):
-            arrays[name] = (axes, values)
-        about = {"law": type(self.law).__name__, "verdict": self.verdict, "rms": self.rms}
-        return needed("xarray", "pip install xarray").Dataset(arrays, coordinates, about)
 
     def __str__(self) -> str:
         """The report: the verdict, then a block each."""

@@ -7,7 +7,7 @@ One pass evaluates residual and Jacobian together, so that an impact is compiled
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
@@ -25,9 +25,6 @@ if TYPE_CHECKING:
 
     from jimpact.fits.problem import FitProblem
 
-# residual (R,), Jacobian (R, P), anything else to keep of the best point y (P,)
-Evaluated = tuple[jax.Array, jax.Array, Any]
-Evaluate = Callable[[jax.Array], Evaluated]
 Method: TypeAlias = "str | optax.GradientTransformation"
 
 # Steps of one start before the solver gives up: more only costs time.
@@ -92,36 +89,23 @@ NEAR_RCOND = 1e-10  # directions that the data do not determine are not searched
 SETTLED, SETTLING = 1e-5, 10  # change (natural scales) and rounds, where errors of v- are passed on
 
 
-class Box(eqx.Module):
-    """The box `low <= y <= high`."""
+def _free_gradient(problem: "FitProblem", y: jax.Array, gradient: jax.Array) -> jax.Array:
+    """The gradient without variables that sit on a bound and are pushed against it."""
+    pushed = ((y <= problem.low) & (gradient > 0)) | ((y >= problem.high) & (gradient < 0))
+    return jnp.where(pushed, 0.0, gradient)
 
-    low: jax.Array
-    high: jax.Array
 
-    def retract(self, y: jax.Array) -> jax.Array:
-        """The nearest point of the box."""
-        return jnp.clip(y, self.low, self.high)
-
-    def free_gradient(self, y: jax.Array, gradient: jax.Array) -> jax.Array:
-        """The gradient without variables that sit on a bound and are pushed against it."""
-        pushed = ((y <= self.low) & (gradient > 0)) | ((y >= self.high) & (gradient < 0))
-        return jnp.where(pushed, 0.0, gradient)
-
-    def step(
-        self, y: jax.Array, residual: jax.Array, jacobian: jax.Array, damping: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """Damped Gauss-Newton step of the free variables, and the decrease it promises."""
-        gradient = jacobian.T @ residual
-        pushed = (self.free_gradient(y, gradient) == 0) & (gradient != 0)
-        jacobian = jnp.where(pushed[None, :], 0.0, jacobian)
-        gradient = jnp.where(pushed, 0.0, gradient)
-        hessian = jacobian.T @ jacobian
-        curvature = jnp.diagonal(hessian)
-        largest = jnp.max(curvature)
-        curvature = jnp.maximum(curvature, jnp.where(largest > 0, _FLAT * largest, 1.0))
-        factor = jax.scipy.linalg.cho_factor(hessian + jnp.diag(damping * curvature))
-        move = -jax.scipy.linalg.cho_solve(factor, gradient)
-        return move, -(gradient @ move) - 0.5 * jnp.sum((jacobian @ move) ** 2)
+def _damped_step(
+    gradient: jax.Array, jacobian: jax.Array, damping: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Damped Gauss-Newton step, and the decrease it promises."""
+    hessian = jacobian.T @ jacobian
+    curvature = jnp.diagonal(hessian)
+    largest = jnp.max(curvature)
+    curvature = jnp.maximum(curvature, jnp.where(largest > 0, _FLAT * largest, 1.0))
+    factor = jax.scipy.linalg.cho_factor(hessian + jnp.diag(damping * curvature))
+    move = -jax.scipy.linalg.cho_solve(factor, gradient)
+    return move, -(gradient @ move) - 0.5 * jnp.sum((jacobian @ move) ** 2)
 
 
 class Damping(NamedTuple):
@@ -161,10 +145,10 @@ class SolverState(eqx.Module):
     stuck: jax.Array  # no step lowers the cost
 
 
-def check_method(method: Any) -> None:
-    """Raise a ValueError unless `method` is a known name or an optax transformation."""
+def default_steps(method: Any) -> int:
+    """Step limit where the user gives none; raises a ValueError for an unknown method."""
     if isinstance(method, str) and method in DEFAULT_STEPS:
-        return
+        return DEFAULT_STEPS[method]
     import optax
 
     if not isinstance(method, optax.GradientTransformation):
@@ -172,15 +156,11 @@ def check_method(method: Any) -> None:
             f"Argument `method` must be one of {', '.join(map(repr, DEFAULT_STEPS))} or an "
             f"optax.GradientTransformation, but has value {method!r}."
         )
+    return DEFAULT_STEPS["adam"]
 
 
-def default_steps(method: Method) -> int:
-    """Step limit where the user gives none."""
-    return DEFAULT_STEPS[method if isinstance(method, str) else "adam"]
-
-
-def begin(y: Any, first: Evaluated, search: "Search") -> SolverState:
-    """States before the first pass from y (S, P); `first`: arrays like what `evaluate` returns."""
+def begin(problems: Any, y: Any, search: "Search") -> SolverState:
+    """States before the first pass of S problems from y (S, Q), on the host."""
     count, dtype = len(y), y.dtype
 
     def all_are(value: Any, dtype: Any = dtype) -> Any:
@@ -194,82 +174,92 @@ def begin(y: Any, first: Evaluated, search: "Search") -> SolverState:
         memory = jax.device_get(jax.vmap(init)(y))
     costs = all_are(np.inf), all_are(np.inf)
     ends = all_are(0, int), all_are(False, bool), all_are(False, bool)
-    # copies: states are written in place
-    return jax.tree.map(np.array, SolverState(y, *first, *costs, y, memory, *ends))
+    trial = np.clip(y, problems.low, problems.high)
+    residual, jacobian, aux = problems.blank(y)
+    state = SolverState(y, residual, jacobian, aux, *costs, trial, memory, *ends)
+    return jax.tree.map(np.array, state)  # copies: states are written in place
 
 
-def advance(
-    evaluate: Evaluate,
-    box: Box,
-    method: Method,
-    max_steps: int,
-    state: SolverState,
-    passes: int,
-    stop: Any,
+@quick_jit
+def advance_all(
+    problems: Any, states: SolverState, method: Method, max_steps: int, stop: jax.Array
 ) -> SolverState:
-    """Up to `passes` passes more, fewer if done or at the step limit; `stop`: see `FINE`."""
-    last = jnp.minimum(state.steps + passes, max_steps)
-    state = eqx.tree_at(lambda s: s.trial, state, box.retract(state.trial))
+    """Up to `PASSES` passes more of every problem; `stop`: see `FINE`."""
 
-    def one(state: SolverState) -> SolverState:
-        """One pass."""
-        residual, jacobian, aux = evaluate(state.trial)
-        cost = 0.5 * jnp.sum(residual**2)
-        better = cost < state.cost
-        here = (state.trial, residual, jacobian, aux, cost)
-        best = (state.y, state.residual, state.jacobian, state.aux, state.cost)
-        best = jax.tree.map(lambda a, b: jnp.where(better, a, b), here, best)
-        y, r, jac, aux, least = best
-        dtype = str(y.dtype)
-        floor = jnp.asarray(_LEAST[dtype], y.dtype)
-        if method == "levenberg-marquardt":
-            memory = state.memory.after(state.cost - cost)
-            step = partial(box.step, y, r, jac)
-            moves, gains = jax.vmap(step)(jnp.stack([floor, memory.value]))  # compiled once
-            gain, trial = gains[0], box.retract(y + moves[1])
-            change = jac @ (trial - y)
-            memory = memory._replace(promised=-(r @ change) - 0.5 * jnp.sum(change**2))
-            stuck = memory.value > _STUCK
-        else:
-            gain = box.step(y, r, jac, floor)[1]
-            gradient = box.free_gradient(state.trial, jacobian.T @ residual)
-            # optax itself mixes integers and floats: it needs the standard promotion
-            with jax.numpy_dtype_promotion("standard"):
-                move, memory = _transformation(method, max_steps).update(
-                    gradient,
-                    state.memory,
-                    state.trial,
-                    value=cost,
-                    grad=gradient,
-                    value_fn=lambda y: _cost(evaluate, box.retract(y)),
-                )
-            trial = box.retract(state.trial + move)
-            stuck = jnp.asarray(False)
-        finest = stop * least / residual.shape[0] + STOP_EXACT[dtype]
-        rounding = ROUNDING[dtype] * least / residual.shape[0] + ROUNDING_EXACT[dtype]
-        small = gain <= jnp.where(better, finest, jnp.maximum(finest, rounding))
-        return SolverState(
-            y, r, jac, aux, least, gain, trial, memory, state.steps + 1, small | stuck, stuck
-        )
+    def one(problem: Any, state: SolverState) -> SolverState:
+        """One problem, until it is done or at the step limit."""
+        last = jnp.minimum(state.steps + PASSES, max_steps)
+        one_pass = partial(_pass, problem, method, max_steps, stop)
+        return jax.lax.while_loop(lambda s: ~s.done & (s.steps < last), one_pass, state)
 
-    return jax.lax.while_loop(lambda s: ~s.done & (s.steps < last), one, state)
+    return eqx.filter_vmap(one)(problems, states)
 
 
-def _cost(evaluate: Evaluate, y: jax.Array) -> jax.Array:
-    """`|r|^2 / 2`, its derivative taken from the Jacobian that `evaluate` gives (line searches)."""
+def _pass(
+    problem: "FitProblem", method: Method, max_steps: int, stop: jax.Array, state: SolverState
+) -> SolverState:
+    """Residual and Jacobian of the trial, and the next one."""
+    residual, jacobian, aux = problem.evaluate(state.trial)
+    cost = 0.5 * jnp.sum(residual**2)
+    better = cost < state.cost
+    here = (state.trial, residual, jacobian, aux, cost)
+    best = (state.y, state.residual, state.jacobian, state.aux, state.cost)
+    best = jax.tree.map(lambda a, b: jnp.where(better, a, b), here, best)
+    y, r, jac, aux, least = best
+    dtype = str(y.dtype)
+    slope = jac.T @ r
+    free = _free_gradient(problem, y, slope)
+    of_free = jnp.where((free == 0) & (slope != 0), 0.0, jac)
+    floor = jnp.asarray(_LEAST[dtype], y.dtype)
+    if method == "levenberg-marquardt":
+        memory = state.memory.after(state.cost - cost)
+        dampings = jnp.stack([floor, memory.value])  # compiled once
+        moves, gains = jax.vmap(partial(_damped_step, free, of_free))(dampings)
+        gain, trial = gains[0], jnp.clip(y + moves[1], problem.low, problem.high)
+        change = jac @ (trial - y)
+        memory = memory._replace(promised=-(r @ change) - 0.5 * jnp.sum(change**2))
+        stuck = memory.value > _STUCK
+    else:
+        gain = _damped_step(free, of_free, floor)[1]
+        gradient = _free_gradient(problem, state.trial, jacobian.T @ residual)
+        # optax itself mixes integers and floats: it needs the standard promotion
+        with jax.numpy_dtype_promotion("standard"):
+            move, memory = _transformation(method, max_steps).update(
+                gradient,
+                state.memory,
+                state.trial,
+                value=cost,
+                grad=gradient,
+                value_fn=partial(_cost, problem),
+            )
+        trial = jnp.clip(state.trial + move, problem.low, problem.high)
+        stuck = jnp.asarray(False)
+    finest = stop * least / residual.shape[0] + STOP_EXACT[dtype]
+    rounding = ROUNDING[dtype] * least / residual.shape[0] + ROUNDING_EXACT[dtype]
+    small = gain <= jnp.where(better, finest, jnp.maximum(finest, rounding))
+    return SolverState(
+        y, r, jac, aux, least, gain, trial, memory, state.steps + 1, small | stuck, stuck
+    )
+
+
+def _cost(problem: "FitProblem", y: jax.Array) -> jax.Array:
+    """`|r|^2 / 2` at the nearest point in the bounds, for line searches.
+
+    Its derivative is taken from the Jacobian that `evaluate` gives.
+    """
 
     @jax.custom_jvp
     def cost(y: jax.Array) -> jax.Array:
         """Half the sum of squares."""
-        return 0.5 * jnp.sum(evaluate(y)[0] ** 2)
+        return 0.5 * jnp.sum(problem.evaluate(y)[0] ** 2)
 
     @cost.defjvp
     def _rule(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
         """The derivative by the Jacobian."""
-        residual, jacobian, _ = evaluate(primals[0])
+        residual, jacobian, _ = problem.evaluate(primals[0])
         return 0.5 * jnp.sum(residual**2), (jacobian.T @ residual) @ tangents[0]
 
-    return cost(y)
+    return cost(jnp.clip(y, problem.low, problem.high))
 
 
 def _transformation(method: Method, max_steps: int) -> "optax.GradientTransformationExtraArgs":
@@ -324,24 +314,33 @@ def minimize(
     stop: float = 0.0,
     rivals: bool = False,
     what: str = "fits",
+    fixed: np.ndarray | None = None,
 ) -> Ends:
-    """Minima of S problems (`FitProblem.program` with a leading axis) from y (S, Q).
+    """Minima of S problems (`stacked`) from y (S, Q).
 
     As many as `problems.lanes(S)` are solved side by side; those that are done make room for
     others. `stop`: see `FINE`, which it is at least. `rivals`: all are starts of one problem, and
-    those that creep or will not become the best are given up. Progress counts `what`. A matrix that
-    must be admissible is sought without that, and then the best admissible one.
+    those that creep or will not become the best are given up. Progress counts `what`. `fixed`
+    (S, Q): which entries of y stay as they are. A matrix that must be admissible is sought without
+    that, and then the best admissible one.
     """
-    dtype, matrix = problems.low.dtype, problems.matrix
+    points = points.astype(problems.low.dtype)
+    dtype, matrix = str(points.dtype), problems.matrix
+    if fixed is not None:
+        low, high = (np.where(fixed, points, end) for end in (problems.low, problems.high))
+        problems, matrix = replace(problems, low=low, high=high), None
     problems = replace(problems, matrix=None)
-    rule = (max(FINE[str(dtype)], stop), rivals, what)
-    states, converged = _descended(problems, points.astype(dtype), search, *rule)
+    rule = (max(FINE[dtype], stop), rivals, what)
+    states, converged = _descended(problems, points, search, *rule)
     y, steps, stuck = np.asarray(states.y), states.steps, states.stuck
     once, moved = search._replace(max_steps=1), np.full(len(y), matrix is not None)
     for _ in range(SETTLING):
         if not moved.any():
             break
-        inside = _in_lanes(best_inside, problems.lanes(len(y)), matrix, states)
+        inside = np.empty_like(y)
+        every = np.arange(len(y)), problems.lanes(len(y))
+        for rows, nearest in _in_lanes(best_inside, *every, matrix, states):
+            inside[rows] = nearest
         states, _ = _descended(problems, inside, once, *rule)
         moved, y = np.abs(inside - y).max(axis=1) > SETTLED, inside
     size = np.asarray(problems.size, float)
@@ -355,16 +354,18 @@ def minimize(
         converged=converged & ~moved,
         stuck=np.asarray(stuck),
         steps=np.asarray(steps),
-        exact=EXACT[str(dtype)] * size**2,
+        exact=EXACT[dtype] * size**2,
     )
 
 
-def _in_lanes(compiled: Callable[..., Any], lanes: int, *trees: Any) -> np.ndarray:
-    """Rows of the results of a compiled function of so many rows."""
-    count = len(jax.tree.leaves(trees[-1])[0])
-    some = [np.arange(first, first + lanes) for first in range(0, count, lanes)]
-    rows = [np.minimum(each, count - 1) for each in some]
-    return np.concatenate([compiled(*(_rows(x, each) for x in trees)) for each in rows])[:count]
+def _in_lanes(
+    compiled: Callable[..., Any], which: np.ndarray, lanes: int, *trees: Any
+) -> Iterator[tuple[np.ndarray, Any]]:
+    """Which rows of the trees, so many side by side, and what a compiled function makes of them."""
+    for first in range(0, len(which), lanes):
+        rows = which[np.minimum(np.arange(first, first + lanes), len(which) - 1)]
+        pick = partial(jax.tree.map, lambda x, rows=rows: x[rows] if eqx.is_array(x) else x)
+        yield rows, compiled(*map(pick, trees))
 
 
 @quick_jit
@@ -390,14 +391,17 @@ def _descended(
     if not descends:
         limit = np.asarray(limit)  # one program serves all limits
     rule: Any = (search.method, limit, np.asarray(stop, dtype))
-    states = begin(points, problems.blank(points), search)
+    states = begin(problems, points, search)
+
+    def advance(problems: Any, states: SolverState) -> SolverState:
+        """Some of them."""
+        return advance_all(problems, states, *rule)
+
     converged = np.zeros(count, bool)
     active, lanes = np.arange(count), problems.lanes(count)
     while len(active):
         before = states.cost.copy()
-        for first in range(0, len(active), lanes):
-            rows = active[np.minimum(np.arange(first, first + lanes), len(active) - 1)]
-            some = advance_all(_rows(problems, rows), _rows(states, rows), *rule)
+        for rows, some in _in_lanes(advance, active, lanes, problems, states):
             for leaf, value in zip(jax.tree.leaves(states), jax.tree.leaves(some)):
                 leaf[rows] = value
         converged = _converged(states, DESCENDED if descends else CONVERGED)
@@ -422,50 +426,17 @@ def _converged(states: SolverState, enough: float) -> np.ndarray:
     return small | (squares <= EXACT[str(states.y.dtype)]) | states.stuck
 
 
-@quick_jit
-def advance_all(
-    problems: Any, states: SolverState, method: Method, max_steps: int, stop: jax.Array
-) -> SolverState:
-    """Up to `PASSES` passes more of every problem."""
-
-    def one(problem: Any, state: SolverState) -> SolverState:
-        """One problem."""
-        box = Box(problem.low, problem.high)
-        return advance(problem.evaluate, box, method, max_steps, state, PASSES, stop)
-
-    return eqx.filter_vmap(one)(problems, states)
-
-
-def _rows(tree: Any, rows: np.ndarray) -> Any:
-    """These rows of all arrays."""
-    return jax.tree.map(lambda leaf: leaf[rows] if eqx.is_array(leaf) else leaf, tree)
-
-
-def repeated(problem: "FitProblem", count: int) -> Any:
-    """So many times the same problem, without copies."""
-
-    def each(leaf: Any) -> Any:
-        """The array without copies."""
-        return np.broadcast_to(leaf, (count, *np.shape(leaf))) if eqx.is_array(leaf) else leaf
-
-    return jax.tree.map(each, problem.program())
-
-
-def stacked(problems: "list[FitProblem]", each: int = 1) -> Any:
-    """The problems side by side, each so many times."""
+def stacked(problems: "Sequence[FitProblem]", each: int = 1) -> Any:
+    """The problems as compiled functions take them, side by side, each so many times."""
     filled = [problem.program() for problem in problems]
-    many = jax.tree.map(lambda *x: np.stack([np.asarray(leaf) for leaf in x]), *filled)
-    return many if each == 1 else jax.tree.map(lambda x: np.repeat(x, each, axis=0), many)
 
+    def side_by_side(*leaves: Any) -> Any:
+        """Arrays with a leading axis; what is no array is the same for all."""
+        if not eqx.is_array(leaves[0]):
+            return leaves[0]
+        return np.repeat(np.stack([np.asarray(leaf) for leaf in leaves]), each, axis=0)
 
-def minimize_with(
-    many: Any, points: np.ndarray, fixed: np.ndarray, search: Search, stop: float = 0.0
-) -> Ends:
-    """Minima of S problems from y (S, Q) with the `fixed` (S, Q) entries of y as they are."""
-    points = points.astype(many.low.dtype)
-    low, high = (np.where(fixed, points, end) for end in (many.low, many.high))
-    many = replace(many, low=low, high=high, matrix=None)
-    return minimize(many, points, search, stop, what="fixed values")
+    return jax.tree.map(side_by_side, *filled)
 
 
 # ---------------------------------------------------------------------------- distinct minima
@@ -561,11 +532,11 @@ def find_minima(problem: "FitProblem", starts: int | None, seed: int, search: Se
 
     def rough(points: np.ndarray) -> Ends:
         """To where minima can be told apart."""
-        many = repeated(problem, len(points))
+        many = stacked([problem], len(points))
         return minimize(many, points, search, COARSE, rivals=True, what="starts")
 
     if starts == 1:
-        return solution(problem, minimize(repeated(problem, 1), points, search, what="starts"))
+        return solution(problem, minimize(stacked([problem]), points, search, what="starts"))
     if rounds > 1:
         points = np.concatenate([points, _scanned(problem)])
     ends = rough(points)
@@ -583,7 +554,7 @@ def find_minima(problem: "FitProblem", starts: int | None, seed: int, search: Se
     near = ends.squares[firsts] <= ends.squares[firsts[0]] + HARDLY_WORSE * variance
     near &= converged[firsts]
     points = ends.y[firsts[near]]
-    fine = minimize(repeated(problem, len(points)), points, search, what="minima")
+    fine = minimize(stacked([problem], len(points)), points, search, what="minima")
     search.show(f"fit: {total} of {total} starts done", total, total)
     steps = ends.steps.max() + fine.steps.max()
     others = converged[firsts] & ~near
@@ -679,16 +650,15 @@ def settled(
     Errors of v- are passed on by the law of each problem's best minimum, until both agree.
     """
     each, start = len(points) // len(problems), points
-    for _ in range(SETTLING):
+    for turn in range(SETTLING):
         ends = minimize(stacked(problems, each), start, search)
+        moved = np.abs(ends.y - start).max(axis=1) > SETTLED
         if ends.slopes is None:
             return problems, ends
+        start = ends.y
         best = np.nanargmin(ends.squares.reshape(-1, each), axis=1)
         slopes = ends.slopes[np.arange(0, len(points), each) + best]
         problems = [p.with_errors_before(slope) for p, slope in zip(problems, slopes)]
-        moved = np.abs(ends.y - start).max(axis=1) > SETTLED
-        start = ends.y
-        if not moved.any():  # residuals and Jacobians with the weights of the final law
-            last = search._replace(max_steps=1)
-            return problems, minimize(stacked(problems, each), start, last)
+        if turn and not moved.any():
+            return problems, ends
     return problems, ends._replace(converged=ends.converged & ~moved)

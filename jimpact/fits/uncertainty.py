@@ -20,7 +20,7 @@ from jimpact.fits.parameters import (
     value_of,
 )
 from jimpact.fits.problem import FitProblem
-from jimpact.fits.solve import FitMinimum, Search, minimize_with, repeated, solution
+from jimpact.fits.solve import FitMinimum, Search, minimize, solution, stacked
 from jimpact.law import Law, parameters_of
 from jimpact.scene import Scene
 
@@ -412,7 +412,7 @@ class FitResult(Generic[AnyLaw]):
         ties = dict(self.problem.ties)
         problem = FitProblem.from_shots(law, own, data, self.problem.parameters.labels, ties=ties)
         point, every = problem.point(problem.start)[None], np.ones((1, len(problem.low)), bool)
-        ends = minimize_with(repeated(problem, 1), point, every, Search(max_steps=1))
+        ends = minimize(stacked([problem]), point, Search(max_steps=1), fixed=every)
         there = solution(problem, ends)
         slope = there.jacobian.reshape((*problem.measured.shape, len(problem.names)))
         error = self.errors_of(problem.errors_of(slope / problem.steps_at(problem.start)))
