@@ -342,22 +342,20 @@ class Weighted(NamedTuple):
 
 def weighted(problem: FitProblem, solution: Solution) -> Weighted:
     """Residuals and derivatives as the tests need them."""
-    here = ~np.isnan(problem.measured)
-    residual, slope = problem.prior_errors(solution.value)
-    errors = problem.independent(problem.measured - solution.predicted)[here]
-    of_priors = slope * problem.steps_at(solution.value)
-    return Weighted(
-        np.append(errors, residual),
-        np.vstack([solution.jacobian[here.ravel()], of_priors]),
-        np.append(problem.shot_of_value, np.full(len(residual), NO_SHOT)),
-    )
+    minimum, here = solution.minima[0], ~np.isnan(problem.measured).ravel()
+    shot = np.append(problem.shot_of_value, np.full(len(problem.priors), NO_SHOT))
+    used = np.append(here, np.ones(len(problem.priors), bool))
+    # where the law fails, what a search takes for the residual is no error
+    errors = problem.independent(problem.measured - solution.predicted)
+    residual = np.append(errors, -minimum.residual[errors.size :])
+    return Weighted(residual[used], minimum.jacobian[used], shot)
 
 
 def unusable(problem: FitProblem, solution: Solution) -> np.ndarray:
     """Shots (K,) whose impacts fail, or whose derivatives are not finite or absurdly large."""
     if not isinstance(problem.observe, Shots):
         return np.zeros(1, bool)
-    slope = np.abs(solution.jacobian.reshape(*problem.measured.shape, -1))
+    slope = np.abs(problem.of_data(solution.jacobian))
     allowed = ABSURD * float(problem.unit) * np.asarray(problem.weight, float)[..., None]
     fails = [STATUS[code].name in UNUSABLE for code in solution.status]
     used = ~np.isnan(problem.measured).all(axis=1)

@@ -235,9 +235,9 @@ def as_fit(
     findings = fit_warnings(judged, found, errors, robust is not None)
     numbers = errors._asdict()
     undetermined = numbers.pop("undetermined")
-    slope = found.jacobian.reshape((*residual.shape, len(problem.names)))
+    slope = problem.of_data(found.jacobian)
     starts = [
-        replace(x, standard_error=_standard_error(problem, found, x, errors), jacobian=None)
+        FitMinimum(x.sum_of_squares, x.value, x.count, _standard_error(problem, found, x, errors))
         for x in found.minima
     ]
     return Fit(
@@ -334,11 +334,12 @@ def _robust(
     psi = (share * error / scale)[here]
     noise = scale * np.sqrt(np.sum(psi**2)) / max(slope[here].mean(), SAME)
     # weighted as in the problem, without the factors of the loss
+    minimum, size = found.minima[0], factor.size
     residual = problem.independent(problem.measured - found.predicted)
-    from_priors, _ = problem.prior_errors(found.value)
-    squares = float(np.sum(residual**2) + np.sum(from_priors**2))
-    slope = found.jacobian / factor.reshape(-1, 1)
-    minimum = FitMinimum(squares, found.value, 1, jacobian=slope)
+    residual = np.append(-residual, minimum.residual[size:])
+    slope = minimum.jacobian / np.append(factor, np.ones(len(residual) - size))[:, None]
+    squares = float(np.sum(residual**2))
+    minimum = FitMinimum(squares, found.value, 1, None, slope, residual)
     return problem, found._replace(minima=[minimum]), float(noise)
 
 

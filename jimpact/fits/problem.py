@@ -583,11 +583,10 @@ class FitProblem:
         rows = self.measured.shape[0] if self.measured.ndim else 1
         return getattr(self.observe, "labels", None) or tuple(str(k + 1) for k in range(rows))
 
-    def prior_errors(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Of each prior: its mean less x (P,), and the derivatives of x (., P), over its std."""
-        means, stds = (np.array([p[k] for p in self.priors], float) for k in (1, 2))
-        which = np.array([p.parameter for p in self.priors], int)
-        return (means - x[which]) / stds, np.eye(len(self.names))[which] / stds[:, None]
+    def of_data(self, rows: np.ndarray) -> np.ndarray:
+        """Those of rows (R, ...), as of a residual, that are of what was measured, in its shape."""
+        count = self.measured.size
+        return rows[:count].reshape((*self.measured.shape, *rows.shape[1:]))
 
     def independent(self, errors: np.ndarray) -> np.ndarray:
         """Errors of what was measured, in units of sigma and as independent ones.

@@ -293,6 +293,7 @@ class Ends(NamedTuple):
 
     y: np.ndarray  # (S, Q)
     squares: np.ndarray  # (S,) |r|^2
+    residual: np.ndarray  # (S, R)
     jacobian: np.ndarray  # (S, R, Q)
     predicted: np.ndarray
     status: np.ndarray
@@ -347,6 +348,7 @@ def minimize(
     return Ends(
         y=np.asarray(states.y, float),
         squares=2 * np.asarray(states.cost, float) * size**2,
+        residual=np.asarray(states.residual, float) * size[:, None],
         jacobian=np.asarray(states.jacobian, float) * size[:, None, None],
         predicted=np.asarray(states.aux[0], float),
         status=states.aux[1],
@@ -447,14 +449,16 @@ class FitMinimum:
     """A minimum that starts ended in: sum of squared (weighted) residuals, values, how many.
 
     `standard_error` is None where it fits so much worse that it does not matter. A search knows the
-    `jacobian` (R, P) of the scaled parameters.
+    `residual` (R,) of what was measured, then that of the priors, and its `jacobian` (R, P) in the
+    scaled parameters.
     """
 
     sum_of_squares: float
     value: np.ndarray
     count: int
     standard_error: np.ndarray | None = None
-    jacobian: np.ndarray | None = None
+    jacobian: np.ndarray = None  # type: ignore[assignment]  # of a result: what a search knows
+    residual: np.ndarray = None  # type: ignore[assignment]
 
 
 class Solution(NamedTuple):
@@ -478,9 +482,7 @@ class Solution(NamedTuple):
     @property
     def jacobian(self) -> np.ndarray:
         """(R, P), of the scaled parameters at the best."""
-        jacobian = self.minima[0].jacobian
-        assert jacobian is not None
-        return jacobian
+        return self.minima[0].jacobian
 
 
 def solution(
@@ -490,6 +492,9 @@ def solution(
     counts = np.ones(len(ends.y), int) if counts is None else counts
     count, measured = len(problem.names), problem.measured
     groups = _groups(ends, count)
+    # without what filled up, and parameters that have no prior
+    first_prior = ends.residual.shape[1] - len(problem.low)
+    own = [*range(measured.size), *(first_prior + prior.parameter for prior in problem.priors)]
     best, y = groups[0][0], ends.y[:, :count]
     # starts that did not converge have no minimum to report, unless they are the best there is
     kept = [[i for i in group if ends.converged[i] or i == best] for group in groups]
@@ -498,7 +503,9 @@ def solution(
             float(ends.squares[group[0]]),
             problem.values_at(ends.y[group[0]]),
             int(counts[group].sum()),
-            jacobian=ends.jacobian[group[0]][: measured.size, :count],  # without what filled up
+            None,
+            ends.jacobian[group[0]][own, :count],
+            ends.residual[group[0]][own],
         )
         for group in kept
         if group

@@ -73,10 +73,7 @@ def uncertainty(
         noise: s; None: as stated, or from |r|^2.
     """
     scale = problem.steps_at(minimum.value)
-    _, of_priors = problem.prior_errors(minimum.value)
-    assert minimum.jacobian is not None
-    jacobian = np.vstack([minimum.jacobian, of_priors * scale])
-    _, singular, directions = np.linalg.svd(jacobian, full_matrices=True)
+    _, singular, directions = np.linalg.svd(minimum.jacobian, full_matrices=True)
     singular = np.pad(singular, (0, len(scale) - len(singular)))
     rank = int(np.sum(singular > RANK_TOLERANCE[problem.precision] * singular[0]))
     freedom = problem.values - rank
@@ -414,7 +411,7 @@ class FitResult(Generic[AnyLaw]):
         point, every = problem.point(problem.start)[None], np.ones((1, len(problem.low)), bool)
         ends = minimize(stacked([problem]), point, Search(max_steps=1), fixed=every)
         there = solution(problem, ends)
-        slope = there.jacobian.reshape((*problem.measured.shape, len(problem.names)))
+        slope = problem.of_data(there.jacobian)
         error = self.errors_of(problem.errors_of(slope / problem.steps_at(problem.start)))
         value, noise = there.predicted, self._noise_of(shots)
         half = quantile * np.hypot(error, noise)
