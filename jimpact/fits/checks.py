@@ -18,7 +18,7 @@ from jimpact.fits.data import Experiments, closed_normals, kept_by_corrections
 from jimpact.fits.matrices import boundary, encloses
 from jimpact.fits.problem import UNUSABLE, FitProblem, Shots
 from jimpact.fits.solve import Solution
-from jimpact.fits.uncertainty import Uncertainty, reproduced
+from jimpact.fits.uncertainty import Uncertainty
 from jimpact.laws.kinematic import RestitutionMatrix
 from jimpact.scene import Scene, dense_mass
 from jimpact.status import STATUS
@@ -673,7 +673,8 @@ def _equally_good(judged: _Judged) -> Iterable[dict[str, Any]]:
 def _noise_hidden(judged: _Judged) -> bool:
     """Whether a fit without sigma reproduces its data."""
     problem = judged.problem
-    return problem.sigma is None and reproduced(problem, judged.solution.minima[0])
+    squares = judged.solution.minima[0].sum_of_squares
+    return problem.sigma is None and squares <= problem.exact_squares
 
 
 def _when(condition: Callable[[_Judged], Any]) -> Callable[[_Judged], Iterable[dict[str, Any]]]:

@@ -14,7 +14,7 @@ from jimpact.fits.checks import MEDIAN, fit_warnings, stretch, unusable, weighte
 from jimpact.fits.data import Experiments
 from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw, plain_law
 from jimpact.fits.problem import FitProblem, filled_count, of_shots
-from jimpact.fits.profiles import needs_profiles, profile, profiles_of
+from jimpact.fits.profiles import LEVEL, PROFILE_STARTS, needs_profiles, profiles_of
 from jimpact.fits.report import Fit
 from jimpact.fits.solve import (
     DEFAULT_STEPS,
@@ -42,7 +42,6 @@ from jimpact.fits.uncertainty import (
 from jimpact.progress import progress_bar
 from jimpact.scene import Scene
 
-QUICK_LEVEL = 0.95  # of the profiles that `fit` computes by default
 HUBER = 1.345  # sigmas up to which a residual counts squared: 95 % of the efficiency
 STUDENT = 4.0  # degrees of freedom of the tails
 ROUNDS = 50  # of weights
@@ -168,11 +167,10 @@ def fit(
         if loss != "squares":
             problem, found, robust = _robust(problem, found, loss, search)
     result = replace(as_fit(problem, found, method, robust), loss=loss, seed=seed)
-    if profiles:
-        return _with_profiles(result, profile(result, progress=progress))
-    if profiles is None and needs_profiles(result):
+    if profiles or (profiles is None and needs_profiles(result)):
+        more = PROFILE_STARTS if profiles else 0
         every = range(len(result.names))
-        return _with_profiles(result, profiles_of(result, every, QUICK_LEVEL, 0, progress))
+        return _with_profiles(result, profiles_of(result, every, LEVEL, more, progress))
     return result
 
 
@@ -202,7 +200,7 @@ def _check_derivatives(problem: FitProblem, solution: Solution) -> None:
         )
 
 
-def _rms(problem: FitProblem, residual: np.ndarray) -> float:
+def rms(problem: FitProblem, residual: np.ndarray) -> float:
     """The root mean square of residuals, those in rad/s by kinetic energy [m/s]."""
     data = problem.experiments
     natural_error = 1.0 if data is None else data.natural_errors(problem.scene)
@@ -249,7 +247,7 @@ def as_fit(
         at_bound=found.at_bound,
         predicted=found.predicted,
         residual=residual,
-        rms=_rms(problem, residual),
+        rms=rms(problem, residual),
         **numbers,
         identifiability=(*problem.notes, *undetermined),
         starts=tuple(starts),

@@ -120,11 +120,6 @@ class Parameters:
         return tuple(self.labels)
 
     @property
-    def count(self) -> int:
-        """Number of entries Q."""
-        return sum(label.size for label in self.labels.values())
-
-    @property
     def first(self) -> list[int]:
         """The first entry of every group: it stands for the parameter."""
         return [group[0] for group in self.groups]

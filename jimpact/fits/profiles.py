@@ -43,6 +43,7 @@ ROUNDS = 8  # of the search for an end: it is then right to a millionth of a ste
 # Shots up to which `fit` profiles of itself, with one start and with several: as long as half of
 # the fit. Parameters: with four of LZB it takes longer than the search.
 FEW_SHOTS, MANY_SHOTS, MOST_PARAMETERS = 64, 256, 3
+LEVEL, PROFILE_STARTS = 0.95, 17  # by default
 _BEYOND = 1.3  # how far a contour's picture goes, in half-widths of the region of a parabola
 _FROM_BEST = -1  # the branch of what was searched from the best minimum
 
@@ -177,8 +178,8 @@ def profile(
     fit: FitResult,
     names: str | Iterable[str] | None = None,
     *,
-    level: float = 0.95,
-    points: int = 17,
+    level: float = LEVEL,
+    points: int = PROFILE_STARTS,
     progress: float | None = None,
 ) -> tuple[Profile, ...]:
     """Profile likelihoods of parameters: intervals without the assumption of a parabola.
@@ -396,7 +397,7 @@ def contour(
     first: str,
     second: str,
     *,
-    level: float = 0.95,
+    level: float = LEVEL,
     points: int = 21,
     progress: float | None = None,
 ) -> Contour:

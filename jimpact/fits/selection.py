@@ -11,7 +11,7 @@ from scipy.special import chdtrc, fdtrc, stdtr
 from jimpact._checks import check_choice, check_kind
 from jimpact.files.records import Column, Table, Tabular, as_data
 from jimpact.fits.data import Experiments
-from jimpact.fits.fitting import Fit, fit, leave_one_out
+from jimpact.fits.fitting import Fit, fit, leave_one_out, rms
 from jimpact.fits.matrices import admissible_start
 from jimpact.fits.parameters import OF_SPEED, default_free
 from jimpact.fits.problem import FEW
@@ -415,7 +415,7 @@ def _judged(fits: dict[str, Fit]) -> dict[str, LawFit]:
         if tier != "fails" and chance < level:
             worse = f"{worse} than {best} (p-value {chance:.1g})"
             tier, verdict = "worse", f"{verdict}, {worse}" if tier != "fits" else worse
-        error = _left_out_rms(each, errors[name])
+        error = rms(each.problem, errors[name])
         entries.append(LawFit(name, each, error, _aicc(each), verdict, tier))
     return {x.name: x for x in sorted(entries, key=_order)}
 
@@ -510,15 +510,6 @@ def _by_residuals(result: Fit, best: Fit) -> float:
     gain = result.starts[0].sum_of_squares - best.starts[0].sum_of_squares
     more = max(best.rank - result.rank, 1)
     return _f_test(gain, more, best)[-1] if gain > 0 else 1.0
-
-
-def _left_out_rms(result: Fit, error: np.ndarray) -> float:
-    """Root mean square error of shots left out [m/s]."""
-    data = result.problem.experiments
-    assert data is not None
-    if np.isnan(error).all():
-        return np.nan
-    return float(np.sqrt(np.nanmean((error / data.natural_errors(result.problem.scene)) ** 2)))
 
 
 def _aicc(result: Fit) -> float:

@@ -553,22 +553,17 @@ def find_minima(problem: "FitProblem", starts: int | None, seed: int, search: Se
         ends = jax.tree.map(lambda a, b: np.concatenate([a, b]), ends, more)
         if not np.nanmin(more.squares) < least * (1 - 1 / ends.jacobian.shape[1]):
             break
-    groups, total = _groups(ends, len(problem.names)), len(ends.y)
-    firsts = np.array([group[0] for group in groups])
-    converged = ends.converged | (np.arange(total) == firsts[0])
-    counts = np.array([converged[group].sum() for group in groups])
-    variance = ends.squares[firsts[0]] / ends.jacobian.shape[1]
-    near = ends.squares[firsts] <= ends.squares[firsts[0]] + HARDLY_WORSE * variance
-    near &= converged[firsts]
-    points = ends.y[firsts[near]]
-    fine = minimize(stacked([problem], len(points)), points, search, what="minima")
+    firsts = np.array([group[0] for group in _groups(ends, len(problem.names))])
+    best, variance = firsts[0], ends.squares[firsts[0]] / ends.jacobian.shape[1]
+    near = ends.squares[firsts] <= ends.squares[best] + HARDLY_WORSE * variance
+    near = firsts[near & (ends.converged[firsts] | (firsts == best))]
+    fine = minimize(stacked([problem], len(near)), ends.y[near], search, what="minima")
+    fine = fine._replace(steps=fine.steps + ends.steps[near])
+    for leaf, value in zip(jax.tree.leaves(ends), jax.tree.leaves(fine)):
+        leaf[near] = value
+    total = len(ends.y)
     search.show(f"fit: {total} of {total} starts done", total, total)
-    steps = ends.steps.max() + fine.steps.max()
-    others = converged[firsts] & ~near
-    ends = jax.tree.map(lambda a, b: np.concatenate([b, a[firsts[others]]]), ends, fine)
-    counts = np.concatenate([counts[near], counts[others]])
-    lost = total - int(counts.sum())
-    return solution(problem, ends, counts, lost)._replace(steps=int(steps))
+    return solution(problem, ends)
 
 
 def start_points(problem: "FitProblem", starts: int, rng: np.random.Generator) -> np.ndarray:

@@ -79,7 +79,7 @@ def uncertainty(
     freedom = problem.values - rank
     if noise is None and problem.sigma is not None:
         noise = 1.0
-    elif noise is None and (freedom < 1 or reproduced(problem, minimum)):
+    elif noise is None and (freedom < 1 or minimum.sum_of_squares <= problem.exact_squares):
         noise = np.nan
     elif noise is None:
         noise = float(np.sqrt(minimum.sum_of_squares / freedom))
@@ -95,11 +95,6 @@ def uncertainty(
     np.fill_diagonal(correlation, 1.0)
     words = tuple(_in_words(problem, row, scale) for row in _reduced(null))
     return Uncertainty(rank, singular, freedom, noise, covariance, correlation, error, words)
-
-
-def reproduced(problem: FitProblem, minimum: FitMinimum) -> bool:
-    """Whether all measured values are reproduced to the last digit."""
-    return minimum.sum_of_squares <= problem.exact_squares
 
 
 def _reduced(null: np.ndarray) -> np.ndarray:
