@@ -15,7 +15,6 @@ from jimpact.fits.data import Experiments
 from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw, plain_law
 from jimpact.fits.problem import FitProblem, filled_count, of_shots
 from jimpact.fits.profiles import LEVEL, PROFILE_STARTS, needs_profiles, profiles_of
-from jimpact.fits.report import Fit
 from jimpact.fits.solve import (
     DEFAULT_STEPS,
     HARDLY_WORSE,
@@ -33,6 +32,7 @@ from jimpact.fits.solve import (
     start_points,
 )
 from jimpact.fits.uncertainty import (
+    Fit,
     Profile,
     Uncertainty,
     check_level,

@@ -77,12 +77,6 @@ class AdmissibleMatrices(eqx.Module):
             slack += [y - self.bounds[0], self.bounds[1] - y]
         return jnp.where(self.moving, jnp.concatenate(slack), 1.0)
 
-    def lost_energy(self, y: jax.Array, x: jax.Array) -> jax.Array:
-        """`x^T (G^-1 - E^T G^-1 E) x`, twice the energy lost at `qn- = -x` (S, F)."""
-        e, inverse = self.matrices(y), self.inverse
-        after = jnp.einsum("sij,sfj->sfi", e, x)
-        return _square(inverse, x) - _square(inverse, after)
-
     def worst(self, y: jax.Array) -> jax.Array:
         """Approaches x >= 0 (S, F, m) among which each face has that of the least lost energy.
 
@@ -106,16 +100,6 @@ class AdmissibleMatrices(eqx.Module):
         """`Q = G^-1 - E^T G^-1 E` (S, m, m)."""
         e = self.matrices(y)
         return self.inverse - jnp.swapaxes(e, 1, 2) @ self.inverse @ e
-
-    def retract(self, y: jax.Array) -> jax.Array:
-        """y, or the last admissible point on the way to it from the center.
-
-        Differentiated (in line searches) as if the share of the way stayed the same.
-        """
-        share = self.share(jax.lax.stop_gradient(y))
-        short = 1 - _SHORT * jnp.finfo(y.dtype).eps
-        inside = self.center + short * share * (y - self.center)
-        return jnp.where(share < 1, inside, y)
 
     @full_precision
     def nearest(self, y: jax.Array, hessian: jax.Array, gradient: jax.Array) -> jax.Array:
@@ -151,7 +135,10 @@ class AdmissibleMatrices(eqx.Module):
         none = jnp.ones(size, dtype), jnp.zeros((size, size), dtype)
         start = (y, none, jnp.asarray(True), jnp.asarray(0))
         end = jax.lax.while_loop(lambda s: s[2] & (s[3] < _CUTS), closer, start)
-        return self.retract(end[0])
+        # cutting planes leave rounding
+        share = self.share(end[0])
+        inside = self.center + (1 - _SHORT * jnp.finfo(dtype).eps) * share * (end[0] - self.center)
+        return jnp.where(share < 1, inside, end[0])
 
     def share(self, y: jax.Array) -> jax.Array:
         """How much of the way from the center to y is admissible, at most 1."""
@@ -184,11 +171,13 @@ class AdmissibleMatrices(eqx.Module):
 
     def conditions(self, y: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Slacks (C,), >= 0 but for rounding, of all conditions, and their derivatives (C, Q)."""
-        x = self.worst(y)
+        x = self.worst(y)  # at qn- = -x the energy lost is x^T Q x / 2
 
         def slacks(y: jax.Array) -> tuple[jax.Array, jax.Array]:
             """Slacks, to be differentiated, and once more as they are."""
-            value = jnp.concatenate([self.elementwise(y), self.lost_energy(y, x).reshape(-1)])
+            value = jnp.concatenate(
+                [self.elementwise(y), _square(self._dissipation(y), x).reshape(-1)]
+            )
             return value, value
 
         rows, slack = jax.jacfwd(slacks, has_aux=True)(y)
@@ -211,22 +200,28 @@ def _quadratic(
     return free + response @ dual.z, dual.z * scale, dual.code == CODE["ok"]
 
 
-def _square(inverse: jax.Array, x: jax.Array) -> jax.Array:
-    """`x^T G^-1 x` of x (S, F, m)."""
-    return jnp.einsum("sfi,sij,sfj->sf", x, inverse, x)
+def _square(a: jax.Array, x: jax.Array) -> jax.Array:
+    """`x^T A x` of x (S, F, m)."""
+    return jnp.einsum("sfi,sij,sfj->sf", x, a, x)
 
 
 def matrix_region(
-    law: Law, scenes: list[Scene], origin: np.ndarray, mix: np.ndarray, bounds: np.ndarray
+    law: Law,
+    scenes: list[Scene],
+    origin: np.ndarray,
+    mix: np.ndarray,
+    bounds: np.ndarray,
+    start: np.ndarray,
 ) -> AdmissibleMatrices | None:
     """The region of a fit of an (m, m) `RestitutionMatrix`; None for other laws and forms.
 
     Args:
-        law: holds the start matrix.
+        law: whose matrix it is.
         scenes: of the shots; E must be admissible in each.
         origin: (Q,) entries of E where y = 0.
         mix: (Q, Q) derivatives of the entries with respect to y.
         bounds: (2, Q) of y.
+        start: y (Q,) of the law itself.
 
     Raises:
         ValueError: redundant contacts, too many contacts, a start that is not admissible, fixed
@@ -238,13 +233,12 @@ def matrix_region(
     dtype = law.matrix.dtype
     used = np.any(mix != 0, axis=0)
     ends = bounds if np.isfinite(bounds[:, used]).any() else None
-    start = jnp.asarray(_start(law.matrix, origin, mix), dtype)
     region = _region(scenes, dtype, origin, mix, ends, start)
     slack, rows = _host_conditions(region, start)
     _check_start(region, slack)
     moving = np.any(rows[:, used] != 0, axis=1) & np.isfinite(slack)
     region = eqx.tree_at(lambda r: r.moving, region, jnp.asarray(moving[: len(region.moving)]))
-    center = _inner_point(region, np.asarray(start, float))
+    center = _inner_point(region, start)
     if center is None:
         raise ValueError(
             "Argument `free` must leave an admissible choice: with the fixed entries every "
@@ -331,12 +325,6 @@ def _inverse(scene: Scene) -> np.ndarray:
             "RestitutionMatrix(matrix, admissible=False) is fitted without that."
         )
     return np.vstack([np.linalg.inv(g), np.asarray(scene.closed, g.dtype)])
-
-
-def _start(entries: Any, origin: Any, mix: Any) -> np.ndarray:
-    """y of these entries of E (0 for what is not free)."""
-    rest = np.ravel(np.asarray(entries, float)) - np.asarray(origin, float)
-    return np.asarray(np.linalg.lstsq(np.asarray(mix, float), rest, rcond=None)[0])
 
 
 @quick_jit

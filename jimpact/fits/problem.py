@@ -698,7 +698,13 @@ def _build(
     owner, ends = arrays["owner"], np.stack([arrays["low"], arrays["high"]])
     moves = np.where(owner[:, None] == np.arange(len(owner)), arrays["scale"], 0.0)
     origin = np.where(owner < 0, arrays["fixed"], 0.0)
-    matrix = matrix_region(law, scenes or [], origin, moves, ends)
+    start = np.zeros(len(owner))
+    start[: len(parameters.names)] = scaled(
+        entries(law, parameters.fields)[parameters.first],
+        arrays["scale"][: len(parameters.names)],
+        parameters.log,
+    )
+    matrix = matrix_region(law, scenes or [], origin, moves, ends, start)
     if matrix is not None and any(entry_of(name)[0] == "matrix" for name, _ in ties):
         raise ValueError("Argument `ties` must not tie a `matrix` that has to stay admissible.")
     return FitProblem(

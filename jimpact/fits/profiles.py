@@ -26,7 +26,7 @@ from jimpact.fits.solve import (
     solution,
     stacked,
 )
-from jimpact.fits.uncertainty import FitResult, Profile, check_level
+from jimpact.fits.uncertainty import Fit, Profile, check_level
 from jimpact.progress import Show, progress_bar
 
 # Deviances are right to this (see `solve.FINE`): the ends of an interval move by less than END. A
@@ -83,7 +83,7 @@ class Grid(NamedTuple):
 class Deviances:
     """Sums of squares of a fit with some of its parameters fixed, in the solver's scale."""
 
-    def __init__(self, fit: FitResult, show: Show):
+    def __init__(self, fit: Fit, show: Show):
         self.fit, self.problem, self.show = fit, fit.problem, show
         # if the noise is undetermined, that of an exact fit up to rounding
         known = np.isfinite(fit.noise) and fit.noise > 0
@@ -162,9 +162,9 @@ class Deviances:
         return known
 
 
-def _check_profiled(fit: FitResult) -> None:
+def _check_profiled(fit: Fit) -> None:
     """Raise an error unless this is a fit, of parameters that can be fixed."""
-    check_kind("fit", fit, FitResult)
+    check_kind("fit", fit, Fit)
     if not fit.can_be_profiled:
         raise ValueError(
             "Argument `fit` must be by least squares, and not of a matrix that must be admissible."
@@ -175,7 +175,7 @@ def _check_profiled(fit: FitResult) -> None:
 
 
 def profile(
-    fit: FitResult,
+    fit: Fit,
     names: str | Iterable[str] | None = None,
     *,
     level: float = LEVEL,
@@ -223,7 +223,7 @@ def profile(
 
 
 def profiles_of(
-    fit: FitResult, which: Sequence[int], level: float, points: int, progress: float | None
+    fit: Fit, which: Sequence[int], level: float, points: int, progress: float | None
 ) -> tuple[Profile, ...]:
     """Profiles of these parameters; points: starts of a search for more minima."""
     with progress_bar(progress) as show:
@@ -241,7 +241,7 @@ def profiles_of(
 class _Lines(Deviances):
     """Deviances of one parameter each, and where they pass the limit of an interval."""
 
-    def __init__(self, fit: FitResult, which: Sequence[int], level: float, show: Show):
+    def __init__(self, fit: Fit, which: Sequence[int], level: float, show: Show):
         super().__init__(fit, show)
         self.which, self.level = which, level
         self.limit = fit.quantile(level) ** 2
@@ -359,7 +359,7 @@ class _Lines(Deviances):
         return float(self.values(i, y[[k]] + share * (y[beyond] - y[k]))[0])
 
 
-def needs_profiles(fit: FitResult) -> bool:
+def needs_profiles(fit: Fit) -> bool:
     """Whether standard errors may mislead, and profiles cost no more than the fit did.
 
     Not after lack of fit: no interval of such a law means anything, and its valleys are rough.
@@ -393,7 +393,7 @@ class Contour:
 
 
 def contour(
-    fit: FitResult,
+    fit: Fit,
     first: str,
     second: str,
     *,

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Generic, NamedTuple
 
 import jax
@@ -10,6 +11,7 @@ import numpy as np
 from scipy.special import ndtri, stdtrit
 
 from jimpact._checks import check_choice, check_kind, check_values
+from jimpact.files.records import Column, Table, Tabular
 from jimpact.fits.data import Experiments
 from jimpact.fits.parameters import (
     AnyLaw,
@@ -20,6 +22,7 @@ from jimpact.fits.parameters import (
     value_of,
 )
 from jimpact.fits.problem import FitProblem
+from jimpact.fits.report import as_record, pieces_in_words, report, save_fit, verdict
 from jimpact.fits.solve import FitMinimum, Search, minimize, solution, stacked
 from jimpact.law import Law, parameters_of
 from jimpact.scene import Scene
@@ -190,21 +193,6 @@ def joined(pieces: Iterable[tuple[float, float]]) -> tuple[tuple[float, float], 
     return tuple(union)
 
 
-def pieces_in_words(pieces: Iterable[tuple[float, float]], domain: tuple[float, float]) -> str:
-    """Pieces of an interval; an end of the domain is left out."""
-    return " or ".join(_piece(*ends, domain) for ends in pieces)
-
-
-def _piece(low: float, high: float, domain: tuple[float, float]) -> str:
-    """One piece of an interval in words."""
-    open_low, open_high = low <= domain[0], high >= domain[1]
-    if open_low and open_high:
-        return "anything"
-    if open_low or open_high:
-        return f"at most {high:.5g}" if open_low else f"at least {low:.5g}"
-    return f"{low:.5g} to {high:.5g}"
-
-
 # ---------------------------------------------------------------------------- the result
 
 
@@ -234,7 +222,7 @@ class Predicted(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class FitResult(Generic[AnyLaw]):
+class Fit(Tabular, Generic[AnyLaw]):
     """The result of `fit`. `print(fit)` gives its report.
 
     P free parameters, K shots of n velocities.
@@ -304,6 +292,45 @@ class FitResult(Generic[AnyLaw]):
     seed: int = 0
     profiles: tuple[Profile, ...] = ()
     reservations: tuple[str, ...] = ()
+    picture = "fit"
+
+    def __str__(self) -> str:
+        return report(self)
+
+    @property
+    def verdict(self) -> str:
+        """The result in one sentence that can be quoted: the first one of `print(fit)`.
+
+        Values with their errors, what they assume, and what speaks against them.
+        """
+        return verdict(self)
+
+    @property
+    def table(self) -> Table:
+        """A row a parameter: value, standard error, ends of its 95 % interval, whether seen."""
+        names = ("value", "standard_error", "low_95", "high_95", "at_bound", "determined")
+        ends = self.confidence_interval().T
+        columns = (self.value, self.standard_error, *ends, self.at_bound, self.determined)
+        rows = list(zip(self.names, *(column.tolist() for column in columns)))
+        return Table([Column(name) for name in ("parameter", *names)], rows)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything a JSON file can hold; numbers that are not finite become None."""
+        return as_record(self)
+
+    def save(self, path: str | Path) -> Path:
+        """Write the fit to a file (JSON) that `ji.load` reads: problem, result, versions.
+
+        Args:
+            path: the file; an existing file is replaced.
+
+        Returns:
+            The path.
+
+        Raises:
+            ValueError: a fit of something else than shots, or with ties: functions cannot be saved.
+        """
+        return save_fit(self, path)
 
     @property
     def scene(self) -> Scene | None:
@@ -577,6 +604,9 @@ class FitResult(Generic[AnyLaw]):
 
 def check_squares(name: str, fit: Any) -> None:
     """Raise an error unless argument `name` is a fit by least squares."""
-    check_kind(name, fit, FitResult)
+    check_kind(name, fit, Fit)
     if fit.loss != "squares":
         raise ValueError(f"Argument `{name}` must be by least squares, but has loss {fit.loss!r}.")
+
+
+FitResult = Fit  # as `jimpact.plot` still calls it

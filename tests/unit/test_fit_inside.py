@@ -9,8 +9,8 @@ from scipy import optimize
 import jimpact as ji
 from jimpact.files.records import with_error
 from jimpact.fits.parameters import LawInScene, bounds_of, free_parameters, tied
-from jimpact.fits.report import Fit
 from jimpact.fits.solve import Damping
+from jimpact.fits.uncertainty import Fit
 
 
 def test_entries_are_named_as_in_the_report():
