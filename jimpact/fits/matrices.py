@@ -227,7 +227,7 @@ def matrix_region(
         ValueError: redundant contacts, too many contacts, a start that is not admissible, fixed
             entries that leave no admissible choice.
     """
-    if not scenes or not encloses(law, scenes[0].contacts):
+    if not encloses(law, scenes[0].contacts):
         return None
     assert isinstance(law, RestitutionMatrix)
     dtype = law.matrix.dtype

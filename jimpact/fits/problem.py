@@ -293,6 +293,9 @@ class FitProblem:
 
         They differ in more where they have scenes, other units or errors of v-, or where the law is
         computed as coarsely as the noise of the shots allows.
+
+        Args:
+            data: shots of as many bodies.
         """
         own, first = data.scenes is not None or self.scene is None, self.experiments
         if own or first is None or data.units != first.units:
@@ -482,14 +485,7 @@ class FitProblem:
         error = jnp.where(bad, 0.0, prediction.value) - jnp.where(bad, 0.0, self.measured)
         error = jnp.where(bad, PENALTY * self.unit, error)
         error = jnp.where(self.weight > 0, error, 0.0)  # its derivatives may be NaN
-        return self._mixed(error * self.weight).reshape(-1), prediction
-
-    @full_precision
-    def _mixed(self, weighted: Any) -> Any:
-        """Weighted errors, shaped like what was measured, as independent ones."""
-        if self.mixing is None:
-            return weighted
-        return (self.mixing @ weighted[..., None])[..., 0]
+        return _mixed(error * self.weight, self.mixing, jnp).reshape(-1), prediction
 
     def evaluate(self, y: jax.Array) -> tuple[jax.Array, jax.Array, Any]:
         """At y (Q,): residual (R + Q,) over `size`, Jacobian (R + Q, Q), (values, status).
@@ -594,24 +590,19 @@ class FitProblem:
         Args:
             errors: (K, n, ...), shaped like `measured`, in its units.
         """
-        return self._times_mixing(np.nan_to_num(errors) * self._weight_of(errors), self.mixing)
+        return _mixed(np.nan_to_num(errors) * self._weight_of(errors), self.mixing)
 
     def errors_of(self, independent: np.ndarray) -> np.ndarray:
         """The errors (K, n, ...) that are these as independent ones; NaN where not measured."""
         weight = self._weight_of(independent)
         back = None if self.mixing is None else np.linalg.inv(np.asarray(self.mixing, float))
-        errors = self._times_mixing(independent, back)
+        errors = _mixed(independent, back)
         return np.where(weight > 0, errors / np.where(weight > 0, weight, 1.0), np.nan)
 
     def _weight_of(self, errors: np.ndarray) -> np.ndarray:
         """The weights, with as many axes as these errors."""
         more = (1,) * (errors.ndim - self.measured.ndim)
         return np.asarray(self.weight, float).reshape((*self.measured.shape, *more))
-
-    @staticmethod
-    def _times_mixing(errors: np.ndarray, mixing: Any) -> np.ndarray:
-        """These errors (K, n, ...) mixed within each shot."""
-        return errors if mixing is None else np.einsum("kij,kj...->ki...", mixing, errors)
 
     @property
     def precision(self) -> str:
@@ -651,14 +642,27 @@ def of_shots(
     filled = np.pad(pre, ((0, 0), (0, extra)), constant_values=unit)
     observe = Shots(stacked, filled, n)  # type: ignore[arg-type]
     choice = (free, *known)
-    problem = _build(law, observe, post, sigma, errors, unit, choice, energy, alike)
+    problem = _build(law, observe, post, sigma, errors, unit, choice, energy)
     problem = replace(
         problem,
         notes=(*problem.notes, *of_tolerance),
         experiments=experiments,
         scene=scene,
+        matrix=_admissible(problem, alike),
     )
     return problem.with_errors_before(np.tile(np.eye(n), (count, 1, 1)))
+
+
+def _admissible(problem: FitProblem, scenes: list[Scene]) -> AdmissibleMatrices | None:
+    """The region of y in which a restitution matrix stays admissible, or None."""
+    owner = problem.owner
+    moves = np.where(owner[:, None] == np.arange(len(owner)), problem.scale, 0.0)
+    origin = np.where(owner < 0, problem.fixed, 0.0)
+    ends, start = np.stack([problem.low, problem.high]), problem.point(problem.start)
+    matrix = matrix_region(problem.law, scenes, origin, moves, ends, start)
+    if matrix is not None and any(entry_of(name)[0] == "matrix" for name, _ in problem.ties):
+        raise ValueError("Argument `ties` must not tie a `matrix` that has to stay admissible.")
+    return matrix
 
 
 def _in(dtype: Any, tree: Any) -> Any:
@@ -675,7 +679,6 @@ def _build(
     unit: float,
     choice: tuple[Any, ...],
     energy: float = 1.0,
-    scenes: list[Scene] | None = None,
 ) -> FitProblem:
     """Arrays, weights and natural scales of a fit; `choice`: free, bounds, priors, ties."""
     leaves = [x for x in jax.tree.leaves((law, observe, measured)) if eqx.is_inexact_array(x)]
@@ -695,22 +698,10 @@ def _build(
         )
     arrays = _of_parameters(law, parameters, limits, priors, energy)
     arrays |= _weighed_values(measured, errors, unit)
-    owner, ends = arrays["owner"], np.stack([arrays["low"], arrays["high"]])
-    moves = np.where(owner[:, None] == np.arange(len(owner)), arrays["scale"], 0.0)
-    origin = np.where(owner < 0, arrays["fixed"], 0.0)
-    start = np.zeros(len(owner))
-    start[: len(parameters.names)] = scaled(
-        entries(law, parameters.fields)[parameters.first],
-        arrays["scale"][: len(parameters.names)],
-        parameters.log,
-    )
-    matrix = matrix_region(law, scenes or [], origin, moves, ends, start)
-    if matrix is not None and any(entry_of(name)[0] == "matrix" for name, _ in ties):
-        raise ValueError("Argument `ties` must not tie a `matrix` that has to stay admissible.")
     return FitProblem(
         law=_in(dtype, law),
         observe=_in(dtype, observe),
-        matrix=matrix,
+        matrix=None,
         **_in(dtype, arrays),
         fields=parameters.fields,
         ties=ties,
@@ -774,6 +765,12 @@ def scaled(x: Any, scale: Any, log: Any, xp: Any = np) -> Any:
 def unscaled(y: Any, scale: Any, log: Any, xp: Any = np) -> Any:
     """Values x of y."""
     return xp.where(log, xp.exp(xp.where(log, y, 0.0)), y * scale)
+
+
+@full_precision
+def _mixed(errors: Any, mixing: Any, xp: Any = np) -> Any:
+    """Weighted errors (K, n, ...) mixed within each shot."""
+    return errors if mixing is None else xp.einsum("kij,kj...->ki...", mixing, errors)
 
 
 def filled_count(count: int) -> int:

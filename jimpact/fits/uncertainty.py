@@ -379,9 +379,12 @@ class Fit(Tabular, Generic[AnyLaw]):
         return dict(zip(tied_names(problem.law, ties), pairs))
 
     def errors_of(self, slope: np.ndarray) -> np.ndarray:
-        """Standard errors of what has these derivatives (..., P) in the parameters.
+        """Standard errors of what depends on the parameters.
 
         Equation: `sqrt(J C J^T)`; inf where it depends on what the data do not determine.
+
+        Args:
+            slope: its derivatives (..., P) in the parameters.
         """
         seen = self.determined
         known = slope[..., seen]
