@@ -15,9 +15,9 @@ from jimpact.bodies.base import CLOSED_BELOW, Body
 from jimpact.files.shots_file import ANGULAR, LINEAR, read_shots
 from jimpact.scene import WALLS, Scene, chain, dense_mass, stackable, with_gaps
 
-# Share of the momentum up to which a corrected shot counts as conserving it: rounding, also in
-# files of ten digits. Ten times more would take measured shots for corrected ones no more often.
-CONSERVED = 1e-9
+# Share of velocities, momenta and readings up to which a difference is rounding, also in files of
+# ten digits. Ten times more would take measured shots for corrected ones no more often.
+ROUNDING = 1e-9
 _PRINTED = 4  # shots that `print` shows
 _RESOLUTION = operator.attrgetter("resolution")
 
@@ -361,7 +361,7 @@ def kept_by_corrections(data: Experiments, scene: Scene | None) -> list[np.ndarr
     """
     kept: list[np.ndarray | None] = []
     for k, (m, pre, post) in enumerate(data.balances(scene)):
-        rounding = CONSERVED * np.abs(m) @ (np.abs(pre) + np.abs(post))
+        rounding = ROUNDING * np.abs(m) @ (np.abs(pre) + np.abs(post))
         corrected = 0 < len(m) <= data.lost[k] and (np.abs(m @ (post - pre)) <= rounding).all()
         kept.append(np.eye(len(pre)) - _smallest_change(data, k, m) @ m if corrected else None)
     return kept

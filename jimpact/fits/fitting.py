@@ -18,6 +18,7 @@ from jimpact.fits.profiles import LEVEL, PROFILE_STARTS, needs_profiles, profile
 from jimpact.fits.solve import (
     DEFAULT_STEPS,
     HARDLY_WORSE,
+    SETTLED,
     Ends,
     FitMinimum,
     Method,
@@ -45,7 +46,7 @@ from jimpact.scene import Scene
 HUBER = 1.345  # sigmas up to which a residual counts squared: 95 % of the efficiency
 STUDENT = 4.0  # degrees of freedom of the tails
 ROUNDS = 50  # of weights
-SAME = 1e-7  # in natural scales of the parameters: the weights have settled
+LEAST_SLOPE = 1e-7  # mean psi' of residuals that all are outliers, in the place of 0
 
 
 def fit(
@@ -325,12 +326,12 @@ def _robust(
         factor, before = np.sqrt(share), problem.point(found.value)
         weighed = problem.weighed(factor)
         found = solution(weighed, minimize(stacked([weighed]), before[None], search))
-        if np.abs(problem.point(found.value) - before).max() <= SAME:
+        if np.abs(problem.point(found.value) - before).max() <= SETTLED:
             break
     else:
         found = found._replace(converged=False)
     psi = (share * error / scale)[here]
-    noise = scale * np.sqrt(np.sum(psi**2)) / max(slope[here].mean(), SAME)
+    noise = scale * np.sqrt(np.sum(psi**2)) / max(slope[here].mean(), LEAST_SLOPE)
     # weighted as in the problem, without the factors of the loss
     minimum, size = found.minima[0], factor.size
     residual = problem.independent(problem.measured - found.predicted)
@@ -401,7 +402,9 @@ def fit_many(
 
     for k, data in enumerate(many):
         check_kind(f"many[{k}]", data, Experiments)
-    problems = _problems(law, scene, many, choice)
+    first = of_shots(law, scene, many[0], *choice)
+    others = (first.with_shots(data) or of_shots(law, scene, data, *choice) for data in many[1:])
+    problems = [first, *others]
     each: list[Ends] = [None] * len(many)  # type: ignore[list-item]  # where its starts ended
     with progress_bar(progress) as show:
         for members in _alike(many):
@@ -426,15 +429,6 @@ def fit_many(
         np.array([getattr(ends, name) for ends in best]) for name in ("y", "squares", "converged")
     )
     return Fits(problems[0].names, problems[0].values_at(y), squares, converged, made)
-
-
-def _problems(
-    law: AnyLaw, scene: Scene | None, many: Sequence[Experiments], choice: tuple[Any, ...]
-) -> list[FitProblem]:
-    """The problem of each data set; those in a common scene differ in their shots only."""
-    first = of_shots(law, scene, many[0], *choice)
-    others = (first.with_shots(data) or of_shots(law, scene, data, *choice) for data in many[1:])
-    return [first, *others]
 
 
 def _alike(many: Sequence[Experiments]) -> list[list[int]]:

@@ -9,18 +9,18 @@ plane, is filled from the minima outwards.
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jimpact._checks import as_whole, check_choice, check_kind
-from jimpact.fits.problem import scaled
+from jimpact.fits.problem import scaled, unscaled
 from jimpact.fits.solve import (
     SAME_VALUE,
     START_SCALES,
     Ends,
+    FitMinimum,
     Search,
-    Solution,
     find_minima,
     minimize,
     solution,
@@ -81,18 +81,32 @@ class Grid(NamedTuple):
 
 
 class Deviances:
-    """Sums of squares of a fit with some of its parameters fixed, in the solver's scale."""
+    """Deviances of a fit with some of its parameters fixed, in the solver's scale."""
 
-    def __init__(self, fit: Fit, show: Show):
-        self.fit, self.problem, self.show = fit, fit.problem, show
+    def __init__(self, fit: Fit, limit: float, show: Show):
+        self.fit, self.problem, self.limit, self.show = fit, fit.problem, limit, show
         # if the noise is undetermined, that of an exact fit up to rounding
         known = np.isfinite(fit.noise) and fit.noise > 0
         self.variance = float(fit.noise**2) if known else self.problem.exact_squares
-        self.starts = [
-            Point(end.sum_of_squares, self.problem.point(end.value)) for end in fit.starts
-        ]
-        self.best = self.lowest = self.starts[0]
         self.error = fit.standard_error / self.problem.steps_at(fit.value)
+        self.starts: list[Point] = []
+        self.add_starts(fit.starts)
+
+    def add_starts(self, minima: Iterable[FitMinimum]) -> None:
+        """Start from these minima, too: the lowest, and others near it that are apart."""
+        starts = [Point(end.sum_of_squares, self.problem.point(end.value)) for end in minima]
+        starts = [*self.starts, *starts]
+        self.best, self.starts = starts[0], []
+        for start in starts:
+            if self._is_below(start.squares, self.best.squares):
+                self.best = start
+        self.lowest = self.best
+        for start in (self.best, *starts):
+            apart = all(np.abs(start.y - other.y).max() > SAME_VALUE for other in self.starts)
+            if apart and self.of(start.squares) <= self.limit:
+                self.starts.append(start)
+        if self.fit.rank < len(self.fit.names):  # they are ends in one valley
+            self.starts = [self.best]
 
     def minimize(self, trials: Sequence[tuple[Index, Sequence[float], np.ndarray]]) -> Ends:
         """Minima with some parameters fixed at values, from y (Q,) each, all side by side."""
@@ -118,11 +132,9 @@ class Deviances:
         """Sums of squares above the least, over the noise variance."""
         return max((squares - self.best.squares) / self.variance, 0.0)
 
-    def values(self, i: int, y: np.ndarray) -> np.ndarray:
+    def values(self, i: int, y: Any) -> Any:
         """Values of the i-th parameter of scaled ones."""
-        points = np.tile(self.best.y, (len(y), 1))
-        points[:, i] = y
-        return self.problem.values_at(points)[:, i]
+        return unscaled(y, float(self.problem.scale[i]), bool(self.problem.log[i]))
 
     def reach(self, i: int) -> tuple[float, float]:
         """The bounds of the i-th parameter, scaled; infinite ones as far as starts reach."""
@@ -130,7 +142,7 @@ class Deviances:
         low = low if np.isfinite(low) else best - START_SCALES
         return float(low), float(high if np.isfinite(high) else best + START_SCALES)
 
-    def fill(self, grids: Sequence[Grid], limit: float) -> list[dict[Index, Point]]:
+    def fill(self, grids: Sequence[Grid]) -> list[dict[Index, Point]]:
         """Cells of grids, from the minima outwards until beyond the limit, many side by side.
 
         Each cell below the limit starts its neighbours from its own minimum, also those that were
@@ -152,7 +164,7 @@ class Deviances:
                 if cell in cells and not squares < (1 - SAME) * cells[cell].squares:
                     continue
                 cells[cell] = Point(squares, y, branch)
-                if self.of(squares) > limit:
+                if self.of(squares) > self.limit:
                     if branch != _FROM_BEST:
                         ahead[g, cell, _FROM_BEST] = self.best.y
                     continue
@@ -227,74 +239,46 @@ def profiles_of(
 ) -> tuple[Profile, ...]:
     """Profiles of these parameters; points: starts of a search for more minima."""
     with progress_bar(progress) as show:
-        lines = _Lines(fit, which, level, show)
+        lines = _Lines(fit, fit.quantile(level) ** 2, show)
         if points and fit.start_count == 1:
-            lines.add_starts(find_minima(fit.problem, points, fit.seed, Search(show=show)))
+            lines.add_starts(find_minima(fit.problem, points, fit.seed, Search(show=show)).minima)
         for _ in range(ROUNDS):
-            profiles = lines.profiles()
+            profiles = lines.profiles(which, level)
             if lines.lowest is lines.best:
                 break
-            lines.add_starts(solution(fit.problem, lines.minimize([((), (), lines.lowest.y)])))
+            end = lines.minimize([((), (), lines.lowest.y)])
+            lines.add_starts(solution(fit.problem, end).minima)
     return profiles
 
 
 class _Lines(Deviances):
     """Deviances of one parameter each, and where they pass the limit of an interval."""
 
-    def __init__(self, fit: Fit, which: Sequence[int], level: float, show: Show):
-        super().__init__(fit, show)
-        self.which, self.level = which, level
-        self.limit = fit.quantile(level) ** 2
-        self._choose(self.starts)
-
-    def _choose(self, starts: Sequence[Point]) -> None:
-        """Take the lowest of these starts, and others near it that are apart from each other."""
-        self.best, self.starts = starts[0], []
-        for start in starts:
-            if self._is_below(start.squares, self.best.squares):
-                self.best = start
-        self.lowest = self.best
-        for start in (self.best, *starts):
-            apart = all(np.abs(start.y - other.y).max() > SAME_VALUE for other in self.starts)
-            if apart and self.of(start.squares) <= self.limit:
-                self.starts.append(start)
-        if self.fit.rank < len(self.fit.names):  # they are ends in one valley
-            self.starts = [self.best]
-
-    def add_starts(self, found: Solution) -> None:
-        """Start from these minima, too."""
-        y = self.problem.point(np.array([minimum.value for minimum in found.minima]))
-        squares = [minimum.sum_of_squares for minimum in found.minima]
-        self._choose([*self.starts, *map(Point, squares, y)])
-
     def grid(self, i: int) -> Grid:
         """Values of the i-th parameter, the denser the nearer to a start."""
         low, high = self.reach(i)
         centres = np.array([start.y[i] for start in self.starts])
-        values = [centres, np.array([low, high])]
-        first = STEP * np.sqrt(self.limit) * self.error[i]
-        if not (np.isfinite(first) and first > 0):
-            first = FIRST_SHARE * (high - low)
-        first = min(first, (high - low) / 2)
+        first, widest = STEP * np.sqrt(self.limit) * self.error[i], FIRST_SHARE * (high - low)
+        if not 0 < first < widest:
+            first = widest
         count = np.log(1 + (GROWTH - 1) * (high - low) / first) / np.log(GROWTH)
         away = first * (GROWTH ** np.arange(1, count + 1) - 1) / (GROWTH - 1)
-        for k, centre in enumerate(centres):
-            near = centre + np.concatenate([-away, away])
-            owner = np.abs(near[:, None] - centres).argmin(axis=1)
-            values.append(near[(owner == k) & (near > low) & (near < high)])
-        return Grid((i,), (np.unique(np.concatenate(values)),))
+        near = centres[:, None] + np.concatenate([-away, away])
+        owner = np.abs(near[..., None] - centres).argmin(axis=-1)
+        near = near[(owner == np.arange(len(centres))[:, None]) & (near > low) & (near < high)]
+        return Grid((i,), (np.unique([*centres, low, high, *near]),))
 
-    def profiles(self) -> tuple[Profile, ...]:
-        """The profiles of all parameters."""
-        grids = [self.grid(i) for i in self.which]
+    def profiles(self, which: Sequence[int], level: float) -> tuple[Profile, ...]:
+        """The profiles of these parameters."""
+        grids = [self.grid(i) for i in which]
         lines = [
             {float(grid.values[0][k]): cell for (k,), cell in cells.items()}
-            for grid, cells in zip(grids, self.fill(grids, self.limit))
+            for grid, cells in zip(grids, self.fill(grids))
         ]
-        self.find_ends(lines)
-        return tuple(self.profile(i, line) for i, line in zip(self.which, lines))
+        self.find_ends(which, lines)
+        return tuple(self.profile(i, line, level) for i, line in zip(which, lines))
 
-    def find_ends(self, lines: Sequence[dict[float, Point]]) -> None:
+    def find_ends(self, which: Sequence[int], lines: Sequence[dict[float, Point]]) -> None:
         """Where deviances pass the limit: regula falsi in their roots, all ends side by side."""
         for turn in range(ROUNDS):
             trials = []
@@ -304,7 +288,7 @@ class _Lines(Deviances):
                     trials.append((n, inside + share * (outside - inside), line[inside].y))
             if not trials:
                 return
-            ends = self.minimize([((self.which[n],), (value,), y) for n, value, y in trials])
+            ends = self.minimize([((which[n],), (value,), y) for n, value, y in trials])
             for (n, value, _), squares, y in zip(trials, ends.squares.tolist(), ends.y):
                 lines[n][float(value)] = Point(squares, y)
 
@@ -326,7 +310,7 @@ class _Lines(Deviances):
         values = sorted(line)
         return np.array(values), np.array([self.of(line[y].squares) for y in values])
 
-    def profile(self, i: int, line: dict[float, Point]) -> Profile:
+    def profile(self, i: int, line: dict[float, Point], level: float) -> Profile:
         """The profile of a parameter from all that was solved."""
         y, deviance = self.deviance(line)
         deviance = deviance - deviance.min()
@@ -343,7 +327,7 @@ class _Lines(Deviances):
             value=self.values(i, y),
             deviance=deviance,
             limit=self.limit,
-            level=self.level,
+            level=level,
             intervals=intervals,
             domain=(float(low), float(high)),
             better=None if is_own else self.problem.values_at(self.best.y),
@@ -356,7 +340,7 @@ class _Lines(Deviances):
             return float(self.problem.domains[i][(step + 1) // 2])
         p, q = np.sqrt(deviance[k]), np.sqrt(deviance[beyond])
         share = (np.sqrt(self.limit) - p) / (q - p)
-        return float(self.values(i, y[[k]] + share * (y[beyond] - y[k]))[0])
+        return float(self.values(i, y[k] + share * (y[beyond] - y[k])))
 
 
 def needs_profiles(fit: Fit) -> bool:
@@ -445,7 +429,7 @@ def contour(
     if fit.problem.sigma is None and freedom > 0:
         limit = float(freedom * ((1 - level) ** (-2 / freedom) - 1))
     with progress_bar(progress) as show:
-        deviances, width = Deviances(fit, show), _BEYOND * np.sqrt(limit)
+        deviances, width = Deviances(fit, limit, show), _BEYOND * np.sqrt(limit)
         values = []
         for i in pair:
             pieces, scale = fit.linearized_interval(i, width), np.asarray(fit.problem.scale)[i]
@@ -453,7 +437,7 @@ def contour(
             outer = scaled(outer, scale, fit.problem.parameters.log[i])
             low, high = np.clip(outer, *deviances.reach(i)).tolist()
             values.append(np.linspace(low, high, points))
-        (cells,) = deviances.fill([Grid(pair, (values[0], values[1]))], limit)
+        (cells,) = deviances.fill([Grid(pair, (values[0], values[1]))])
     squares = np.full((points, points), np.inf)
     for cell, known in cells.items():
         squares[cell] = known.squares

@@ -75,7 +75,9 @@ START_RESTITUTION = 0.5
 # residual, and their values by less than this share of a standard error, or of a natural scale
 # where the data do not determine them. What starts leave is a tenth of that.
 SAME_COST, SAME_ERRORS, SAME_VALUE = 1e-2, 0.2, 1e-3
-FLAT = 1e-6  # share of the largest singular value below which data do not determine a direction
+# Singular values of the scaled Jacobian below this share of the largest are zero: derivatives of
+# an impact are good to about 1e-7 (float64; 1e-4 in float32), so smaller ones may be errors.
+RANK_TOLERANCE = {"float64": 1e-6, "float32": 1e-3}
 # Starts up to so many variances above the best are solved to their ends, the others only to
 # where minima can be told apart: intervals of all levels end before.
 HARDLY_WORSE = 100.0
@@ -85,7 +87,6 @@ STARTS, ROUNDS = 12, 6  # by default, and how often others around the best follo
 # times more values take ten times as long, ten times fewer step over minima.
 SCANNED, SCAN_FACTOR, SCANS = 24, 100.0, 2
 NEAR_SPREAD = 2.0  # of starts around the best, in standard errors
-NEAR_RCOND = 1e-10  # directions that the data do not determine are not searched
 SETTLED, SETTLING = 1e-5, 10  # change (natural scales) and rounds, where errors of v- are passed on
 
 
@@ -491,7 +492,7 @@ def solution(
     """The distinct minima among ends; counts: of the starts that an end is for."""
     counts = np.ones(len(ends.y), int) if counts is None else counts
     count, measured = len(problem.names), problem.measured
-    groups = _groups(ends, count)
+    groups = _groups(problem, ends)
     # without what filled up, and parameters that have no prior
     first_prior = ends.residual.shape[1] - len(problem.low)
     own = [*range(measured.size), *(first_prior + prior.parameter for prior in problem.priors)]
@@ -553,7 +554,7 @@ def find_minima(problem: "FitProblem", starts: int | None, seed: int, search: Se
         ends = jax.tree.map(lambda a, b: np.concatenate([a, b]), ends, more)
         if not np.nanmin(more.squares) < least * (1 - 1 / ends.jacobian.shape[1]):
             break
-    firsts = np.array([group[0] for group in _groups(ends, len(problem.names))])
+    firsts = np.array([group[0] for group in _groups(problem, ends)])
     best, variance = firsts[0], ends.squares[firsts[0]] / ends.jacobian.shape[1]
     near = ends.squares[firsts] <= ends.squares[best] + HARDLY_WORSE * variance
     near = firsts[near & (ends.converged[firsts] | (firsts == best))]
@@ -599,20 +600,22 @@ def _near(problem: "FitProblem", ends: Ends, count: int, rng: np.random.Generato
     """Points (count, Q) around the best, as far off as its standard errors, inside the bounds."""
     best = int(np.nanargmin(ends.squares))
     jacobian, measured = np.nan_to_num(ends.jacobian[best]), int(np.sum(problem.weight > 0))
-    inverse = np.linalg.pinv(jacobian.T @ jacobian, rcond=NEAR_RCOND, hermitian=True)
+    # directions that the data do not determine are not searched
+    least = RANK_TOLERANCE[problem.precision] ** 2
+    inverse = np.linalg.pinv(jacobian.T @ jacobian, rcond=least, hermitian=True)
     spread = NEAR_SPREAD * np.sqrt(ends.squares[best] / measured * np.diag(inverse))
     y = ends.y[best]
     points = y + np.minimum(spread, START_SCALES) * rng.normal(size=(count, len(y)))
     return np.clip(points, problem.low, problem.high)
 
 
-def _groups(ends: Ends, count: int) -> list[list[int]]:
+def _groups(problem: "FitProblem", ends: Ends) -> list[list[int]]:
     """Ends in the same minimum, best minimum first.
 
     Of equally good ends a converged one comes first, then the earliest start: the first start is
     the user's own.
     """
-    squares, y, least = ends.squares, ends.y[:, :count], np.nanmin(ends.squares)
+    squares, y, least = ends.squares, ends.y[:, : len(problem.names)], np.nanmin(ends.squares)
     unit, exact = SAME_COST / ends.jacobian.shape[1], ends.exact[0]
     equal = squares <= least * (1 + unit) + exact
     order = np.lexsort((np.arange(len(y)), ~ends.converged, np.where(equal, least, squares)))
@@ -621,7 +624,7 @@ def _groups(ends: Ends, count: int) -> list[list[int]]:
         for group in groups:
             first = group[0]
             close = abs(squares[i] - squares[first]) <= unit * squares[first] + exact
-            if close and _same_values(ends, first, y[i] - y[first]):
+            if close and _same_values(problem, ends, first, y[i] - y[first]):
                 group.append(int(i))
                 break
         else:
@@ -629,7 +632,7 @@ def _groups(ends: Ends, count: int) -> list[list[int]]:
     return groups
 
 
-def _same_values(ends: Ends, first: int, apart: np.ndarray) -> bool:
+def _same_values(problem: "FitProblem", ends: Ends, first: int, apart: np.ndarray) -> bool:
     """Whether values (P,) so far apart from those of an end are the same."""
     if np.abs(apart).max() < SAME_VALUE:
         return True
@@ -637,7 +640,7 @@ def _same_values(ends: Ends, first: int, apart: np.ndarray) -> bool:
     if not np.isfinite(jacobian).all():
         return False
     _, singular, directions = np.linalg.svd(jacobian, full_matrices=False)
-    determined = singular > FLAT * singular[0]
+    determined = singular > RANK_TOLERANCE[problem.precision] * singular[0]
     noise = np.sqrt(ends.squares[first] / len(jacobian))
     errors = np.where(determined, noise / np.where(determined, singular, 1.0), 0.0)
     allowed = np.maximum(SAME_ERRORS * errors, SAME_VALUE)

@@ -23,13 +23,9 @@ from jimpact.fits.parameters import (
 )
 from jimpact.fits.problem import FitProblem
 from jimpact.fits.report import as_record, pieces_in_words, report, save_fit, verdict
-from jimpact.fits.solve import FitMinimum, Search, minimize, solution, stacked
+from jimpact.fits.solve import RANK_TOLERANCE, FitMinimum, Search, minimize, solution, stacked
 from jimpact.law import Law, parameters_of
 from jimpact.scene import Scene
-
-# Singular values of the scaled Jacobian below this share of the largest are zero: derivatives of
-# an impact are good to about 1e-7 (float64; 1e-4 in float32), so smaller ones may be errors.
-RANK_TOLERANCE = {"float64": 1e-6, "float32": 1e-3}
 
 # A parameter takes part in an undetermined combination if its share of that direction exceeds this;
 # shares of parameters that take no part are errors of the derivatives, about 1e-6.
