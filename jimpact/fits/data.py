@@ -19,6 +19,7 @@ from jimpact.scene import WALLS, Scene, chain, dense_mass, stackable, with_gaps
 # ten digits. Ten times more would take measured shots for corrected ones no more often.
 ROUNDING = 1e-9
 _PRINTED = 4  # shots that `print` shows
+_VALUES = ("pre", "post", "sigma", "sigma_pre", "resolution")
 _RESOLUTION = operator.attrgetter("resolution")
 
 
@@ -212,12 +213,20 @@ class Experiments(eqx.Module):
 
     def _with(self, **changed: Any) -> "Experiments":
         """A copy with other fields."""
-        names = ("pre", "post", "sigma", "scenes", "shots", "units", "sigma_pre")
-        changed = {"lost_freedom": self.lost} | changed
-        resolution = changed.pop("resolution", self.resolution)
-        copy = Experiments(**({name: getattr(self, name) for name in names} | changed))
+        fields = self._of_each_shot() | {"units": self.units} | changed
+        for name in _VALUES:
+            fields[name] = None if fields[name] is None else np.asarray(fields[name])
+        resolution = fields.pop("resolution")
         # what it adds to sigma is there already
-        return eqx.tree_at(_RESOLUTION, copy, resolution, is_leaf=lambda x: x is None)
+        return eqx.tree_at(
+            _RESOLUTION, Experiments(**fields), resolution, is_leaf=lambda x: x is None
+        )
+
+    def _of_each_shot(self) -> dict[str, Any]:
+        """What each shot has, by the name of its argument; None: no shot has it."""
+        names = (*_VALUES, "scenes", "shots")
+        fields = {"lost_freedom": self.lost} | {name: getattr(self, name) for name in names}
+        return {name: np.asarray(x) if eqx.is_array(x) else x for name, x in fields.items()}
 
     def with_contacts(self, contacts: int | Sequence[int]) -> "Experiments":
         """The shots on such numbers of `contacts`."""
@@ -236,14 +245,8 @@ class Experiments(eqx.Module):
         ('2',)
         """
         rows = np.arange(len(self.shots))[which]
-        fields: dict[str, Any] = {"shots": [self.shots[k] for k in rows]}
-        fields["lost_freedom"] = [self.lost[k] for k in rows]
-        for name in ("pre", "post", "sigma", "sigma_pre", "resolution"):
-            values = getattr(self, name)
-            fields[name] = None if values is None else np.asarray(values)[rows]
-        if self.scenes is not None:
-            fields["scenes"] = [self.scenes[k] for k in rows]
-        return self._with(**fields)
+        fields = self._of_each_shot().items()
+        return self._with(**{k: None if x is None else [x[i] for i in rows] for k, x in fields})
 
     def __add__(self, other: "Experiments") -> "Experiments":
         """These shots and others, see `join`."""
@@ -276,24 +279,20 @@ class Experiments(eqx.Module):
         ):
             if len(set(same)) > 1:
                 raise ValueError(f"Argument `many` must have {name}.")
-        labels = [label for data in many for label in data.shots]
-        if len(set(labels)) < len(labels):
-            labels = [f"{i}/{label}" for i, data in enumerate(many, 1) for label in data.shots]
-        first, names = many[0], ("pre", "post", "sigma", "resolution")
-        parts = {name: [getattr(data, name) for data in many] for name in names}
-        if any(data.sigma_pre is not None for data in many):
-            exact = [jnp.zeros_like(data.pre) for data in many]
-            parts["sigma_pre"] = [
-                e if d.sigma_pre is None else d.sigma_pre for d, e in zip(many, exact)
-            ]
-        fields: dict[str, Any] = {
-            name: None if any(x is None for x in each) else np.concatenate(each)
-            for name, each in parts.items()
-        }
-        if first.scenes is not None:
-            fields["scenes"] = [scene for data in many for scene in data.scenes or ()]
-        lost = [k for data in many for k in data.lost]
-        return first._with(**fields, shots=labels, lost_freedom=lost)
+        columns = [data._of_each_shot() for data in many]
+        if any(each["sigma_pre"] is not None for each in columns):
+            for each in columns:
+                if each["sigma_pre"] is None:
+                    each["sigma_pre"] = np.zeros_like(each["pre"])
+        joined: dict[str, Any] = {}
+        for name in columns[0]:
+            parts = [each[name] for each in columns]
+            known = all(part is not None for part in parts)
+            joined[name] = [row for part in parts for row in part] if known else None
+        if len(set(joined["shots"])) < len(joined["shots"]):
+            sets = enumerate(many, 1)
+            joined["shots"] = [f"{i}/{label}" for i, data in sets for label in data.shots]
+        return many[0]._with(**joined)
 
     @property
     def contacts(self) -> np.ndarray:

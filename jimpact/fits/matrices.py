@@ -56,7 +56,6 @@ class AdmissibleMatrices(eqx.Module):
     closed: jax.Array  # (S, m) zeros and ones
     bounds: jax.Array | None  # (2, Q) of y
     center: jax.Array  # y strictly inside
-    moving: jax.Array  # which of the elementwise conditions depend on y
 
     def matrices(self, y: jax.Array) -> jax.Array:
         """E (S, m, m), with zeros for open contacts."""
@@ -67,7 +66,7 @@ class AdmissibleMatrices(eqx.Module):
     def elementwise(self, y: jax.Array) -> jax.Array:
         """All that must be >= 0 and is linear in y: E, impulses, distances from the bounds.
 
-        1 for conditions that y cannot change.
+        1 where there is no bound.
         """
         e = self.matrices(y)
         identity = jnp.eye(e.shape[1], dtype=e.dtype)[None]
@@ -75,7 +74,14 @@ class AdmissibleMatrices(eqx.Module):
         slack = [self.origin + self.map @ y, impulses.reshape(-1)]
         if self.bounds is not None:
             slack += [y - self.bounds[0], self.bounds[1] - y]
-        return jnp.where(self.moving, jnp.concatenate(slack), 1.0)
+        slacks = jnp.concatenate(slack)
+        return jnp.where(jnp.isfinite(slacks), slacks, 1.0)
+
+    @property
+    def faces(self) -> int:
+        """Number of conditions on the energy."""
+        scenes, m = self.closed.shape
+        return scenes * (2**m - 1)
 
     def worst(self, y: jax.Array) -> jax.Array:
         """Approaches x >= 0 (S, F, m) among which each face has that of the least lost energy.
@@ -113,8 +119,8 @@ class AdmissibleMatrices(eqx.Module):
         weight = _LEAST_DAMPING[str(dtype)] * jnp.where(largest > 0, largest, 1.0)
         hessian = hessian + weight * jnp.eye(size, dtype=dtype)
         rounding = _SHORT * jnp.finfo(dtype).eps * jnp.abs(self.inverse).max()
-        first = len(self.moving)
         slack, rows = self.conditions(y)
+        first = len(slack) - self.faces
         linear = slack[:first], rows[:first]
         worst = min(len(slack) - first, _WORST * self.closed.size)
 
@@ -143,7 +149,7 @@ class AdmissibleMatrices(eqx.Module):
     def share(self, y: jax.Array) -> jax.Array:
         """How much of the way from the center to y is admissible, at most 1."""
         slack, target = self.elementwise(self.center), self.elementwise(y)
-        crossed = target < 0
+        crossed = (target < 0) & (target < slack)  # others, y does not change
         share = jnp.where(crossed, slack / jnp.where(crossed, slack - target, 1.0), 1.0).min()
 
         def closer(
@@ -234,10 +240,7 @@ def matrix_region(
     used = np.any(mix != 0, axis=0)
     ends = bounds if np.isfinite(bounds[:, used]).any() else None
     region = _region(scenes, dtype, origin, mix, ends, start)
-    slack, rows = _host_conditions(region, start)
-    _check_start(region, slack)
-    moving = np.any(rows[:, used] != 0, axis=1) & np.isfinite(slack)
-    region = eqx.tree_at(lambda r: r.moving, region, jnp.asarray(moving[: len(region.moving)]))
+    _check_start(region, _host_conditions(region, start)[0])
     center = _inner_point(region, start)
     if center is None:
         raise ValueError(
@@ -282,9 +285,8 @@ def _region(
     bounds: np.ndarray | None,
     center: Any,
 ) -> AdmissibleMatrices:
-    """The region of these scenes, all of whose conditions count as depending on y."""
+    """The region of these scenes."""
     inverse, closed = _inverses(scenes)
-    count = inverse[0].size * (1 + len(inverse)) + (0 if bounds is None else bounds.size)
     return AdmissibleMatrices(
         origin=jnp.asarray(origin, dtype),
         map=jnp.asarray(mix, dtype),
@@ -292,7 +294,6 @@ def _region(
         closed=jnp.asarray(closed, dtype),
         bounds=None if bounds is None else jnp.asarray(bounds, dtype),
         center=jnp.asarray(center, dtype),
-        moving=jnp.ones(count, bool),
     )
 
 
@@ -341,9 +342,9 @@ def _host_conditions(region: AdmissibleMatrices, y: Any) -> tuple[np.ndarray, np
 
 def _kinds(region: AdmissibleMatrices) -> tuple[slice, slice, slice]:
     """Where the conditions named in `_FACES` are in a list of all."""
-    entries, elementwise = len(region.origin), len(region.moving)
+    entries = len(region.origin)
     impulses = entries * (1 + len(region.inverse))
-    return slice(entries), slice(entries, impulses), slice(elementwise, None)
+    return slice(entries), slice(entries, impulses), slice(-region.faces, None)
 
 
 def _rounding(region: AdmissibleMatrices) -> float:
@@ -375,7 +376,7 @@ def _inner_point(region: AdmissibleMatrices, start: np.ndarray) -> np.ndarray | 
     y, most, planes = start, np.inf, np.zeros((0, len(start) + 2))
     for _ in range(_CUTS):
         slack, rows = _host_conditions(region, y)
-        moving = np.any(rows != 0, axis=1) & np.isfinite(slack)
+        moving = np.any(rows[:, free] != 0, axis=1)
         if slack[moving].min() > max(0.5 * most, _rounding(region)):
             return y
         # t <= slack + rows (z - y)

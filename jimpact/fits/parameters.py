@@ -382,7 +382,6 @@ class Values:
         self.law, self.functions = law, dict(ties)
         self.places = tied_places(law, ties)
         self.waiting: list[str] = []  # ties that have begun, each needed by the one before
-        self.known: dict[str, Any] = {}
 
     def __getitem__(self, name: str) -> Any:
         """The value of an entry, or of a whole field in its shape."""
@@ -396,8 +395,6 @@ class Values:
 
     def _follow(self, name: str) -> Any:
         """The value of what is tied, by its function."""
-        if name in self.known:
-            return self.known[name]
         if name in self.waiting:
             circle = [*self.waiting[self.waiting.index(name) :], name]
             way = f"{circle[0]} needs {', which needs '.join(circle[1:])}"
@@ -413,8 +410,7 @@ class Values:
                 f"Argument `ties` must give one number for `{name}`{or_shape}, "
                 f"but its function gives shape {value.shape}."
             )
-        self.known[name] = value.ravel() if value.ndim else value
-        return self.known[name]
+        return value.ravel() if value.ndim else value
 
 
 def tied(law: AnyLaw, ties: Ties) -> AnyLaw:
