@@ -12,7 +12,7 @@ from jimpact._checks import as_whole, check_choice, check_kind
 from jimpact.files.records import listed
 from jimpact.fits.checks import MEDIAN, fit_warnings, stretch, unusable, weighted
 from jimpact.fits.data import Experiments
-from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw, plain_law
+from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw
 from jimpact.fits.problem import FitProblem, filled_count, of_shots
 from jimpact.fits.profiles import LEVEL, PROFILE_STARTS, needs_profiles, profiles_of
 from jimpact.fits.solve import (
@@ -240,7 +240,7 @@ def as_fit(
         for x in found.minima
     ]
     return Fit(
-        law=plain_law(problem.law_in_scene(found.value)),
+        law=problem.to_law(found.value),
         method=method if isinstance(method, str) else "optax",
         names=problem.names,
         value=found.value,
