@@ -403,7 +403,7 @@ def _judged(fits: dict[str, Fit]) -> dict[str, LawFit]:
     squares = {name: _per_shot(fits[name], errors[name]) for name in fits}
     usable = [name for name in fits if against[name][0] != "fails"] or list(fits)
     many = all(np.isfinite(squares[name]).sum() >= _LEAST for name in usable)
-    least = {name: _total(squares[name]) if many else _variance(fits[name]) for name in usable}
+    least = {name: np.nansum(squares[name]) if many else _variance(fits[name]) for name in usable}
     best = min(usable, key=lambda name: (least[name], len(fits[name].names)))
     entries = []
     for name, each in fits.items():
@@ -469,11 +469,6 @@ def _per_shot(result: Fit, error: np.ndarray) -> np.ndarray:
     """Weighted squares (K,) of these errors; NaN where a shot has none."""
     squares = np.sum(result.problem.independent(error) ** 2, axis=1)
     return np.where(np.isnan(error).all(axis=1), np.nan, squares)
-
-
-def _total(squares: np.ndarray) -> float:
-    """The sum of these squares; 0 where there are none."""
-    return float(np.nansum(squares)) if np.isfinite(squares).any() else 0.0
 
 
 def _chance(squares: np.ndarray, best: np.ndarray) -> float:

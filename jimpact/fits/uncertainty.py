@@ -24,7 +24,7 @@ from jimpact.fits.parameters import (
 from jimpact.fits.problem import FitProblem
 from jimpact.fits.report import as_record, pieces_in_words, report, save_fit, verdict
 from jimpact.fits.solve import RANK_TOLERANCE, FitMinimum, Search, minimize, solution, stacked
-from jimpact.law import Law, parameters_of
+from jimpact.law import parameters_of
 from jimpact.scene import Scene
 
 # A parameter takes part in an undetermined combination if its share of that direction exceeds this;
@@ -334,12 +334,6 @@ class Fit(Tabular, Generic[AnyLaw]):
         return self.problem.to_scene(self.value)
 
     @property
-    def law_in_scene(self) -> Law:
-        """The law, and with it the parts of the scene that were fitted."""
-        fitted = isinstance(self.problem.law, LawInScene)
-        return self.problem.law_in_scene(self.value) if fitted else self.law
-
-    @property
     def determined(self) -> np.ndarray:
         """(P,) which parameters the data say anything about; the values of others are starts."""
         seen = ~np.isinf(self.standard_error)
@@ -424,7 +418,13 @@ class Fit(Tabular, Generic[AnyLaw]):
             )
         check_values("shots", data)
         data = Experiments(data, np.zeros_like(np.asarray(data, float)), scenes=scenes, units=units)
-        law, own = self.placed(scene)
+        law = self.problem.law_in_scene(self.value)
+        if isinstance(law, LawInScene) and scene is not None:
+            raise ValueError(
+                "Argument `scene` must be left out where parts of the scene were fitted: they hold "
+                "for that of the fit only."
+            )
+        own = self.problem.scene if scene is None else scene
         largest = own if scenes is None else max(scenes, key=lambda each: each.contacts)
         self._check_scene(largest, len(units))
         ties = dict(self.problem.ties)
@@ -437,20 +437,6 @@ class Fit(Tabular, Generic[AnyLaw]):
         value, noise = there.predicted, self._noise_of(shots)
         half = quantile * np.hypot(error, noise)
         return Predicted(value, error, np.asarray(there.status), noise, value - half, value + half)
-
-    def placed(self, scene: Scene | None) -> tuple[Law, Scene | None]:
-        """The law, with the parts of the scene that were fitted, and the scene of new shots.
-
-        Raises:
-            ValueError: another scene than that of which parts were fitted.
-        """
-        law = self.law_in_scene
-        if isinstance(law, LawInScene) and scene is not None:
-            raise ValueError(
-                "Argument `scene` must be left out where parts of the scene were fitted: they hold "
-                "for that of the fit only."
-            )
-        return law, self.problem.scene if scene is None else scene
 
     def _check_scene(self, scene: Any, size: int) -> None:
         """Raise unless this is a scene for the law that was fitted and velocities of this size."""
@@ -472,10 +458,8 @@ class Fit(Tabular, Generic[AnyLaw]):
             stretched = 1.0 if self.problem.sigma is None else self.noise
             return stretched * np.asarray(shots.sigma, float)
         pre = shots.pre if isinstance(shots, Experiments) else shots
-        weight = self.problem.weight
-        variance = np.where(weight > 0, 1 / np.where(weight > 0, weight, 1.0) ** 2, 0.0).sum(axis=0)
-        count = (weight > 0).sum(axis=0)
-        each = np.sqrt(variance / np.where(count > 0, count, np.nan))  # NaN: never measured
+        weight = np.ma.masked_equal(np.asarray(self.problem.weight, float), 0.0)
+        each = np.sqrt((1 / weight**2).mean(axis=0)).filled(np.nan)  # NaN: never measured
         return np.broadcast_to(self.noise * each, np.shape(pre))
 
     @property
