@@ -235,10 +235,11 @@ def as_fit(
     numbers = errors._asdict()
     undetermined = numbers.pop("undetermined")
     slope = problem.of_data(found.jacobian)
-    starts = [
-        FitMinimum(x.sum_of_squares, x.value, x.count, _standard_error(problem, found, x, errors))
-        for x in found.minima
-    ]
+    starts, limit = [], found.minima[0].sum_of_squares + HARDLY_WORSE * errors.noise**2
+    for end in found.minima:
+        matters = not end.sum_of_squares > limit  # also where the noise is not known
+        error = uncertainty(problem, end, errors.noise).standard_error if matters else None
+        starts.append(FitMinimum(end.sum_of_squares, end.value, end.count, error))
     return Fit(
         law=problem.to_law(found.value),
         method=method if isinstance(method, str) else "optax",
@@ -276,18 +277,6 @@ def _errors(
     elif problem.sigma is not None:
         noise = stretch(judged, weighted(problem, found), errors.rank)
     return errors if noise in (None, 1.0) else uncertainty(problem, best, noise)
-
-
-def _standard_error(
-    problem: FitProblem, found: Solution, minimum: FitMinimum, best: Uncertainty
-) -> np.ndarray | None:
-    """Standard errors (P,) at a minimum that fits hardly worse than the best; else None."""
-    if minimum is found.minima[0]:
-        return best.standard_error
-    more = minimum.sum_of_squares - found.minima[0].sum_of_squares
-    if not more <= HARDLY_WORSE * best.noise**2:
-        return None
-    return uncertainty(problem, minimum, best.noise).standard_error
 
 
 # ---------------------------------------------------------------------------- robust losses

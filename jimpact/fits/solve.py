@@ -655,15 +655,16 @@ def settled(
     Errors of v- are passed on by the law of each problem's best minimum, until both agree.
     """
     each, start = len(points) // len(problems), points
-    for turn in range(SETTLING):
+    for _ in range(SETTLING):
         ends = minimize(stacked(problems, each), start, search)
-        moved = np.abs(ends.y - start).max(axis=1) > SETTLED
         if ends.slopes is None:
             return problems, ends
-        start = ends.y
         best = np.nanargmin(ends.squares.reshape(-1, each), axis=1)
         slopes = ends.slopes[np.arange(0, len(points), each) + best]
         problems = [p.with_errors_before(slope) for p, slope in zip(problems, slopes)]
-        if turn and not moved.any():
-            return problems, ends
+        moved = np.abs(ends.y - start).max(axis=1) > SETTLED
+        start = ends.y
+        if not moved.any():  # residuals and Jacobians with the weights of the final law
+            last = search._replace(max_steps=1)
+            return problems, minimize(stacked(problems, each), start, last)
     return problems, ends._replace(converged=ends.converged & ~moved)
