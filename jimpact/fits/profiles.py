@@ -48,7 +48,7 @@ _BEYOND = 1.3  # how far a contour's picture goes, in half-widths of the region 
 _FROM_BEST = -1  # the branch of what was searched from the best minimum
 
 
-class Point(NamedTuple):
+class Lowest(NamedTuple):
     """The least sum of squares that is known with values fixed, where, from which start."""
 
     squares: float
@@ -89,12 +89,12 @@ class Deviances:
         known = np.isfinite(fit.noise) and fit.noise > 0
         self.variance = float(fit.noise**2) if known else self.problem.exact_squares
         self.error = fit.standard_error / self.problem.steps_at(fit.value)
-        self.starts: list[Point] = []
+        self.starts: list[Lowest] = []
         self.add_starts(fit.starts)
 
     def add_starts(self, minima: Iterable[FitMinimum]) -> None:
         """Start from these minima, too: the lowest, and others near it that are apart."""
-        starts = [Point(end.sum_of_squares, self.problem.point(end.value)) for end in minima]
+        starts = [Lowest(end.sum_of_squares, self.problem.point(end.value)) for end in minima]
         starts = [*self.starts, *starts]
         self.best, self.starts = starts[0], []
         for start in starts:
@@ -121,7 +121,7 @@ class Deviances:
         ends = minimize(many, points, search, _STOP, what="fixed values", fixed=fixed)
         least = int(np.argmin(ends.squares))
         if self._is_below(ends.squares[least], self.lowest.squares):
-            self.lowest = Point(float(ends.squares[least]), ends.y[least])
+            self.lowest = Lowest(float(ends.squares[least]), ends.y[least])
         return ends
 
     def _is_below(self, squares: float, other: float) -> bool:
@@ -142,13 +142,13 @@ class Deviances:
         low = low if np.isfinite(low) else best - START_SCALES
         return float(low), float(high if np.isfinite(high) else best + START_SCALES)
 
-    def fill(self, grids: Sequence[Grid]) -> list[dict[Index, Point]]:
+    def fill(self, grids: Sequence[Grid]) -> list[dict[Index, Lowest]]:
         """Cells of grids, from the minima outwards until beyond the limit, many side by side.
 
         Each cell below the limit starts its neighbours from its own minimum, also those that were
         reached from another start. One above may lie on a ridge: once more from the best.
         """
-        known: list[dict[Index, Point]] = [{} for _ in grids]
+        known: list[dict[Index, Lowest]] = [{} for _ in grids]
         ahead = {
             (g, grid.nearest(start.y), branch): start.y
             for g, grid in enumerate(grids)
@@ -163,7 +163,7 @@ class Deviances:
                 cells = known[g]
                 if cell in cells and not squares < (1 - SAME) * cells[cell].squares:
                     continue
-                cells[cell] = Point(squares, y, branch)
+                cells[cell] = Lowest(squares, y, branch)
                 if self.of(squares) > self.limit:
                     if branch != _FROM_BEST:
                         ahead[g, cell, _FROM_BEST] = self.best.y
@@ -278,7 +278,7 @@ class _Lines(Deviances):
         self.find_ends(which, lines)
         return tuple(self.profile(i, line, level) for i, line in zip(which, lines))
 
-    def find_ends(self, which: Sequence[int], lines: Sequence[dict[float, Point]]) -> None:
+    def find_ends(self, which: Sequence[int], lines: Sequence[dict[float, Lowest]]) -> None:
         """Where deviances pass the limit: regula falsi in their roots, all ends side by side."""
         for turn in range(ROUNDS):
             trials = []
@@ -290,9 +290,9 @@ class _Lines(Deviances):
                 return
             ends = self.minimize([((which[n],), (value,), y) for n, value, y in trials])
             for (n, value, _), squares, y in zip(trials, ends.squares.tolist(), ends.y):
-                lines[n][float(value)] = Point(squares, y)
+                lines[n][float(value)] = Lowest(squares, y)
 
-    def _crossings(self, line: dict[float, Point]) -> Iterator[tuple[float, float, float, float]]:
+    def _crossings(self, line: dict[float, Lowest]) -> Iterator[tuple[float, float, float, float]]:
         """Ends that are not settled: values inside and outside, and by how much they pass.
 
         That is the root of the deviance over that of the limit, less 1.
@@ -305,12 +305,12 @@ class _Lines(Deviances):
             if min(-height[a], height[b]) > END and abs(values[b] - values[a]) > least:
                 yield values[a], values[b], height[a], height[b]
 
-    def deviance(self, line: dict[float, Point]) -> tuple[np.ndarray, np.ndarray]:
+    def deviance(self, line: dict[float, Lowest]) -> tuple[np.ndarray, np.ndarray]:
         """Fixed values in order, and their deviances."""
         values = sorted(line)
         return np.array(values), np.array([self.of(line[y].squares) for y in values])
 
-    def profile(self, i: int, line: dict[float, Point], level: float) -> Profile:
+    def profile(self, i: int, line: dict[float, Lowest], level: float) -> Profile:
         """The profile of a parameter from all that was solved."""
         y, deviance = self.deviance(line)
         deviance = deviance - deviance.min()
