@@ -217,7 +217,7 @@ def _fit_every_law(command: options.FitCommand, steps: Steps) -> CommandResult:
     fits = _laws_fitted(study, steps, starts=command.starts, seed=command.seed)
     best = fits.best
     picture = ji.plot.fit(best.fit, None, f"{study.title}: {best.name}")
-    return CommandResult(study.title, fits, picture, _plain(*fits.rows()))
+    return CommandResult(study.title, fits, picture, fits.table)
 
 
 def _laws_fitted(study: Study, steps: Steps, **chosen: int | None) -> "LawFits":

@@ -14,11 +14,11 @@ import numpy as np
 from scipy.special import chdtrc, fdtrc, ndtri, stdtr
 
 from jimpact.files.records import listed
-from jimpact.fits.data import Experiments, closed_normals, kept_by_corrections
+from jimpact.fits.data import ROUNDING, Experiments, closed_normals, kept_by_corrections
 from jimpact.fits.matrices import boundary, encloses
 from jimpact.fits.problem import UNUSABLE, FitProblem, Shots
-from jimpact.fits.solve import Solution
-from jimpact.fits.uncertainty import Uncertainty, reproduced
+from jimpact.fits.solve import RANK_TOLERANCE, Solution
+from jimpact.fits.uncertainty import Uncertainty
 from jimpact.laws.kinematic import RestitutionMatrix
 from jimpact.scene import Scene, dense_mass
 from jimpact.status import STATUS
@@ -35,10 +35,6 @@ DEFECT_LEVEL = 0.02
 # no test: no noise of a useful measurement is as large, but a wrong unit is. With ten times more, a
 # factor of 3.6 (km/h) in two shots would go unseen.
 GROSS = 0.5
-SEPARATION = 1e-9  # share of the velocities up to which an approach is rounding
-# Share of the velocities by which copies of a shot, scaled, may differ: rounding. Ten times more
-# would still be far below what is measured.
-COPIED = 1e-9
 # Factors that a wrong unit leaves in velocities: cm/s or mm/s for m/s, km/h, a decimal slip. A
 # median ratio of velocities within UNIT_NEAR of one (or of its inverse) is reported. Ten times
 # nearer, and noise of a percent would hide it.
@@ -47,7 +43,6 @@ UNIT_FACTORS, UNIT_NEAR = {10.0: "a decimal point", 100.0: "cm/s", 1000.0: "mm/s
 # ------------------------------------------------------------------ thresholds of the fit
 LEVEL = 0.01  # of each test: how often it flags data that the law itself made
 _LEAST = 3  # degrees of freedom of the noise too few to test against
-_RANGE = 1e-6  # singular values below this share count as 0 (derivatives are good to 1e-7)
 _LISTED = 6  # shots named one by one (with their ratios); of more, how many there are
 MEDIAN = 1.4826  # sigma of a normal distribution over the median of its absolute values
 # A median of absolute values is as uncertain as a standard deviation of this share of the values
@@ -128,7 +123,7 @@ class _Data:
             errors = np.hstack([errors, np.asarray(experiments.sigma_pre, float)])
         normals, masses = (experiments.each(scene, f) for f in (closed_normals, dense_mass))
         for k, (rows, pre, post) in enumerate(experiments.balances(scene)):
-            slowest = -SEPARATION * np.abs(normals[k]).T @ np.abs(pre)
+            slowest = -ROUNDING * np.abs(normals[k]).T @ np.abs(pre)
             if stored_energy == 0 and (normals[k].T @ pre >= slowest).all():
                 self.resting.append(k)
             if not np.isnan(post).any():
@@ -141,7 +136,7 @@ class _Data:
         used = slice(len(post) if sigma is None else len(sigma))
         for j, row in enumerate(rows):
             excess, scale, before = row @ (post - pre), np.abs(row) @ np.abs(pre), row @ pre
-            back = before < -SEPARATION * scale
+            back = before < -ROUNDING * scale
             ratio = 1 + (-excess if back else excess) / scale if scale else np.inf
             slope = np.append(row, -row)[used]
             defect = _Defect(k, excess, scale, before, slope, sigma, ratio)
@@ -218,7 +213,7 @@ def _copies(data: _Data) -> Iterable[dict[str, Any]]:
     size = np.sqrt(np.nansum(rows**2, axis=1, keepdims=True))
     unit = np.nan_to_num(rows / np.where(size > 0, size, 1.0), nan=np.inf)
     # what more than half have in common is the median
-    same = np.isclose(unit, np.median(unit, axis=0), rtol=0, atol=COPIED).all(axis=1)
+    same = np.isclose(unit, np.median(unit, axis=0), rtol=0, atol=ROUNDING).all(axis=1)
     count, total = int(same.sum()), data.total
     if 2 * count > total > 1:
         which, some = f"All {total}", "the"
@@ -342,22 +337,20 @@ class Weighted(NamedTuple):
 
 def weighted(problem: FitProblem, solution: Solution) -> Weighted:
     """Residuals and derivatives as the tests need them."""
-    here = ~np.isnan(problem.measured)
-    residual, slope = problem.prior_errors(solution.value)
-    errors = problem.independent(problem.measured - solution.predicted)[here]
-    of_priors = slope * problem.steps_at(solution.value)
-    return Weighted(
-        np.append(errors, residual),
-        np.vstack([solution.jacobian[here.ravel()], of_priors]),
-        np.append(problem.shot_of_value, np.full(len(residual), NO_SHOT)),
-    )
+    minimum, here = solution.minima[0], ~np.isnan(problem.measured).ravel()
+    shot = np.append(problem.shot_of_value, np.full(len(problem.priors), NO_SHOT))
+    used = np.append(here, np.ones(len(problem.priors), bool))
+    # where the law fails, what a search takes for the residual is no error
+    errors = problem.independent(problem.measured - solution.predicted)
+    residual = np.append(errors, -minimum.residual[errors.size :])
+    return Weighted(residual[used], minimum.jacobian[used], shot)
 
 
 def unusable(problem: FitProblem, solution: Solution) -> np.ndarray:
     """Shots (K,) whose impacts fail, or whose derivatives are not finite or absurdly large."""
     if not isinstance(problem.observe, Shots):
         return np.zeros(1, bool)
-    slope = np.abs(solution.jacobian.reshape(*problem.measured.shape, -1))
+    slope = np.abs(problem.of_data(solution.jacobian))
     allowed = ABSURD * float(problem.unit) * np.asarray(problem.weight, float)[..., None]
     fails = [STATUS[code].name in UNUSABLE for code in solution.status]
     used = ~np.isnan(problem.measured).all(axis=1)
@@ -426,15 +419,16 @@ def _reading_variance(problem: FitProblem) -> float:
     values = np.asarray(problem.measured, float)[~np.isnan(problem.measured)]
     largest = np.abs(values).max()
     for digits in range(9):
-        if np.abs(values - values.round(digits)).max() <= 1e-9 * largest:
+        if np.abs(values - values.round(digits)).max() <= ROUNDING * largest:
             return float(problem.weight.max()) ** 2 * 10.0 ** (-2 * digits) / 12
     return 0.0
 
 
-def _range(matrix: np.ndarray, size: float | None = None) -> np.ndarray:
+def _range(problem: FitProblem, matrix: np.ndarray, size: float | None = None) -> np.ndarray:
     """Orthonormal columns that span those of the matrix, but for what is small against `size`."""
     u, singular, _ = np.linalg.svd(matrix, full_matrices=False)
-    return u[:, singular > _RANGE * (singular[0] if size is None else size)]
+    size = singular[0] if size is None else size
+    return u[:, singular > RANK_TOLERANCE[problem.precision] * size]
 
 
 # ------------------------------------------------------------------ what is wrong with the fit
@@ -463,6 +457,12 @@ class _Judged:
     def inexact(self) -> bool:
         """Whether there are residuals to test."""
         return self.freedom >= 1 and self.residuals.squares > self.problem.exact_squares
+
+    @property
+    def shows_noise(self) -> bool:
+        """Whether residuals have to show the noise: those of shots without sigma."""
+        problem = self.problem
+        return self.inexact and problem.sigma is None and problem.experiments is not None
 
 
 def _left_out(judged: _Judged) -> Iterable[dict[str, Any]]:
@@ -531,7 +531,7 @@ def _beyond_sigma(judged: _Judged) -> Iterable[dict[str, Any]]:
 def _beyond_noise(judged: _Judged) -> Iterable[dict[str, Any]]:
     """What the law leaves over, against the noise of momentum and of repeated shots."""
     problem, data = judged.problem, judged.residuals
-    if not judged.inexact or problem.sigma is not None or problem.experiments is None:
+    if not judged.shows_noise:
         return
     noise, count = _noise(problem, data)
     rest = judged.freedom - count
@@ -546,24 +546,23 @@ def _beyond_noise(judged: _Judged) -> Iterable[dict[str, Any]]:
 def _pattern(judged: _Judged) -> Iterable[dict[str, Any]]:
     """Whether the residuals are proportional to the velocities before: by an F test."""
     problem, data, rest = judged.problem, judged.residuals, judged.freedom
-    if not judged.inexact or problem.sigma is not None or problem.experiments is None:
+    if not judged.shows_noise or list(_beyond_noise(judged)):  # which says enough
         return
-    if list(_beyond_noise(judged)):  # which says enough
-        return
+    assert problem.experiments is not None
     pre = np.asarray(problem.experiments.pre, float)
     u, singular, _ = np.linalg.svd(pre, full_matrices=False)
-    basis = u[:, singular > 1e-9 * singular[0]]
+    basis = u[:, singular > ROUNDING * singular[0]]
     body = np.broadcast_to(np.arange(pre.shape[1]), problem.measured.shape)
     body = body[~np.isnan(problem.measured)]
     more = np.hstack([basis[data.shot] * (body == i)[:, None] for i in range(pre.shape[1])])
-    residual, known = data.residual.copy(), _range(data.jacobian)
+    residual, known = data.residual.copy(), _range(problem, data.jacobian)
     for k, momentum in enumerate(_conserved(problem)):  # no law explains that part
         if momentum.shape[1]:
             rows = data.shot == k
             more[rows] -= momentum @ (momentum.T @ more[rows])
             residual[rows] -= momentum @ (momentum.T @ residual[rows])
             rest -= 0 if problem.experiments.lost_freedom else momentum.shape[1]
-    extra = _range(more - known @ (known.T @ more), float(np.linalg.norm(more)))
+    extra = _range(problem, more - known @ (known.T @ more), float(np.linalg.norm(more)))
     count = extra.shape[1]
     rest -= count
     explained = float(np.sum((extra.T @ residual) ** 2))
@@ -580,10 +579,10 @@ def _contradicted_priors(judged: _Judged) -> Iterable[dict[str, Any]]:
     problem, data = judged.problem, judged.residuals
     if not judged.inexact:
         return
-    known = _range(data.jacobian)
+    known = _range(problem, data.jacobian)
     for row, prior in zip(np.flatnonzero(data.shot == NO_SHOT), problem.priors):
         left = 1 - float(known[row] @ known[row])  # variance of the residual; 0: the prior decides
-        if left <= _RANGE:
+        if left <= RANK_TOLERANCE[problem.precision]:
             continue
         far = float(abs(data.residual[row]) / np.sqrt(left))
         if chdtrc(1, far**2) < LEVEL / len(problem.priors):
@@ -598,7 +597,7 @@ def _suspicious(judged: _Judged) -> Iterable[dict[str, Any]]:
     labels, count = judged.problem.experiments.shots, len(judged.residuals.shots)
     suspects = [
         (squares, labels[k])
-        for k, squares, chance in (_beyond_median if judged.robust else _beyond_others)(judged)
+        for k, squares, chance in _against_others(judged)
         if squares > 0 and chance < LEVEL / count
     ]
     if not suspects:
@@ -614,38 +613,28 @@ def _suspicious(judged: _Judged) -> Iterable[dict[str, Any]]:
     }
 
 
-def _beyond_others(judged: _Judged) -> Iterable[tuple[int, float, float]]:
-    """Every shot, its sum of squares, how often the noise of the others is as large: F tests."""
-    problem, data = judged.problem, judged.residuals
-    known, reading = _range(data.jacobian), _reading_variance(problem)
-    if judged.freedom - max((data.shot == k).sum() for k in data.shots) < _LEAST:
-        return
+def _against_others(judged: _Judged) -> Iterable[tuple[int, float, float]]:
+    """Every shot, its sum of squares, how often the noise of the others is as large: F tests.
+
+    The others are fitted without it; after a robust loss their noise is that of the median
+    residual, which many outliers together do not hide in. `sigma`, if known, is the least noise.
+    """
+    problem, data, freedom = judged.problem, judged.residuals, judged.freedom
+    known, reading = _range(problem, data.jacobian), _reading_variance(problem)
+    median = MEDIAN * float(np.median(np.abs(data.residual)))
     for k in data.shots:
         rows = data.shot == k
         r, q, n = data.residual[rows], known[rows], int(rows.sum())
-        rest = judged.freedom - n
-        squares = float(r @ np.linalg.lstsq(np.eye(n) - q @ q.T, r, rcond=1e-9)[0])
-        noise = max(data.squares - squares, 0.0) / rest + reading
-        yield int(k), squares, _too_large(problem, squares, n, rest, noise)
-
-
-def _beyond_median(judged: _Judged) -> Iterable[tuple[int, float, float]]:
-    """The same against the median residual, which many outliers together do not hide in."""
-    problem, data, freedom = judged.problem, judged.residuals, judged.freedom
-    if MEDIAN_FREEDOM * freedom < _LEAST:
-        return
-    scale = MEDIAN * float(np.median(np.abs(data.residual)))
-    noise = scale**2 * len(data.residual) / freedom + _reading_variance(problem)
-    for k in data.shots:
-        r = data.residual[data.shot == k]
-        squares = float(r @ r)
-        yield int(k), squares, _too_large(problem, squares, len(r), MEDIAN_FREEDOM * freedom, noise)
-
-
-def _too_large(problem: FitProblem, squares: float, n: int, rest: float, noise: float) -> float:
-    """How often n residuals have so large squares; sigma, where it is known, is the least noise."""
-    noise = noise if problem.sigma is None else max(noise, 1.0)
-    return 0.0 if noise == 0 else float(fdtrc(n, rest, squares / n / noise))
+        rest = MEDIAN_FREEDOM * freedom if judged.robust else freedom - n
+        if rest < _LEAST:
+            continue
+        if judged.robust:
+            squares, noise = float(r @ r), median**2 * len(data.residual) / freedom
+        else:
+            squares = float(r @ np.linalg.lstsq(np.eye(n) - q @ q.T, r, rcond=1e-9)[0])
+            noise = max(data.squares - squares, 0.0) / rest
+        noise = max(noise + reading, 0.0 if problem.sigma is None else 1.0)
+        yield int(k), squares, float(fdtrc(n, rest, squares / n / noise)) if noise else 0.0
 
 
 def _at_bounds(judged: _Judged) -> Iterable[dict[str, Any]]:
@@ -670,12 +659,6 @@ def _equally_good(judged: _Judged) -> Iterable[dict[str, Any]]:
     more = max(EQUALLY_GOOD * noise**2, problem.exact_squares)
     several = sum(end.sum_of_squares <= minima[0].sum_of_squares + more for end in minima)
     return [{"several": several}] if several > 1 and not _undetermined(judged) else []
-
-
-def _noise_hidden(judged: _Judged) -> bool:
-    """Whether a fit without sigma reproduces its data."""
-    problem = judged.problem
-    return problem.sigma is None and reproduced(problem, judged.solution.minima[0])
 
 
 def _when(condition: Callable[[_Judged], Any]) -> Callable[[_Judged], Iterable[dict[str, Any]]]:
@@ -770,7 +753,13 @@ FIT_ROWS = (
         "No degree of freedom is left to estimate the noise: errors are unknown without sigma.",
     ),
     Check(
-        _when(lambda judged: judged.freedom >= 1 and _noise_hidden(judged)),
+        _when(
+            lambda judged: (
+                judged.freedom >= 1
+                and judged.problem.sigma is None
+                and judged.solution.minima[0].sum_of_squares <= judged.problem.exact_squares
+            )
+        ),
         "The data are reproduced to the last digit and do not show their noise: errors are unknown "
         "without `sigma` or `resolution`.",
     ),

@@ -1,10 +1,9 @@
 """Measured shots: velocities before and after impacts, read from CSV files."""
 
-import functools
 import operator
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -16,10 +15,11 @@ from jimpact.bodies.base import CLOSED_BELOW, Body
 from jimpact.files.shots_file import ANGULAR, LINEAR, read_shots
 from jimpact.scene import WALLS, Scene, chain, dense_mass, stackable, with_gaps
 
-# Share of the momentum up to which a corrected shot counts as conserving it: rounding, also in
-# files of ten digits. Ten times more would take measured shots for corrected ones no more often.
-CONSERVED = 1e-9
+# Share of velocities, momenta and readings up to which a difference is rounding, also in files of
+# ten digits. Ten times more would take measured shots for corrected ones no more often.
+ROUNDING = 1e-9
 _PRINTED = 4  # shots that `print` shows
+_VALUES = ("pre", "post", "sigma", "sigma_pre", "resolution")
 _RESOLUTION = operator.attrgetter("resolution")
 
 
@@ -150,11 +150,11 @@ class Experiments(eqx.Module):
 
     def scene_of(self, scene: Scene | None, shot: int) -> Scene:
         """The scene of one shot (counted from 0): its own, or else the given common one."""
-        return _scene_of(self, scene, shot)
+        return self.each(scene, lambda each: each)[shot]
 
     def largest_scene(self, scene: Scene | None) -> Scene:
         """The first of the scenes (or the given common scene) with the most contacts."""
-        return max(self.each(scene, lambda s: s), key=lambda each: each.contacts)
+        return max(self.each(scene, lambda each: each), key=lambda each: each.contacts)
 
     def momentum_excess(self, scene: Scene | None = None) -> np.ndarray:
         """Momentum that the contacts cannot have changed, but the data did: (K, c) [N s].
@@ -213,12 +213,20 @@ class Experiments(eqx.Module):
 
     def _with(self, **changed: Any) -> "Experiments":
         """A copy with other fields."""
-        names = ("pre", "post", "sigma", "scenes", "shots", "units", "sigma_pre")
-        changed = {"lost_freedom": self.lost} | changed
-        resolution = changed.pop("resolution", self.resolution)
-        copy = Experiments(**({name: getattr(self, name) for name in names} | changed))
+        fields = self._of_each_shot() | {"units": self.units} | changed
+        for name in _VALUES:
+            fields[name] = None if fields[name] is None else np.asarray(fields[name])
+        resolution = fields.pop("resolution")
         # what it adds to sigma is there already
-        return eqx.tree_at(_RESOLUTION, copy, resolution, is_leaf=lambda x: x is None)
+        return eqx.tree_at(
+            _RESOLUTION, Experiments(**fields), resolution, is_leaf=lambda x: x is None
+        )
+
+    def _of_each_shot(self) -> dict[str, Any]:
+        """What each shot has, by the name of its argument; None: no shot has it."""
+        names = (*_VALUES, "scenes", "shots")
+        fields = {"lost_freedom": self.lost} | {name: getattr(self, name) for name in names}
+        return {name: np.asarray(x) if eqx.is_array(x) else x for name, x in fields.items()}
 
     def with_contacts(self, contacts: int | Sequence[int]) -> "Experiments":
         """The shots on such numbers of `contacts`."""
@@ -237,14 +245,8 @@ class Experiments(eqx.Module):
         ('2',)
         """
         rows = np.arange(len(self.shots))[which]
-        fields: dict[str, Any] = {"shots": [self.shots[k] for k in rows]}
-        fields["lost_freedom"] = [self.lost[k] for k in rows]
-        for name in ("pre", "post", "sigma", "sigma_pre", "resolution"):
-            values = getattr(self, name)
-            fields[name] = None if values is None else np.asarray(values)[rows]
-        if self.scenes is not None:
-            fields["scenes"] = [self.scenes[k] for k in rows]
-        return self._with(**fields)
+        fields = self._of_each_shot().items()
+        return self._with(**{k: None if x is None else [x[i] for i in rows] for k, x in fields})
 
     def __add__(self, other: "Experiments") -> "Experiments":
         """These shots and others, see `join`."""
@@ -277,24 +279,20 @@ class Experiments(eqx.Module):
         ):
             if len(set(same)) > 1:
                 raise ValueError(f"Argument `many` must have {name}.")
-        labels = [label for data in many for label in data.shots]
-        if len(set(labels)) < len(labels):
-            labels = [f"{i}/{label}" for i, data in enumerate(many, 1) for label in data.shots]
-        first, names = many[0], ("pre", "post", "sigma", "resolution")
-        parts = {name: [getattr(data, name) for data in many] for name in names}
-        if any(data.sigma_pre is not None for data in many):
-            exact = [jnp.zeros_like(data.pre) for data in many]
-            parts["sigma_pre"] = [
-                e if d.sigma_pre is None else d.sigma_pre for d, e in zip(many, exact)
-            ]
-        fields: dict[str, Any] = {
-            name: None if any(x is None for x in each) else np.concatenate(each)
-            for name, each in parts.items()
-        }
-        if first.scenes is not None:
-            fields["scenes"] = [scene for data in many for scene in data.scenes or ()]
-        lost = [k for data in many for k in data.lost]
-        return first._with(**fields, shots=labels, lost_freedom=lost)
+        columns = [data._of_each_shot() for data in many]
+        if any(each["sigma_pre"] is not None for each in columns):
+            for each in columns:
+                if each["sigma_pre"] is None:
+                    each["sigma_pre"] = np.zeros_like(each["pre"])
+        joined: dict[str, Any] = {}
+        for name in columns[0]:
+            parts = [each[name] for each in columns]
+            known = all(part is not None for part in parts)
+            joined[name] = [row for part in parts for row in part] if known else None
+        if len(set(joined["shots"])) < len(joined["shots"]):
+            sets = enumerate(many, 1)
+            joined["shots"] = [f"{i}/{label}" for i, data in sets for label in data.shots]
+        return many[0]._with(**joined)
 
     @property
     def contacts(self) -> np.ndarray:
@@ -330,26 +328,21 @@ class Experiments(eqx.Module):
         return [(rows, a, b) for rows, a, b in zip(self.each(scene, conserved_momenta), pre, post)]
 
     def each(self, scene: Scene | None, function: Callable[[Scene], Any]) -> list[Any]:
-        """`function` of the scene of every shot; of a common one only once."""
-        if self.scenes is None:
-            return [function(_scene_of(self, scene, 0))] * len(self.shots)
-        return [function(_scene_of(self, scene, k)) for k in range(len(self.shots))]
-
-
-def _scene_of(data: Experiments, scene: Scene | None, shot: int) -> Scene:
-    """`Experiments.scene_of`. Calling a method would go through all arrays of `data`."""
-    if data.scenes is not None:
-        scene = data.scenes[shot]
-    if scene is None:
-        raise ValueError(
-            "Argument `scene` must be a Scene where the experiments carry none, but is None."
-        )
-    if scene.size != data.pre.shape[1]:
-        raise ValueError(
-            "Argument `experiments` must have one velocity per body of the scene: it has "
-            f"{data.pre.shape[1]} a shot, but the scene has {scene.size}."
-        )
-    return scene
+        """`function` of the scene of every shot; of one that several shots have only once."""
+        if self.scenes is not None:
+            different = {id(own): own for own in self.scenes}
+            values = {key: function(own) for key, own in different.items()}
+            return [values[id(own)] for own in self.scenes]
+        if scene is None:
+            raise ValueError(
+                "Argument `scene` must be a Scene where the experiments carry none, but is None."
+            )
+        if scene.size != self.pre.shape[1]:
+            raise ValueError(
+                "Argument `experiments` must have one velocity per body of the scene: it has "
+                f"{self.pre.shape[1]} a shot, but the scene has {scene.size}."
+            )
+        return [function(scene)] * len(self.shots)
 
 
 def _smallest_change(data: Experiments, k: int, rows: np.ndarray) -> np.ndarray:
@@ -367,7 +360,7 @@ def kept_by_corrections(data: Experiments, scene: Scene | None) -> list[np.ndarr
     """
     kept: list[np.ndarray | None] = []
     for k, (m, pre, post) in enumerate(data.balances(scene)):
-        rounding = CONSERVED * np.abs(m) @ (np.abs(pre) + np.abs(post))
+        rounding = ROUNDING * np.abs(m) @ (np.abs(pre) + np.abs(post))
         corrected = 0 < len(m) <= data.lost[k] and (np.abs(m @ (post - pre)) <= rounding).all()
         kept.append(np.eye(len(pre)) - _smallest_change(data, k, m) @ m if corrected else None)
     return kept
@@ -381,25 +374,6 @@ def _filled(rows: list[np.ndarray]) -> np.ndarray:
     return filled
 
 
-class _Same(NamedTuple):
-    """A scene that is equal to itself only."""
-
-    scene: Scene
-
-    def __hash__(self) -> int:
-        return id(self.scene)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Same) and self.scene is other.scene
-
-
-def _remembered(function: Callable[[Scene], np.ndarray]) -> Callable[[Scene], np.ndarray]:
-    """The function, which need not compute again for the scenes it was called with last."""
-    last = functools.lru_cache(maxsize=4)(lambda same: function(same.scene))
-    return functools.wraps(function)(lambda scene: last(_Same(scene)))
-
-
-@_remembered
 def conserved_momenta(scene: Scene) -> np.ndarray:
     """`C^T M` (c, n): C spans the complement of all contact and constraint directions."""
     others = [x for x in (scene.tangents, scene.constraints) if x is not None]
@@ -411,7 +385,6 @@ def conserved_momenta(scene: Scene) -> np.ndarray:
     return (complement / complement[largest, np.arange(complement.shape[1])]).T @ dense_mass(scene)
 
 
-@_remembered
 def closed_normals(scene: Scene) -> np.ndarray:
     """Normals (n, c) of the closed contacts."""
     return np.asarray(scene.normals, float)[:, np.asarray(scene.closed)]

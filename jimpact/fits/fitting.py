@@ -12,27 +12,28 @@ from jimpact._checks import as_whole, check_choice, check_kind
 from jimpact.files.records import listed
 from jimpact.fits.checks import MEDIAN, fit_warnings, stretch, unusable, weighted
 from jimpact.fits.data import Experiments
-from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw, plain_law
+from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw
 from jimpact.fits.problem import FitProblem, filled_count, of_shots
-from jimpact.fits.profiles import needs_profiles, profile, profiles_of
-from jimpact.fits.report import Fit
+from jimpact.fits.profiles import LEVEL, PROFILE_STARTS, needs_profiles, profiles_of
 from jimpact.fits.solve import (
     DEFAULT_STEPS,
+    HARDLY_WORSE,
+    SETTLED,
     Ends,
     FitMinimum,
     Method,
     Search,
     Solution,
-    check_method,
     default_steps,
     find_minima,
     minimize,
-    repeated,
     settled,
     solution,
+    stacked,
     start_points,
 )
 from jimpact.fits.uncertainty import (
+    Fit,
     Profile,
     Uncertainty,
     check_level,
@@ -42,14 +43,10 @@ from jimpact.fits.uncertainty import (
 from jimpact.progress import progress_bar
 from jimpact.scene import Scene
 
-# A minimum gets standard errors up to a sum of squares this many noise standard deviations above
-# the best: intervals of all levels end before. With ten times more, only time is lost.
-HARDLY_WORSE = 10.0
-QUICK_LEVEL = 0.95  # of the profiles that `fit` computes by default
 HUBER = 1.345  # sigmas up to which a residual counts squared: 95 % of the efficiency
 STUDENT = 4.0  # degrees of freedom of the tails
 ROUNDS = 50  # of weights
-SAME = 1e-7  # in natural scales of the parameters: the weights have settled
+LEAST_SLOPE = 1e-7  # mean psi' of residuals that all are outliers, in the place of 0
 
 
 def fit(
@@ -137,8 +134,8 @@ def fit(
     >>> round(float(result.law.restitution), 4)
     0.4
     """
-    check_method(method)
-    steps = default_steps(method) if max_steps is None else max_steps
+    default = default_steps(method)
+    steps = default if max_steps is None else max_steps
     if starts is not None:
         as_whole("starts", starts, 1)
     for name, count, least in (("max_steps", steps, 1), ("seed", seed, 0)):
@@ -171,11 +168,10 @@ def fit(
         if loss != "squares":
             problem, found, robust = _robust(problem, found, loss, search)
     result = replace(as_fit(problem, found, method, robust), loss=loss, seed=seed)
-    if profiles:
-        return _with_profiles(result, profile(result, progress=progress))
-    if profiles is None and needs_profiles(result):
+    if profiles or (profiles is None and needs_profiles(result)):
+        more = PROFILE_STARTS if profiles else 0
         every = range(len(result.names))
-        return _with_profiles(result, profiles_of(result, every, QUICK_LEVEL, 0, progress))
+        return _with_profiles(result, profiles_of(result, every, LEVEL, more, progress))
     return result
 
 
@@ -205,7 +201,7 @@ def _check_derivatives(problem: FitProblem, solution: Solution) -> None:
         )
 
 
-def _rms(problem: FitProblem, residual: np.ndarray) -> float:
+def rms(problem: FitProblem, residual: np.ndarray) -> float:
     """The root mean square of residuals, those in rad/s by kinetic energy [m/s]."""
     data = problem.experiments
     natural_error = 1.0 if data is None else data.natural_errors(problem.scene)
@@ -238,13 +234,14 @@ def as_fit(
     findings = fit_warnings(judged, found, errors, robust is not None)
     numbers = errors._asdict()
     undetermined = numbers.pop("undetermined")
-    slope = found.jacobian.reshape((*residual.shape, len(problem.names)))
-    starts = [
-        replace(x, standard_error=_standard_error(problem, found, x, errors), jacobian=None)
-        for x in found.minima
-    ]
+    slope = problem.of_data(found.jacobian)
+    starts, limit = [], found.minima[0].sum_of_squares + HARDLY_WORSE * errors.noise**2
+    for end in found.minima:
+        matters = not end.sum_of_squares > limit  # also where the noise is not known
+        error = uncertainty(problem, end, errors.noise).standard_error if matters else None
+        starts.append(FitMinimum(end.sum_of_squares, end.value, end.count, error))
     return Fit(
-        law=plain_law(problem.law_in_scene(found.value)),
+        law=problem.to_law(found.value),
         method=method if isinstance(method, str) else "optax",
         names=problem.names,
         value=found.value,
@@ -252,7 +249,7 @@ def as_fit(
         at_bound=found.at_bound,
         predicted=found.predicted,
         residual=residual,
-        rms=_rms(problem, residual),
+        rms=rms(problem, residual),
         **numbers,
         identifiability=(*problem.notes, *undetermined),
         starts=tuple(starts),
@@ -280,18 +277,6 @@ def _errors(
     elif problem.sigma is not None:
         noise = stretch(judged, weighted(problem, found), errors.rank)
     return errors if noise in (None, 1.0) else uncertainty(problem, best, noise)
-
-
-def _standard_error(
-    problem: FitProblem, found: Solution, minimum: FitMinimum, best: Uncertainty
-) -> np.ndarray | None:
-    """Standard errors (P,) at a minimum that fits hardly worse than the best; else None."""
-    if minimum is found.minima[0]:
-        return best.standard_error
-    more = minimum.sum_of_squares - found.minima[0].sum_of_squares
-    if not more <= (HARDLY_WORSE * best.noise) ** 2:
-        return None
-    return uncertainty(problem, minimum, best.noise).standard_error
 
 
 # ---------------------------------------------------------------------------- robust losses
@@ -329,19 +314,20 @@ def _robust(
         share, slope = LOSSES[loss](error / scale)
         factor, before = np.sqrt(share), problem.point(found.value)
         weighed = problem.weighed(factor)
-        found = solution(weighed, minimize(repeated(weighed, 1), before[None], search))
-        if np.abs(problem.point(found.value) - before).max() <= SAME:
+        found = solution(weighed, minimize(stacked([weighed]), before[None], search))
+        if np.abs(problem.point(found.value) - before).max() <= SETTLED:
             break
     else:
         found = found._replace(converged=False)
     psi = (share * error / scale)[here]
-    noise = scale * np.sqrt(np.sum(psi**2)) / max(slope[here].mean(), SAME)
+    noise = scale * np.sqrt(np.sum(psi**2)) / max(slope[here].mean(), LEAST_SLOPE)
     # weighted as in the problem, without the factors of the loss
+    minimum, size = found.minima[0], factor.size
     residual = problem.independent(problem.measured - found.predicted)
-    from_priors, _ = problem.prior_errors(found.value)
-    squares = float(np.sum(residual**2) + np.sum(from_priors**2))
-    slope = found.jacobian / factor.reshape(-1, 1)
-    minimum = FitMinimum(squares, found.value, 1, jacobian=slope)
+    residual = np.append(-residual, minimum.residual[size:])
+    slope = minimum.jacobian / np.append(factor, np.ones(len(residual) - size))[:, None]
+    squares = float(np.sum(residual**2))
+    minimum = FitMinimum(squares, found.value, 1, None, slope, residual)
     return problem, found._replace(minima=[minimum]), float(noise)
 
 
@@ -405,7 +391,9 @@ def fit_many(
 
     for k, data in enumerate(many):
         check_kind(f"many[{k}]", data, Experiments)
-    problems = _problems(law, scene, many, choice)
+    first = of_shots(law, scene, many[0], *choice)
+    others = (first.with_shots(data) or of_shots(law, scene, data, *choice) for data in many[1:])
+    problems = [first, *others]
     each: list[Ends] = [None] * len(many)  # type: ignore[list-item]  # where its starts ended
     with progress_bar(progress) as show:
         for members in _alike(many):
@@ -430,24 +418,6 @@ def fit_many(
         np.array([getattr(ends, name) for ends in best]) for name in ("y", "squares", "converged")
     )
     return Fits(problems[0].names, problems[0].values_at(y), squares, converged, made)
-
-
-def _problems(
-    law: AnyLaw, scene: Scene | None, many: Sequence[Experiments], choice: tuple[Any, ...]
-) -> list[FitProblem]:
-    """The problem of each data set; those in a common scene differ in their shots only."""
-    first = of_shots(law, scene, many[0], *choice)
-    problems = [first]
-    for data in many[1:]:
-        same = data.scenes is None and first.scene is not None and data.units == many[0].units
-        exact = data.sigma_pre is None and first.mixing is None
-        # of a coarser law, where the noise allows it, each set decides by itself
-        coarse = any("computed with `rtol`" in note for note in first.notes)
-        if same and exact and not coarse:
-            problems.append(first.with_shots(data))
-        else:
-            problems.append(of_shots(law, scene, data, *choice))
-    return problems
 
 
 def _alike(many: Sequence[Experiments]) -> list[list[int]]:

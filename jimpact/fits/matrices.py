@@ -37,7 +37,6 @@ _REDUNDANT = 100.0  # G with an eigenvalue below this multiple of m eps has no i
 _CUTS = 60  # rounds of cutting planes, mostly 10 to 20
 _FLAT = 1e-9  # share of the longest derivative below which a condition does not depend on y
 _WORST = 2  # new cuts of each scene and contact
-_HALVINGS = 40  # from a start on the boundary towards the inside
 _FACES = ("E >= 0", "G^-1 (I + E) >= 0", "G^-1 - E^T G^-1 E copositive (energy)")
 
 
@@ -57,7 +56,6 @@ class AdmissibleMatrices(eqx.Module):
     closed: jax.Array  # (S, m) zeros and ones
     bounds: jax.Array | None  # (2, Q) of y
     center: jax.Array  # y strictly inside
-    moving: jax.Array  # which of the elementwise conditions depend on y
 
     def matrices(self, y: jax.Array) -> jax.Array:
         """E (S, m, m), with zeros for open contacts."""
@@ -68,7 +66,7 @@ class AdmissibleMatrices(eqx.Module):
     def elementwise(self, y: jax.Array) -> jax.Array:
         """All that must be >= 0 and is linear in y: E, impulses, distances from the bounds.
 
-        1 for conditions that y cannot change.
+        1 where there is no bound.
         """
         e = self.matrices(y)
         identity = jnp.eye(e.shape[1], dtype=e.dtype)[None]
@@ -76,13 +74,14 @@ class AdmissibleMatrices(eqx.Module):
         slack = [self.origin + self.map @ y, impulses.reshape(-1)]
         if self.bounds is not None:
             slack += [y - self.bounds[0], self.bounds[1] - y]
-        return jnp.where(self.moving, jnp.concatenate(slack), 1.0)
+        slacks = jnp.concatenate(slack)
+        return jnp.where(jnp.isfinite(slacks), slacks, 1.0)
 
-    def lost_energy(self, y: jax.Array, x: jax.Array) -> jax.Array:
-        """`x^T (G^-1 - E^T G^-1 E) x`, twice the energy lost at `qn- = -x` (S, F)."""
-        e, inverse = self.matrices(y), self.inverse
-        after = jnp.einsum("sij,sfj->sfi", e, x)
-        return _square(inverse, x) - _square(inverse, after)
+    @property
+    def faces(self) -> int:
+        """Number of conditions on the energy."""
+        scenes, m = self.closed.shape
+        return scenes * (2**m - 1)
 
     def worst(self, y: jax.Array) -> jax.Array:
         """Approaches x >= 0 (S, F, m) among which each face has that of the least lost energy.
@@ -108,16 +107,6 @@ class AdmissibleMatrices(eqx.Module):
         e = self.matrices(y)
         return self.inverse - jnp.swapaxes(e, 1, 2) @ self.inverse @ e
 
-    def retract(self, y: jax.Array) -> jax.Array:
-        """y, or the last admissible point on the way to it from the center.
-
-        Differentiated (in line searches) as if the share of the way stayed the same.
-        """
-        share = self.share(jax.lax.stop_gradient(y))
-        short = 1 - _SHORT * jnp.finfo(y.dtype).eps
-        inside = self.center + short * share * (y - self.center)
-        return jnp.where(share < 1, inside, y)
-
     @full_precision
     def nearest(self, y: jax.Array, hessian: jax.Array, gradient: jax.Array) -> jax.Array:
         """The admissible z of the least `g^T (z - y) + (z - y)^T H (z - y) / 2`.
@@ -130,8 +119,8 @@ class AdmissibleMatrices(eqx.Module):
         weight = _LEAST_DAMPING[str(dtype)] * jnp.where(largest > 0, largest, 1.0)
         hessian = hessian + weight * jnp.eye(size, dtype=dtype)
         rounding = _SHORT * jnp.finfo(dtype).eps * jnp.abs(self.inverse).max()
-        first = len(self.moving)
         slack, rows = self.conditions(y)
+        first = len(slack) - self.faces
         linear = slack[:first], rows[:first]
         worst = min(len(slack) - first, _WORST * self.closed.size)
 
@@ -152,12 +141,15 @@ class AdmissibleMatrices(eqx.Module):
         none = jnp.ones(size, dtype), jnp.zeros((size, size), dtype)
         start = (y, none, jnp.asarray(True), jnp.asarray(0))
         end = jax.lax.while_loop(lambda s: s[2] & (s[3] < _CUTS), closer, start)
-        return self.retract(end[0])
+        # cutting planes leave rounding
+        share = self.share(end[0])
+        inside = self.center + (1 - _SHORT * jnp.finfo(dtype).eps) * share * (end[0] - self.center)
+        return jnp.where(share < 1, inside, end[0])
 
     def share(self, y: jax.Array) -> jax.Array:
         """How much of the way from the center to y is admissible, at most 1."""
         slack, target = self.elementwise(self.center), self.elementwise(y)
-        crossed = target < 0
+        crossed = (target < 0) & (target < slack)  # others, y does not change
         share = jnp.where(crossed, slack / jnp.where(crossed, slack - target, 1.0), 1.0).min()
 
         def closer(
@@ -185,11 +177,13 @@ class AdmissibleMatrices(eqx.Module):
 
     def conditions(self, y: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Slacks (C,), >= 0 but for rounding, of all conditions, and their derivatives (C, Q)."""
-        x = self.worst(y)
+        x = self.worst(y)  # at qn- = -x the energy lost is x^T Q x / 2
 
         def slacks(y: jax.Array) -> tuple[jax.Array, jax.Array]:
             """Slacks, to be differentiated, and once more as they are."""
-            value = jnp.concatenate([self.elementwise(y), self.lost_energy(y, x).reshape(-1)])
+            value = jnp.concatenate(
+                [self.elementwise(y), _square(self._dissipation(y), x).reshape(-1)]
+            )
             return value, value
 
         rows, slack = jax.jacfwd(slacks, has_aux=True)(y)
@@ -212,47 +206,54 @@ def _quadratic(
     return free + response @ dual.z, dual.z * scale, dual.code == CODE["ok"]
 
 
-def _square(inverse: jax.Array, x: jax.Array) -> jax.Array:
-    """`x^T G^-1 x` of x (S, F, m)."""
-    return jnp.einsum("sfi,sij,sfj->sf", x, inverse, x)
+def _square(a: jax.Array, x: jax.Array) -> jax.Array:
+    """`x^T A x` of x (S, F, m)."""
+    return jnp.einsum("sfi,sij,sfj->sf", x, a, x)
 
 
 def matrix_region(
-    law: Law, scenes: list[Scene], origin: np.ndarray, mix: np.ndarray, bounds: np.ndarray
+    law: Law,
+    scenes: list[Scene],
+    origin: np.ndarray,
+    mix: np.ndarray,
+    bounds: np.ndarray,
+    start: np.ndarray,
 ) -> AdmissibleMatrices | None:
     """The region of a fit of an (m, m) `RestitutionMatrix`; None for other laws and forms.
 
     Args:
-        law: holds the start matrix.
+        law: whose matrix it is.
         scenes: of the shots; E must be admissible in each.
         origin: (Q,) entries of E where y = 0.
         mix: (Q, Q) derivatives of the entries with respect to y.
         bounds: (2, Q) of y.
+        start: y (Q,) of the law itself.
 
     Raises:
         ValueError: redundant contacts, too many contacts, a start that is not admissible, fixed
             entries that leave no admissible choice.
     """
-    if not scenes or not encloses(law, scenes[0].contacts):
+    if not encloses(law, scenes[0].contacts):
         return None
     assert isinstance(law, RestitutionMatrix)
     dtype = law.matrix.dtype
     used = np.any(mix != 0, axis=0)
     ends = bounds if np.isfinite(bounds[:, used]).any() else None
-    start = jnp.asarray(_start(law.matrix, origin, mix), dtype)
     region = _region(scenes, dtype, origin, mix, ends, start)
-    slack, rows = _host_conditions(region, start)
-    _check_start(region, slack)
-    moving = np.any(rows[:, used] != 0, axis=1) & np.isfinite(slack)
-    region = eqx.tree_at(lambda r: r.moving, region, jnp.asarray(moving[: len(region.moving)]))
-    return eqx.tree_at(lambda r: r.center, region, _center(region, slack, rows, moving))
+    _check_start(region, _host_conditions(region, start)[0])
+    center = _inner_point(region, start)
+    if center is None:
+        raise ValueError(
+            "Argument `free` must leave an admissible choice: with the fixed entries every "
+            "free entry is at the edge already."
+        )
+    return eqx.tree_at(lambda r: r.center, region, jnp.asarray(center, dtype))
 
 
 def admissible_start(scenes: list[Scene]) -> np.ndarray:
-    """A matrix E (m, m) strictly inside the admissible ones of all scenes.
+    """A matrix E (m, m) that is admissible in all scenes.
 
-    `I / 2` where it will do (chains); else the point from which the conditions, all of them
-    concave, are farthest, found by cutting planes.
+    `I / 2` where it will do (chains); else one from which all conditions are far.
 
     Raises:
         ValueError: redundant or too many contacts, or no matrix that is admissible.
@@ -262,33 +263,18 @@ def admissible_start(scenes: list[Scene]) -> np.ndarray:
     >>> admissible_start([ji.chain([1.0, 1.0, 1.0])]).tolist()
     [[0.5, 0.0], [0.0, 0.5]]
     """
-    from scipy.optimize import linprog  # late: slow to import
-
     m = scenes[0].contacts
     dtype = scenes[0].mass.dtype
-    region = _region(scenes, dtype, np.zeros(m * m), np.eye(m * m), None, np.zeros(m * m))
-    e, planes = 0.5 * np.eye(m).ravel(), np.zeros((0, m * m + 2))
-    for _ in range(_CUTS):
-        slack, rows = _host_conditions(region, e)
-        moving = np.any(rows != 0, axis=1)
-        if slack[moving].min() >= -_rounding(region):
-            return e.reshape(m, m)
-        # t <= slack + rows (E - e): least slack t at E, below all tangents so far
-        new = np.column_stack([-rows, np.ones(len(rows)), slack - rows @ e])[moving]
-        planes = np.vstack([planes, new])
-        farthest = linprog(
-            np.append(np.zeros(m * m), -1.0),
-            A_ub=planes[:, :-1],
-            b_ub=planes[:, -1],
-            bounds=[*[(0.0, None)] * (m * m), (None, 1.0)],
+    half = 0.5 * np.eye(m).ravel()
+    region = _region(scenes, dtype, np.zeros(m * m), np.eye(m * m), None, half)
+    will_do = _host_conditions(region, half)[0].min() >= -_rounding(region)
+    e = half if will_do else _inner_point(region, half)
+    if e is None:
+        raise ValueError(
+            "Argument `scene` must have an admissible restitution matrix to start from, but none "
+            "was found: give one, or RestitutionMatrix(matrix, admissible=False)."
         )
-        if not farthest.success or farthest.x[-1] <= 0:
-            break
-        e = farthest.x[:-1]
-    raise ValueError(
-        "Argument `scene` must have an admissible restitution matrix to start from, but none was "
-        "found: give one, or RestitutionMatrix(matrix, admissible=False)."
-    )
+    return e.reshape(m, m)
 
 
 def _region(
@@ -299,9 +285,8 @@ def _region(
     bounds: np.ndarray | None,
     center: Any,
 ) -> AdmissibleMatrices:
-    """The region of these scenes, all of whose conditions count as depending on y."""
+    """The region of these scenes."""
     inverse, closed = _inverses(scenes)
-    count = inverse[0].size * (1 + len(inverse)) + (0 if bounds is None else bounds.size)
     return AdmissibleMatrices(
         origin=jnp.asarray(origin, dtype),
         map=jnp.asarray(mix, dtype),
@@ -309,7 +294,6 @@ def _region(
         closed=jnp.asarray(closed, dtype),
         bounds=None if bounds is None else jnp.asarray(bounds, dtype),
         center=jnp.asarray(center, dtype),
-        moving=jnp.ones(count, bool),
     )
 
 
@@ -344,12 +328,6 @@ def _inverse(scene: Scene) -> np.ndarray:
     return np.vstack([np.linalg.inv(g), np.asarray(scene.closed, g.dtype)])
 
 
-def _start(entries: Any, origin: Any, mix: Any) -> np.ndarray:
-    """y of these entries of E (0 for what is not free)."""
-    rest = np.ravel(np.asarray(entries, float)) - np.asarray(origin, float)
-    return np.asarray(np.linalg.lstsq(np.asarray(mix, float), rest, rcond=None)[0])
-
-
 @quick_jit
 def _all_conditions(region: AdmissibleMatrices, y: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Compiled `AdmissibleMatrices.conditions`."""
@@ -364,9 +342,9 @@ def _host_conditions(region: AdmissibleMatrices, y: Any) -> tuple[np.ndarray, np
 
 def _kinds(region: AdmissibleMatrices) -> tuple[slice, slice, slice]:
     """Where the conditions named in `_FACES` are in a list of all."""
-    entries, elementwise = len(region.origin), len(region.moving)
+    entries = len(region.origin)
     impulses = entries * (1 + len(region.inverse))
-    return slice(entries), slice(entries, impulses), slice(elementwise, None)
+    return slice(entries), slice(entries, impulses), slice(-region.faces, None)
 
 
 def _rounding(region: AdmissibleMatrices) -> float:
@@ -385,29 +363,31 @@ def _check_start(region: AdmissibleMatrices, slack: np.ndarray) -> None:
             )
 
 
-def _center(
-    region: AdmissibleMatrices, slack: np.ndarray, rows: np.ndarray, moving: np.ndarray
-) -> jax.Array:
-    """A point strictly inside: from the start, in the direction that all conditions like best."""
+def _inner_point(region: AdmissibleMatrices, start: np.ndarray) -> np.ndarray | None:
+    """y near the start, from which all conditions are half as far as possible, or farther.
+
+    By cutting planes: the least condition, concave in y, lies below all tangents so far, and the
+    next y is where these leave most. None: there is no such y.
+    """
     from scipy.optimize import linprog  # late: slow to import
 
-    start = np.asarray(region.center, float)
-    used = np.any(rows[moving] != 0, axis=0)
-    solution = linprog(
-        np.append(np.zeros(len(start)), -1.0),  # the least slack after the step is to be large
-        A_ub=np.hstack([-rows, np.ones((len(rows), 1))])[moving],
-        b_ub=slack[moving],
-        bounds=[*((-int(free), int(free)) for free in used), (None, 1.0)],
-    )
-    move = solution.x[:-1] if solution.success else np.zeros(len(start))
-    for halving in range(_HALVINGS):
-        center = start + 0.5**halving * move
-        if _host_conditions(region, center)[0][moving].min() > _rounding(region):
-            return jnp.asarray(center, region.center.dtype)
-    raise ValueError(
-        "Argument `free` must leave an admissible choice: with the fixed entries every "
-        "free entry is at the edge already."
-    )
+    free = np.any(np.asarray(region.map) != 0, axis=0)
+    box = [*((x - moves, x + moves) for x, moves in zip(start, free)), (None, 1.0)]
+    y, most, planes = start, np.inf, np.zeros((0, len(start) + 2))
+    for _ in range(_CUTS):
+        slack, rows = _host_conditions(region, y)
+        moving = np.any(rows[:, free] != 0, axis=1)
+        if slack[moving].min() > max(0.5 * most, _rounding(region)):
+            return y
+        # t <= slack + rows (z - y)
+        new = np.column_stack([-rows, np.ones(len(rows)), slack - rows @ y])[moving]
+        planes = np.vstack([planes, new])
+        cost = np.append(np.zeros(len(start)), -1.0)
+        farthest = linprog(cost, A_ub=planes[:, :-1], b_ub=planes[:, -1], bounds=box)
+        if not farthest.success or farthest.x[-1] <= 0:
+            return None
+        y, most = farthest.x[:-1], farthest.x[-1]
+    return None
 
 
 def boundary(region: AdmissibleMatrices | None, y: np.ndarray) -> tuple[str, ...]:

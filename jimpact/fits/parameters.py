@@ -120,11 +120,6 @@ class Parameters:
         return tuple(self.labels)
 
     @property
-    def count(self) -> int:
-        """Number of entries Q."""
-        return sum(label.size for label in self.labels.values())
-
-    @property
     def first(self) -> list[int]:
         """The first entry of every group: it stands for the parameter."""
         return [group[0] for group in self.groups]
@@ -265,20 +260,21 @@ def _only_ratios(law: Law, labels: Mapping[str, np.ndarray]) -> bool:
 # ---------------------------------------------------------------------------- bounds and priors
 
 
-def _check_names(argument: str, chosen: Mapping[str, Any], known: Any) -> None:
-    """Raise a ValueError unless all chosen names are those of free parameters."""
-    for name in chosen:
-        if name not in known:
-            raise ValueError(
-                f"Argument `{argument}` must name free parameters, {', '.join(known)}, "
-                f"but has {name!r}."
-            )
+def _check_name(argument: str, name: str, known: Any) -> None:
+    """Raise a ValueError unless this names free parameters."""
+    if name not in known:
+        names = tuple(dict.fromkeys(known))
+        raise ValueError(
+            f"Argument `{argument}` must name free parameters, {', '.join(names)}, "
+            f"but has {name!r}.{suggestion(name, names)}"
+        )
 
 
 def bounds_of(parameters: Parameters, law: Law, bounds: Mapping[str, Any] | None) -> Limits:
     """Lower and upper bounds (P,): the user's, or else the field's domain."""
     chosen, fields = dict(bounds or {}), sorted(set(parameters.of_fields))
-    _check_names("bounds", [entry_of(name)[0] for name in chosen], fields)  # type: ignore[arg-type]
+    for name in chosen:
+        _check_name("bounds", entry_of(name)[0], fields)
     ends = {field: _default_bounds(law, field) for field in parameters.fields}
     for name in sorted(chosen, key=lambda name: entry_of(name)[1] is not None):  # fields first
         field, _ = entry_of(name)
@@ -345,8 +341,7 @@ def priors_of(
     """The user's priors, by name of a parameter or of a field for all that belong to it."""
     chosen, fields = dict(priors or {}), parameters.of_fields
     for name in chosen:
-        if name not in (*parameters.names, *fields):
-            _check_names("priors", [name], parameters.names)  # type: ignore[arg-type]
+        _check_name("priors", name, (*parameters.names, *fields))
     found = []
     for i, (name, field, low, high) in enumerate(zip(parameters.names, fields, *limits)):
         pair = chosen.get(name, chosen.get(field))
@@ -387,7 +382,6 @@ class Values:
         self.law, self.functions = law, dict(ties)
         self.places = tied_places(law, ties)
         self.waiting: list[str] = []  # ties that have begun, each needed by the one before
-        self.known: dict[str, Any] = {}
 
     def __getitem__(self, name: str) -> Any:
         """The value of an entry, or of a whole field in its shape."""
@@ -401,8 +395,6 @@ class Values:
 
     def _follow(self, name: str) -> Any:
         """The value of what is tied, by its function."""
-        if name in self.known:
-            return self.known[name]
         if name in self.waiting:
             circle = [*self.waiting[self.waiting.index(name) :], name]
             way = f"{circle[0]} needs {', which needs '.join(circle[1:])}"
@@ -418,8 +410,7 @@ class Values:
                 f"Argument `ties` must give one number for `{name}`{or_shape}, "
                 f"but its function gives shape {value.shape}."
             )
-        self.known[name] = value.ravel() if value.ndim else value
-        return self.known[name]
+        return value.ravel() if value.ndim else value
 
 
 def tied(law: AnyLaw, ties: Ties) -> AnyLaw:
@@ -480,12 +471,11 @@ def tied_places(law: Law, ties: Ties) -> dict[str, list[int]]:
 
 def _value(law: Law, name: str) -> Any:
     """The field of a name, a parameter that is an array."""
-    known = free_parameters_of(law)
-    field, _ = entry_of(name)
+    known, (field, _) = free_parameters_of(law), entry_of(name)
     if field not in known:
         raise ValueError(
             f"Argument `ties` must use parameters of {type(law).__name__}, one of "
-            f"{', '.join(known)}, but uses {name!r}."
+            f"{', '.join(known)}, but uses {name!r}.{suggestion(field, known)}"
         )
     return jnp.asarray(known[field].value)
 
@@ -557,20 +547,18 @@ def with_parts_of_scene(law: Law, scene: Scene | None, own_scenes: bool, free: A
             "admissible in one scene only."
         )
     planar = scene.tangents is not None and scene.tangents.shape == scene.normals.shape
+    flat = jnp.zeros(scene.contacts, scene.mass.dtype) if planar else None
+    mass = scene.mass if scene.mass.ndim == 1 else None
     known = {
-        "mass": (scene.mass.ndim == 1, scene.mass, "that of `scene` is (n,)"),
-        "gaps": (scene.gaps is not None, scene.gaps, "`scene` has gaps"),
-        "tilt": (
-            planar,
-            jnp.zeros(scene.contacts, scene.mass.dtype),
-            "`scene` has one tangent for each contact",
-        ),
+        "mass": (mass, "that of `scene` is (n,)"),
+        "gaps": (scene.gaps, "`scene` has gaps"),
+        "tilt": (flat, "`scene` has one tangent for each contact"),
     }
     for name in parts:
-        has, _, where = known[name]
-        if not has:
+        value, where = known[name]
+        if value is None:
             raise ValueError(f"Argument `free` may name `{name}` only where {where}.")
-    return LawInScene(law, **{name: known[name][1] for name in parts})
+    return LawInScene(law, **{name: known[name][0] for name in parts})
 
 
 def limits_with_scene(

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_whole, needed
+from jimpact._checks import as_whole, check_choice, needed
 from jimpact.compiling import known_options
 from jimpact.fits.fitting import Fit
 from jimpact.fits.problem import FitProblem
@@ -188,13 +188,8 @@ def _priors(problem: FitProblem, chosen_priors: dict[str, Any], kinds: Any) -> d
         log = bool(parameters.log[i])
         low, high = (float(end) for end in problem.domains[i])
         priors[name] = _prior(name, chosen, low, high, log, kinds)
-    known = {*problem.names, *parameters.of_fields}
     for name in chosen_priors:
-        if name not in known:
-            raise ValueError(
-                f"Argument `priors` must name parameters, {', '.join(sorted(known))}, "
-                f"but has {name!r}."
-            )
+        check_choice("priors", name, dict.fromkeys((*problem.names, *parameters.of_fields)))
     return priors
 
 

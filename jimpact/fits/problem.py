@@ -43,7 +43,7 @@ from jimpact.fits.parameters import (
     with_entries,
     with_parts_of_scene,
 )
-from jimpact.fits.solve import EXACT, Evaluated
+from jimpact.fits.solve import EXACT
 from jimpact.impacts import impact
 from jimpact.law import AnyLaw, Law, forward_only
 from jimpact.scene import Scene, dense_mass, stackable
@@ -115,9 +115,8 @@ _ARRAYS = (
 )
 _STATIC = ("fields", "ties")
 _ON_HOST: dict[str, Any] = dict.fromkeys(
-    ("parameters", "domains", "sigma", "values", "priors", "notes", "experiments", "scene")
+    ("parameters", "domains", "sigma", "priors", "notes", "experiments", "scene", "left_out")
 )
-_ON_HOST["left_out"] = None
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=_ARRAYS, meta_fields=(*_STATIC, *_ON_HOST))
@@ -160,7 +159,6 @@ class FitProblem:
         parameters: which entries are free.
         domains: (P, 2) lowest and highest values.
         sigma: standard errors of what was measured, or None.
-        values: how many independent values were measured or are priors.
         priors: of parameters.
         notes: in words, what was fixed instead of fitted.
         experiments, scene: of shots, or None.
@@ -196,7 +194,6 @@ class FitProblem:
     parameters: Parameters
     domains: np.ndarray
     sigma: np.ndarray | None
-    values: int
     priors: tuple[Prior, ...]
     notes: tuple[str, ...]
     experiments: Experiments | None = None
@@ -291,12 +288,21 @@ class FitProblem:
             )
         return problem
 
-    def with_shots(self, data: Experiments) -> "FitProblem":
-        """The same of other shots in the common scene.
+    def with_shots(self, data: Experiments) -> "FitProblem | None":
+        """The same of other shots, where only these differ, which is many times quicker; else None.
+
+        They differ in more where they have scenes, other units or errors of v-, or where the law is
+        computed as coarsely as the noise of the shots allows.
 
         Args:
-            data: shots of as many bodies, with exact v-.
+            data: shots of as many bodies.
         """
+        own, first = data.scenes is not None or self.scene is None, self.experiments
+        if own or first is None or data.units != first.units:
+            return None
+        coarse = getattr(self.law, "rtol", None) == COARSE_RTOL
+        if data.sigma_pre is not None or self.mixing is not None or coarse:
+            return None
         observe: Any = self.observe
         count, n = data.pre.shape
         scenes = jax.tree.map(lambda x: np.repeat(x[:1], count, axis=0), observe.scenes)
@@ -304,13 +310,11 @@ class FitProblem:
         before[:, :n] = np.asarray(data.pre)
         sigma, errors, unit = _errors_and_unit(data, self.scene)
         arrays = _weighed_values(np.asarray(data.post), errors, unit)
-        here = int(data.measured.sum())
         return replace(
             self,
             observe=replace(observe, scenes=scenes, pre=before),
             **_in(self.low.dtype, arrays),
             sigma=sigma,
-            values=here + len(self.priors) - data.lost_freedom,
             experiments=data,
         )
 
@@ -325,12 +329,7 @@ class FitProblem:
             weight = self.weight * used
             mixing = np.where(used, factor, 1.0)[..., None] * mixing
         measured = np.where(used, self.measured, np.nan)
-        lost = int(np.isnan(measured).sum() - np.isnan(self.measured).sum())
-        if self.experiments is not None:  # whole shots are left out, with what a correction took
-            gone = np.isnan(measured).all(axis=1) & ~np.isnan(self.measured).all(axis=1)
-            lost -= int(np.array(self.experiments.lost)[gone].sum())
-        values = self.values - lost
-        return replace(self, **self._weights(weight, mixing), measured=measured, values=values)
+        return replace(self, **self._weights(weight, mixing), measured=measured)
 
     def _weights(self, weight: np.ndarray, mixing: Any) -> dict[str, Any]:
         """The fields that follow from weights and mixing."""
@@ -448,7 +447,7 @@ class FitProblem:
         x = jax.lax.stop_gradient(jnp.asarray(x, self.low.dtype))
         rest = len(self.low) - len(x)
         x = jnp.pad(x, (0, rest))
-        y = jnp.where(self.log, jnp.log(jnp.where(self.log, x, 1.0)), x / self.scale)
+        y = scaled(x, self.scale, self.log, jnp)
         inside = jnp.clip(y, self.low, self.high)
         if self.matrix is not None:
             inside = self.matrix.nearest(y, jnp.eye(len(y), dtype=y.dtype), jnp.zeros_like(y))
@@ -477,7 +476,7 @@ class FitProblem:
     @full_precision
     def _values(self, y: jax.Array) -> jax.Array:
         """x (Q,) of y (Q,)."""
-        return jnp.where(self.log, jnp.exp(jnp.where(self.log, y, 0.0)), y * self.scale)
+        return unscaled(y, self.scale, self.log, jnp)
 
     def _errors(self, law: Law) -> tuple[jax.Array, Prediction]:
         """Residual of what was measured, 0 elsewhere, and what the law makes visible."""
@@ -486,16 +485,9 @@ class FitProblem:
         error = jnp.where(bad, 0.0, prediction.value) - jnp.where(bad, 0.0, self.measured)
         error = jnp.where(bad, PENALTY * self.unit, error)
         error = jnp.where(self.weight > 0, error, 0.0)  # its derivatives may be NaN
-        return self._mixed(error * self.weight).reshape(-1), prediction
+        return _mixed(error * self.weight, self.mixing, jnp).reshape(-1), prediction
 
-    @full_precision
-    def _mixed(self, weighted: Any) -> Any:
-        """Weighted errors, shaped like what was measured, as independent ones."""
-        if self.mixing is None:
-            return weighted
-        return (self.mixing @ weighted[..., None])[..., 0]
-
-    def evaluate(self, y: jax.Array) -> Evaluated:
+    def evaluate(self, y: jax.Array) -> tuple[jax.Array, jax.Array, Any]:
         """At y (Q,): residual (R + Q,) over `size`, Jacobian (R + Q, Q), (values, status).
 
         The last Q are those of the priors. Where errors of v- are passed on, `dv+/dv-` (K, n, n)
@@ -519,7 +511,7 @@ class FitProblem:
             aux.append(slopes[..., count:])
         return residual, jacobian[:, :count], tuple(aux)
 
-    def blank(self, y: np.ndarray) -> Evaluated:
+    def blank(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, Any]:
         """Zeros shaped like what `evaluate` gives of S such problems at y (S, Q), on the host."""
         (count, q), shape, dtype = y.shape, self.measured.shape[1:], y.dtype
         size = math.prod(shape) + q
@@ -527,7 +519,7 @@ class FitProblem:
         aux: Any = (np.zeros((count, *shape), dtype), np.zeros((count, statuses), np.int32))
         if self.mixing is not None:
             aux += (np.zeros(np.shape(self.mixing), dtype),)
-        return np.zeros((count, size), dtype), np.zeros((count, size, q), dtype), aux  # type: ignore[return-value]
+        return np.zeros((count, size), dtype), np.zeros((count, size, q), dtype), aux
 
     def lanes(self, count: int) -> int:
         """How many of `count` such problems are solved side by side.
@@ -556,14 +548,22 @@ class FitProblem:
     def values_at(self, y: np.ndarray) -> np.ndarray:
         """x (..., P) of y (..., Q), on the host."""
         p = len(self.names)
-        y, log = np.asarray(y, float)[..., :p], np.asarray(self.log)[:p]
-        return np.where(log, np.exp(np.where(log, y, 0.0)), y * np.asarray(self.scale, float)[:p])
+        scale = np.asarray(self.scale, float)[:p]
+        return unscaled(np.asarray(y, float)[..., :p], scale, np.asarray(self.log)[:p])
 
     def steps_at(self, x: np.ndarray) -> np.ndarray:
         """(P,) dx/dy: the natural size of a change of each parameter at x."""
         return np.where(self.parameters.log, x, np.asarray(self.scale, float)[: len(x)])
 
     # ------------------------------------------------------------------ for judging a fit
+
+    @property
+    def values(self) -> int:
+        """How many independent values were measured or are priors."""
+        here, data = ~np.isnan(self.measured), self.experiments
+        used = here.any(axis=1) if data is not None else ()
+        lost = sum(np.array(data.lost)[used]) if data is not None else 0
+        return int(here.sum() - lost) + len(self.priors)
 
     @property
     def shot_of_value(self) -> np.ndarray:
@@ -579,11 +579,10 @@ class FitProblem:
         rows = self.measured.shape[0] if self.measured.ndim else 1
         return getattr(self.observe, "labels", None) or tuple(str(k + 1) for k in range(rows))
 
-    def prior_errors(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Of each prior: its mean less x (P,), and the derivatives of x (., P), over its std."""
-        means, stds = (np.array([p[k] for p in self.priors], float) for k in (1, 2))
-        which = np.array([p.parameter for p in self.priors], int)
-        return (means - x[which]) / stds, np.eye(len(self.names))[which] / stds[:, None]
+    def of_data(self, rows: np.ndarray) -> np.ndarray:
+        """Those of rows (R, ...), as of a residual, that are of what was measured, in its shape."""
+        count = self.measured.size
+        return rows[:count].reshape((*self.measured.shape, *rows.shape[1:]))
 
     def independent(self, errors: np.ndarray) -> np.ndarray:
         """Errors of what was measured, in units of sigma and as independent ones.
@@ -591,24 +590,19 @@ class FitProblem:
         Args:
             errors: (K, n, ...), shaped like `measured`, in its units.
         """
-        return self._times_mixing(np.nan_to_num(errors) * self._weight_of(errors), self.mixing)
+        return _mixed(np.nan_to_num(errors) * self._weight_of(errors), self.mixing)
 
     def errors_of(self, independent: np.ndarray) -> np.ndarray:
         """The errors (K, n, ...) that are these as independent ones; NaN where not measured."""
         weight = self._weight_of(independent)
         back = None if self.mixing is None else np.linalg.inv(np.asarray(self.mixing, float))
-        errors = self._times_mixing(independent, back)
+        errors = _mixed(independent, back)
         return np.where(weight > 0, errors / np.where(weight > 0, weight, 1.0), np.nan)
 
     def _weight_of(self, errors: np.ndarray) -> np.ndarray:
         """The weights, with as many axes as these errors."""
         more = (1,) * (errors.ndim - self.measured.ndim)
         return np.asarray(self.weight, float).reshape((*self.measured.shape, *more))
-
-    @staticmethod
-    def _times_mixing(errors: np.ndarray, mixing: Any) -> np.ndarray:
-        """These errors (K, n, ...) mixed within each shot."""
-        return errors if mixing is None else np.einsum("kij,kj...->ki...", mixing, errors)
 
     @property
     def precision(self) -> str:
@@ -648,15 +642,27 @@ def of_shots(
     filled = np.pad(pre, ((0, 0), (0, extra)), constant_values=unit)
     observe = Shots(stacked, filled, n)  # type: ignore[arg-type]
     choice = (free, *known)
-    problem = _build(law, observe, post, sigma, errors, unit, choice, energy, alike)
+    problem = _build(law, observe, post, sigma, errors, unit, choice, energy)
     problem = replace(
         problem,
         notes=(*problem.notes, *of_tolerance),
-        values=problem.values - experiments.lost_freedom,
         experiments=experiments,
         scene=scene,
+        matrix=_admissible(problem, alike),
     )
     return problem.with_errors_before(np.tile(np.eye(n), (count, 1, 1)))
+
+
+def _admissible(problem: FitProblem, scenes: list[Scene]) -> AdmissibleMatrices | None:
+    """The region of y in which a restitution matrix stays admissible, or None."""
+    owner = problem.owner
+    moves = np.where(owner[:, None] == np.arange(len(owner)), problem.scale, 0.0)
+    origin = np.where(owner < 0, problem.fixed, 0.0)
+    ends, start = np.stack([problem.low, problem.high]), problem.point(problem.start)
+    matrix = matrix_region(problem.law, scenes, origin, moves, ends, start)
+    if matrix is not None and any(entry_of(name)[0] == "matrix" for name, _ in problem.ties):
+        raise ValueError("Argument `ties` must not tie a `matrix` that has to stay admissible.")
+    return matrix
 
 
 def _in(dtype: Any, tree: Any) -> Any:
@@ -673,7 +679,6 @@ def _build(
     unit: float,
     choice: tuple[Any, ...],
     energy: float = 1.0,
-    scenes: list[Scene] | None = None,
 ) -> FitProblem:
     """Arrays, weights and natural scales of a fit; `choice`: free, bounds, priors, ties."""
     leaves = [x for x in jax.tree.leaves((law, observe, measured)) if eqx.is_inexact_array(x)]
@@ -693,24 +698,16 @@ def _build(
         )
     arrays = _of_parameters(law, parameters, limits, priors, energy)
     arrays |= _weighed_values(measured, errors, unit)
-    here = ~np.isnan(measured)
-    owner, ends = arrays["owner"], np.stack([arrays["low"], arrays["high"]])
-    moves = np.where(owner[:, None] == np.arange(len(owner)), arrays["scale"], 0.0)
-    origin = np.where(owner < 0, arrays["fixed"], 0.0)
-    matrix = matrix_region(law, scenes or [], origin, moves, ends)
-    if matrix is not None and any(entry_of(name)[0] == "matrix" for name, _ in ties):
-        raise ValueError("Argument `ties` must not tie a `matrix` that has to stay admissible.")
     return FitProblem(
         law=_in(dtype, law),
         observe=_in(dtype, observe),
-        matrix=matrix,
+        matrix=None,
         **_in(dtype, arrays),
         fields=parameters.fields,
         ties=ties,
         parameters=parameters,
         domains=np.stack(limits, axis=1),
         sigma=sigma,
-        values=int(here.sum()) + len(priors),
         priors=priors,
         notes=tuple(notes),
     )
@@ -759,10 +756,21 @@ def _of_parameters(
     return {"owner": owner, "fixed": fixed, "scale": scale} | padded
 
 
-def scaled(x: np.ndarray, scale: np.ndarray, log: np.ndarray) -> np.ndarray:
-    """y of values x, on the host."""
+def scaled(x: Any, scale: Any, log: Any, xp: Any = np) -> Any:
+    """y of values x, by NumPy or JAX."""
     with np.errstate(divide="ignore"):
-        return np.where(log, np.log(np.where(log, x, 1.0)), x / scale)
+        return xp.where(log, xp.log(xp.where(log, x, 1.0)), x / scale)
+
+
+def unscaled(y: Any, scale: Any, log: Any, xp: Any = np) -> Any:
+    """Values x of y."""
+    return xp.where(log, xp.exp(xp.where(log, y, 0.0)), y * scale)
+
+
+@full_precision
+def _mixed(errors: Any, mixing: Any, xp: Any = np) -> Any:
+    """Weighted errors (K, n, ...) mixed within each shot."""
+    return errors if mixing is None else xp.einsum("kij,kj...->ki...", mixing, errors)
 
 
 def filled_count(count: int) -> int:

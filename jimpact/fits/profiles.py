@@ -7,27 +7,26 @@ plane, is filled from the minima outwards.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jimpact._checks import as_whole, check_choice, check_kind
-from jimpact.fits.problem import scaled
+from jimpact.fits.problem import scaled, unscaled
 from jimpact.fits.solve import (
     SAME_VALUE,
     START_SCALES,
     Ends,
     FitMinimum,
     Search,
-    Solution,
     find_minima,
-    minimize_with,
-    repeated,
+    minimize,
     solution,
+    stacked,
 )
-from jimpact.fits.uncertainty import FitResult, Profile, check_level, uncertainty
+from jimpact.fits.uncertainty import Fit, Profile, check_level
 from jimpact.progress import Show, progress_bar
 
 # Deviances are right to this (see `solve.FINE`): the ends of an interval move by less than END. A
@@ -44,24 +43,17 @@ ROUNDS = 8  # of the search for an end: it is then right to a millionth of a ste
 # Shots up to which `fit` profiles of itself, with one start and with several: as long as half of
 # the fit. Parameters: with four of LZB it takes longer than the search.
 FEW_SHOTS, MANY_SHOTS, MOST_PARAMETERS = 64, 256, 3
+LEVEL, PROFILE_STARTS = 0.95, 17  # by default
 _BEYOND = 1.3  # how far a contour's picture goes, in half-widths of the region of a parabola
 _FROM_BEST = -1  # the branch of what was searched from the best minimum
 
 
-class Start(NamedTuple):
-    """A minimum: its sum of squares, y (Q,), and standard errors of y (P,)."""
-
-    squares: float
-    y: np.ndarray
-    error: np.ndarray
-
-
-class Cell(NamedTuple):
+class Lowest(NamedTuple):
     """The least sum of squares that is known with values fixed, where, from which start."""
 
     squares: float
     y: np.ndarray
-    branch: int
+    branch: int = _FROM_BEST
 
 
 Index = tuple[int, ...]
@@ -73,11 +65,9 @@ class Grid(NamedTuple):
     which: tuple[int, ...]
     values: tuple[np.ndarray, ...]
 
-    def fixed(self, y: np.ndarray, cell: Index) -> np.ndarray:
-        """A copy of y with the values of a cell."""
-        point = np.array(y, float)
-        point[list(self.which)] = [values[k] for values, k in zip(self.values, cell)]
-        return point
+    def at(self, cell: Index) -> list[float]:
+        """The values of a cell."""
+        return [float(values[k]) for values, k in zip(self.values, cell)]
 
     def nearest(self, y: np.ndarray) -> Index:
         """The cell next to y."""
@@ -91,33 +81,47 @@ class Grid(NamedTuple):
 
 
 class Deviances:
-    """Sums of squares of a fit with some of its parameters fixed, in the solver's scale."""
+    """Deviances of a fit with some of its parameters fixed, in the solver's scale."""
 
-    def __init__(self, fit: FitResult, show: Show):
-        self.fit, self.problem, self.show = fit, fit.problem, show
+    def __init__(self, fit: Fit, limit: float, show: Show):
+        self.fit, self.problem, self.limit, self.show = fit, fit.problem, limit, show
         # if the noise is undetermined, that of an exact fit up to rounding
         known = np.isfinite(fit.noise) and fit.noise > 0
         self.variance = float(fit.noise**2) if known else self.problem.exact_squares
-        self.starts = [self.start(end) for end in fit.starts]
-        self.best = self.lowest = self.starts[0]
+        self.error = fit.standard_error / self.problem.steps_at(fit.value)
+        self.starts: list[Lowest] = []
+        self.add_starts(fit.starts)
 
-    def start(self, end: FitMinimum) -> Start:
-        """A minimum in the solver's scale."""
-        steps = self.problem.steps_at(end.value)
-        error = np.full(len(steps), np.nan) if end.standard_error is None else end.standard_error
-        return Start(end.sum_of_squares, self.problem.point(end.value), error / steps)
+    def add_starts(self, minima: Iterable[FitMinimum]) -> None:
+        """Start from these minima, too: the lowest, and others near it that are apart."""
+        starts = [Lowest(end.sum_of_squares, self.problem.point(end.value)) for end in minima]
+        starts = [*self.starts, *starts]
+        self.best, self.starts = starts[0], []
+        for start in starts:
+            if self._is_below(start.squares, self.best.squares):
+                self.best = start
+        self.lowest = self.best
+        for start in (self.best, *starts):
+            apart = all(np.abs(start.y - other.y).max() > SAME_VALUE for other in self.starts)
+            if apart and self.of(start.squares) <= self.limit:
+                self.starts.append(start)
+        if self.fit.rank < len(self.fit.names):  # they are ends in one valley
+            self.starts = [self.best]
 
-    def minimize(self, fixed: Sequence[tuple[int, ...]], y: Sequence[np.ndarray]) -> Ends:
-        """Minima from each y (A, Q) with these of its parameters fixed, all side by side."""
-        held = np.zeros((len(y), len(self.best.y)), bool)
-        for row, which in zip(held, fixed):
-            row[list(which)] = True
-        held[:, len(self.fit.names) :] = True
+    def minimize(self, trials: Sequence[tuple[Index, Sequence[float], np.ndarray]]) -> Ends:
+        """Minima with some parameters fixed at values, from y (Q,) each, all side by side."""
+        points = np.array([y for _, _, y in trials])
+        fixed = np.zeros(points.shape, bool)
+        fixed[:, len(self.fit.names) :] = True
+        for k, (which, values, _) in enumerate(trials):
+            points[k, list(which)] = values
+            fixed[k, list(which)] = True
         search = Search(max_steps=PASSES, show=self.show, damping=NEAR)
-        ends = minimize_with(repeated(self.problem, len(y)), np.array(y), held, search, _STOP)
+        many = stacked([self.problem], len(points))
+        ends = minimize(many, points, search, _STOP, what="fixed values", fixed=fixed)
         least = int(np.argmin(ends.squares))
         if self._is_below(ends.squares[least], self.lowest.squares):
-            self.lowest = Start(float(ends.squares[least]), ends.y[least], self.best.error)
+            self.lowest = Lowest(float(ends.squares[least]), ends.y[least])
         return ends
 
     def _is_below(self, squares: float, other: float) -> bool:
@@ -128,11 +132,9 @@ class Deviances:
         """Sums of squares above the least, over the noise variance."""
         return max((squares - self.best.squares) / self.variance, 0.0)
 
-    def values(self, i: int, y: np.ndarray) -> np.ndarray:
+    def values(self, i: int, y: Any) -> Any:
         """Values of the i-th parameter of scaled ones."""
-        points = np.tile(self.best.y, (len(y), 1))
-        points[:, i] = y
-        return self.problem.values_at(points)[:, i]
+        return unscaled(y, float(self.problem.scale[i]), bool(self.problem.log[i]))
 
     def reach(self, i: int) -> tuple[float, float]:
         """The bounds of the i-th parameter, scaled; infinite ones as far as starts reach."""
@@ -140,28 +142,29 @@ class Deviances:
         low = low if np.isfinite(low) else best - START_SCALES
         return float(low), float(high if np.isfinite(high) else best + START_SCALES)
 
-    def fill(self, grids: Sequence[Grid], limit: float) -> list[dict[Index, Cell]]:
+    def fill(self, grids: Sequence[Grid]) -> list[dict[Index, Lowest]]:
         """Cells of grids, from the minima outwards until beyond the limit, many side by side.
 
         Each cell below the limit starts its neighbours from its own minimum, also those that were
         reached from another start. One above may lie on a ridge: once more from the best.
         """
-        known: list[dict[Index, Cell]] = [{} for _ in grids]
+        known: list[dict[Index, Lowest]] = [{} for _ in grids]
         ahead = {
             (g, grid.nearest(start.y), branch): start.y
             for g, grid in enumerate(grids)
             for branch, start in enumerate(self.starts)
         }
         while ahead:
-            points = [grids[g].fixed(y, cell) for (g, cell, _), y in ahead.items()]
-            ends = self.minimize([grids[g].which for g, _, _ in ahead], points)
+            ends = self.minimize(
+                [(grids[g].which, grids[g].at(cell), y) for (g, cell, _), y in ahead.items()]
+            )
             trials, ahead = list(ahead), {}
             for (g, cell, branch), squares, y in zip(trials, ends.squares.tolist(), ends.y):
                 cells = known[g]
                 if cell in cells and not squares < (1 - SAME) * cells[cell].squares:
                     continue
-                cells[cell] = Cell(squares, y, branch)
-                if self.of(squares) > limit:
+                cells[cell] = Lowest(squares, y, branch)
+                if self.of(squares) > self.limit:
                     if branch != _FROM_BEST:
                         ahead[g, cell, _FROM_BEST] = self.best.y
                     continue
@@ -171,9 +174,9 @@ class Deviances:
         return known
 
 
-def _check_profiled(fit: FitResult) -> None:
+def _check_profiled(fit: Fit) -> None:
     """Raise an error unless this is a fit, of parameters that can be fixed."""
-    check_kind("fit", fit, FitResult)
+    check_kind("fit", fit, Fit)
     if not fit.can_be_profiled:
         raise ValueError(
             "Argument `fit` must be by least squares, and not of a matrix that must be admissible."
@@ -184,11 +187,11 @@ def _check_profiled(fit: FitResult) -> None:
 
 
 def profile(
-    fit: FitResult,
+    fit: Fit,
     names: str | Iterable[str] | None = None,
     *,
-    level: float = 0.95,
-    points: int = 17,
+    level: float = LEVEL,
+    points: int = PROFILE_STARTS,
     progress: float | None = None,
 ) -> tuple[Profile, ...]:
     """Profile likelihoods of parameters: intervals without the assumption of a parabola.
@@ -232,102 +235,64 @@ def profile(
 
 
 def profiles_of(
-    fit: FitResult, which: Sequence[int], level: float, points: int, progress: float | None
+    fit: Fit, which: Sequence[int], level: float, points: int, progress: float | None
 ) -> tuple[Profile, ...]:
     """Profiles of these parameters; points: starts of a search for more minima."""
     with progress_bar(progress) as show:
-        lines = _Lines(fit, which, level, show)
+        lines = _Lines(fit, fit.quantile(level) ** 2, show)
         if points and fit.start_count == 1:
-            lines.add_starts(find_minima(fit.problem, points, fit.seed, Search(show=show)))
+            lines.add_starts(find_minima(fit.problem, points, fit.seed, Search(show=show)).minima)
         for _ in range(ROUNDS):
-            profiles = lines.profiles()
+            profiles = lines.profiles(which, level)
             if lines.lowest is lines.best:
                 break
-            lines.add_starts(solution(fit.problem, lines.minimize([()], [lines.lowest.y])))
+            end = lines.minimize([((), (), lines.lowest.y)])
+            lines.add_starts(solution(fit.problem, end).minima)
     return profiles
-
-
-def with_entry(y: np.ndarray, i: int, value: float) -> np.ndarray:
-    """A copy of y with another i-th entry."""
-    changed = np.array(y, float)
-    changed[i] = value
-    return changed
 
 
 class _Lines(Deviances):
     """Deviances of one parameter each, and where they pass the limit of an interval."""
 
-    def __init__(self, fit: FitResult, which: Sequence[int], level: float, show: Show):
-        super().__init__(fit, show)
-        self.which, self.level = which, level
-        self.limit = fit.quantile(level) ** 2
-        self._choose(self.starts)
-
-    def _choose(self, starts: Sequence[Start]) -> None:
-        """Take the lowest of these starts, and others near it that are apart from each other."""
-        self.best, self.starts = starts[0], []
-        for start in starts:
-            if self._is_below(start.squares, self.best.squares):
-                self.best = start
-        self.lowest = self.best
-        for start in (self.best, *starts):
-            apart = all(np.abs(start.y - other.y).max() > SAME_VALUE for other in self.starts)
-            if apart and self.of(start.squares) <= self.limit:
-                self.starts.append(start)
-        if self.fit.rank < len(self.fit.names):  # they are ends in one valley
-            self.starts = [self.best]
-
-    def add_starts(self, found: Solution) -> None:
-        """Start from these minima, too."""
-        starts = []
-        for minimum in found.minima:
-            error = uncertainty(self.problem, minimum, self.fit.noise).standard_error
-            starts.append(self.start(replace(minimum, standard_error=error)))
-        self._choose([*self.starts, *starts])
-
     def grid(self, i: int) -> Grid:
         """Values of the i-th parameter, the denser the nearer to a start."""
         low, high = self.reach(i)
         centres = np.array([start.y[i] for start in self.starts])
-        values = [centres, np.array([low, high])]
-        for k, start in enumerate(self.starts):
-            first = STEP * np.sqrt(self.limit) * start.error[i]
-            widest = FIRST_SHARE * (high - low)
-            first = min(first, (high - low) / 2) if np.isfinite(first) and first > 0 else widest
-            count = np.log(1 + (GROWTH - 1) * (high - low) / first) / np.log(GROWTH)
-            away = first * (GROWTH ** np.arange(1, count + 1) - 1) / (GROWTH - 1)
-            near = start.y[i] + np.concatenate([-away, away])
-            owner = np.abs(near[:, None] - centres).argmin(axis=1)
-            values.append(near[(owner == k) & (near > low) & (near < high)])
-        return Grid((i,), (np.unique(np.concatenate(values)),))
+        first, widest = STEP * np.sqrt(self.limit) * self.error[i], FIRST_SHARE * (high - low)
+        if not 0 < first < widest:
+            first = widest
+        count = np.log(1 + (GROWTH - 1) * (high - low) / first) / np.log(GROWTH)
+        away = first * (GROWTH ** np.arange(1, count + 1) - 1) / (GROWTH - 1)
+        near = centres[:, None] + np.concatenate([-away, away])
+        owner = np.abs(near[..., None] - centres).argmin(axis=-1)
+        near = near[(owner == np.arange(len(centres))[:, None]) & (near > low) & (near < high)]
+        return Grid((i,), (np.unique([*centres, low, high, *near]),))
 
-    def profiles(self) -> tuple[Profile, ...]:
-        """The profiles of all parameters."""
-        grids = [self.grid(i) for i in self.which]
+    def profiles(self, which: Sequence[int], level: float) -> tuple[Profile, ...]:
+        """The profiles of these parameters."""
+        grids = [self.grid(i) for i in which]
         lines = [
             {float(grid.values[0][k]): cell for (k,), cell in cells.items()}
-            for grid, cells in zip(grids, self.fill(grids, self.limit))
+            for grid, cells in zip(grids, self.fill(grids))
         ]
-        self.find_ends(lines)
-        return tuple(self.profile(i, line) for i, line in zip(self.which, lines))
+        self.find_ends(which, lines)
+        return tuple(self.profile(i, line, level) for i, line in zip(which, lines))
 
-    def find_ends(self, lines: Sequence[dict[float, Cell]]) -> None:
+    def find_ends(self, which: Sequence[int], lines: Sequence[dict[float, Lowest]]) -> None:
         """Where deviances pass the limit: regula falsi in their roots, all ends side by side."""
         for turn in range(ROUNDS):
             trials = []
             for n, line in enumerate(lines):
                 for inside, outside, p, q in self._crossings(line):
                     share = np.clip(p / (p - q), 0.02, 0.98) if turn % 3 < 2 else 0.5
-                    trials.append((n, line[inside].y, inside + share * (outside - inside)))
+                    trials.append((n, inside + share * (outside - inside), line[inside].y))
             if not trials:
                 return
-            which = [self.which[n] for n, _, _ in trials]
-            points = [with_entry(y, i, value) for i, (_, y, value) in zip(which, trials)]
-            ends = self.minimize([(i,) for i in which], points)
-            for (n, _, value), squares, y in zip(trials, ends.squares.tolist(), ends.y):
-                lines[n][float(value)] = Cell(squares, y, _FROM_BEST)
+            ends = self.minimize([((which[n],), (value,), y) for n, value, y in trials])
+            for (n, value, _), squares, y in zip(trials, ends.squares.tolist(), ends.y):
+                lines[n][float(value)] = Lowest(squares, y)
 
-    def _crossings(self, line: dict[float, Cell]) -> Iterator[tuple[float, float, float, float]]:
+    def _crossings(self, line: dict[float, Lowest]) -> Iterator[tuple[float, float, float, float]]:
         """Ends that are not settled: values inside and outside, and by how much they pass.
 
         That is the root of the deviance over that of the limit, less 1.
@@ -340,12 +305,12 @@ class _Lines(Deviances):
             if min(-height[a], height[b]) > END and abs(values[b] - values[a]) > least:
                 yield values[a], values[b], height[a], height[b]
 
-    def deviance(self, line: dict[float, Cell]) -> tuple[np.ndarray, np.ndarray]:
+    def deviance(self, line: dict[float, Lowest]) -> tuple[np.ndarray, np.ndarray]:
         """Fixed values in order, and their deviances."""
         values = sorted(line)
         return np.array(values), np.array([self.of(line[y].squares) for y in values])
 
-    def profile(self, i: int, line: dict[float, Cell]) -> Profile:
+    def profile(self, i: int, line: dict[float, Lowest], level: float) -> Profile:
         """The profile of a parameter from all that was solved."""
         y, deviance = self.deviance(line)
         deviance = deviance - deviance.min()
@@ -362,7 +327,7 @@ class _Lines(Deviances):
             value=self.values(i, y),
             deviance=deviance,
             limit=self.limit,
-            level=self.level,
+            level=level,
             intervals=intervals,
             domain=(float(low), float(high)),
             better=None if is_own else self.problem.values_at(self.best.y),
@@ -375,10 +340,10 @@ class _Lines(Deviances):
             return float(self.problem.domains[i][(step + 1) // 2])
         p, q = np.sqrt(deviance[k]), np.sqrt(deviance[beyond])
         share = (np.sqrt(self.limit) - p) / (q - p)
-        return float(self.values(i, y[[k]] + share * (y[beyond] - y[k]))[0])
+        return float(self.values(i, y[k] + share * (y[beyond] - y[k])))
 
 
-def needs_profiles(fit: FitResult) -> bool:
+def needs_profiles(fit: Fit) -> bool:
     """Whether standard errors may mislead, and profiles cost no more than the fit did.
 
     Not after lack of fit: no interval of such a law means anything, and its valleys are rough.
@@ -412,11 +377,11 @@ class Contour:
 
 
 def contour(
-    fit: FitResult,
+    fit: Fit,
     first: str,
     second: str,
     *,
-    level: float = 0.95,
+    level: float = LEVEL,
     points: int = 21,
     progress: float | None = None,
 ) -> Contour:
@@ -464,7 +429,7 @@ def contour(
     if fit.problem.sigma is None and freedom > 0:
         limit = float(freedom * ((1 - level) ** (-2 / freedom) - 1))
     with progress_bar(progress) as show:
-        deviances, width = Deviances(fit, show), _BEYOND * np.sqrt(limit)
+        deviances, width = Deviances(fit, limit, show), _BEYOND * np.sqrt(limit)
         values = []
         for i in pair:
             pieces, scale = fit.linearized_interval(i, width), np.asarray(fit.problem.scale)[i]
@@ -472,7 +437,7 @@ def contour(
             outer = scaled(outer, scale, fit.problem.parameters.log[i])
             low, high = np.clip(outer, *deviances.reach(i)).tolist()
             values.append(np.linspace(low, high, points))
-        (cells,) = deviances.fill([Grid(pair, (values[0], values[1]))], limit)
+        (cells,) = deviances.fill([Grid(pair, (values[0], values[1]))])
     squares = np.full((points, points), np.inf)
     for cell, known in cells.items():
         squares[cell] = known.squares

@@ -4,24 +4,25 @@ import dataclasses
 import json
 import platform
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import jimpact
-from jimpact._checks import needed
-from jimpact.files.records import Column, Table, Tabular, as_data, with_error
-from jimpact.fits.parameters import AnyLaw, value_of
+from jimpact.files.records import as_data, with_error
+from jimpact.fits.parameters import value_of
 from jimpact.fits.problem import FitProblem
-from jimpact.fits.uncertainty import FitResult, pieces_in_words
 from jimpact.law import StaticNumber, StaticNumbers
 from jimpact.status import STATUS
+
+if TYPE_CHECKING:
+    from jimpact.fits.uncertainty import Fit  # which imports this module
 
 _ROUNDING = 1e-7  # share of the largest velocity that is printed as 0: impacts are good to 1e-8
 _VELOCITIES_SHOWN = 24  # in the table of shots
@@ -47,7 +48,7 @@ def joined_words(parts: Sequence[str]) -> str:
     return " and ".join([", ".join(parts[:-1]), parts[-1]]) if len(parts) > 1 else "".join(parts)
 
 
-def _values_in_words(fit: FitResult) -> str:
+def _values_in_words(fit: "Fit") -> str:
     """Values with their errors, what they assume, and what the data do not determine."""
     seen, data = fit.determined, _data_name(fit)
     determined = np.flatnonzero(seen)
@@ -71,7 +72,7 @@ def _values_in_words(fit: FitResult) -> str:
     return "; ".join(parts)
 
 
-def _objection(fit: FitResult) -> str:
+def _objection(fit: "Fit") -> str:
     """Why the law is not one for these data; an empty text if nothing speaks against it."""
     data = _data_name(fit)
     if fit.shows_lack_of_fit:
@@ -87,7 +88,7 @@ def _objection(fit: FitResult) -> str:
     return f"fails in {failing} of {data}"
 
 
-def _assumptions(fit: FitResult) -> list[str]:
+def _assumptions(fit: "Fit") -> list[str]:
     """What is taken for granted of several contacts: common values, stiffnesses, exponents."""
     if fit.experiments is None:
         return []
@@ -108,21 +109,21 @@ def _assumptions(fit: FitResult) -> list[str]:
     return assumed
 
 
-def _data_name(fit: FitResult) -> str:
+def _data_name(fit: "Fit") -> str:
     """What was fitted, as in "these 4 shots"."""
     if fit.experiments is None:
         return "these data"
     return "this shot" if fit.shot_count == 1 else f"these {fit.shot_count} shots"
 
 
-def _full_name(fit: FitResult, i: int) -> str:
+def _full_name(fit: "Fit", i: int) -> str:
     """The name of a parameter; a stiffness is a ratio if that of contact 1 is fixed."""
     name = fit.names[i]
     fixed = any(note.startswith("stiffness[1] is fixed") for note in fit.problem.notes)
     return f"the stiffness ratio {name} / stiffness[1]" if "stiffness" in name and fixed else name
 
 
-def _with_error(fit: FitResult, i: int) -> str:
+def _with_error(fit: "Fit", i: int) -> str:
     """A parameter with its error, and the interval where that is one-sided or of several pieces."""
     value, error, name = fit.value[i], fit.standard_error[i], _full_name(fit, i)
     if np.isnan(error):
@@ -137,7 +138,7 @@ def _with_error(fit: FitResult, i: int) -> str:
     return f"{name} = {text}{', the end of what is allowed' if fit.at_bound[i] else ''}"
 
 
-def _headline(fit: FitResult) -> str:
+def _headline(fit: "Fit") -> str:
     """The law, how many values were measured, the method."""
     measured, law = np.isfinite(fit.problem.measured), type(fit.law).__name__
     values = int(measured.sum())
@@ -151,7 +152,7 @@ def _headline(fit: FitResult) -> str:
     )
 
 
-def _prior(fit: FitResult, i: int) -> str:
+def _prior(fit: "Fit", i: int) -> str:
     """The prior of a parameter, and whether it alone determines the value; '' without one."""
     for prior in fit.problem.priors:
         if prior.parameter == i:
@@ -165,13 +166,13 @@ def marked(value: float, seen: bool, digits: str) -> str:
     return f"{value:{digits}}" if seen else f"({value:{digits}})"
 
 
-def named_values(fit: FitResult, values: np.ndarray) -> str:
+def named_values(fit: "Fit", values: np.ndarray) -> str:
     """Names and values (P,) of the parameters, in brackets what the data do not determine."""
     cells = zip(fit.names, values, fit.determined)
     return ", ".join(f"{name} {marked(value, seen, '.4g')}" for name, value, seen in cells)
 
 
-def _parameters(fit: FitResult) -> list[str]:
+def _parameters(fit: "Fit") -> list[str]:
     """The table of parameters."""
     width = max(9, *(len(name) for name in fit.names))
     heads = f"{'parameter':{width}s} {'value':>12s} {'std. error':>12s}   95 % interval"
@@ -203,7 +204,7 @@ def _parameters(fit: FitResult) -> list[str]:
     return lines
 
 
-def _quality(fit: FitResult) -> list[str]:
+def _quality(fit: "Fit") -> list[str]:
     """Residuals, noise, how many parameters the data determine, the solver."""
     unit, one = (" m/s", "velocity") if fit.experiments is not None else ("", "value")
     lines = [f"rms residual   {fit.rms:.4g}{unit}"]
@@ -236,7 +237,7 @@ def degrees(count: int) -> str:
     return f"{count} degree{'s' * (count != 1)} of freedom"
 
 
-def _how_many_are_determined(fit: FitResult) -> str:
+def _how_many_are_determined(fit: "Fit") -> str:
     """The rank of the derivatives, and whether intervals bound as many parameters."""
     total, bounded = len(fit.names), int(fit.determined.sum())
     text = f"{fit.rank} of {total} parameter{'s' * (total > 1)} (rank of the derivatives"
@@ -245,14 +246,14 @@ def _how_many_are_determined(fit: FitResult) -> str:
     return f"{text})"
 
 
-def _of_what_part(fit: FitResult) -> str:
+def _of_what_part(fit: "Fit") -> str:
     """Which residuals the factor of the errors is that of, where these are not all."""
     ratio = np.sqrt(fit.starts[0].sum_of_squares / max(fit.degrees_of_freedom, 1))
     every = np.isclose(fit.noise, ratio, rtol=1e-3)
     return "" if every else " (the factor is that of the residuals that are not momentum)"
 
 
-def _sigma_sources(fit: FitResult) -> list[str]:
+def _sigma_sources(fit: "Fit") -> list[str]:
     """What went into the stated errors besides sigma."""
     data = fit.experiments
     if data is None:
@@ -272,7 +273,7 @@ def _section(title: str, lines: tuple[str, ...]) -> list[str]:
     return [title, *(f"  - {line}" for line in lines)] if lines else []
 
 
-def _minima(fit: FitResult) -> list[str]:
+def _minima(fit: "Fit") -> list[str]:
     """Where the starts ended."""
     total, lost = fit.start_count, fit.lost_starts
     unfinished = f"{lost} of {total} starts did not converge." if lost else ""
@@ -297,7 +298,7 @@ def _without_rounding(values: np.ndarray) -> np.ndarray:
     return np.where(np.abs(values) <= _ROUNDING * largest, 0.0, values)
 
 
-def _shots(fit: FitResult) -> list[str]:
+def _shots(fit: "Fit") -> list[str]:
     """The table of the first shots."""
     data = fit.experiments
     if data is None:
@@ -320,170 +321,119 @@ def _shots(fit: FitResult) -> list[str]:
     return lines
 
 
-# ---------------------------------------------------------------------------- the fit
+def pieces_in_words(pieces: Iterable[tuple[float, float]], domain: tuple[float, float]) -> str:
+    """Pieces of an interval; an end of the domain is left out."""
+    return " or ".join(_piece(*ends, domain) for ends in pieces)
 
 
-class Fit(FitResult[AnyLaw], Tabular):
-    """See `FitResult`."""
+def _piece(low: float, high: float, domain: tuple[float, float]) -> str:
+    """One piece of an interval in words."""
+    open_low, open_high = low <= domain[0], high >= domain[1]
+    if open_low and open_high:
+        return "anything"
+    if open_low or open_high:
+        return f"at most {high:.5g}" if open_low else f"at least {low:.5g}"
+    return f"{low:.5g} to {high:.5g}"
 
-    __doc__ = FitResult.__doc__
-    picture = "fit"
 
-    @property
-    def table(self) -> Table:
-        """A row a parameter: value, standard error, ends of its 95 % interval, whether seen."""
-        names = ("value", "standard_error", "low_95", "high_95", "at_bound", "determined")
-        ends = self.confidence_interval().T
-        columns = (self.value, self.standard_error, *ends, self.at_bound, self.determined)
-        rows = list(zip(self.names, *(column.tolist() for column in columns)))
-        return Table([Column(name) for name in ("parameter", *names)], rows)
+# ---------------------------------------------------------------------------- the whole
 
-    def to_dict(self) -> dict[str, Any]:
-        """Everything a JSON file can hold; numbers that are not finite become None."""
-        interval = self.confidence_interval()
-        parameters = [
-            {
-                "name": name,
-                "value": as_data(self.value[i]),
-                "standard_error": as_data(self.standard_error[i]),
-                "confidence_interval_95": as_data(interval[i]),
-                "at_bound": bool(self.at_bound[i]),
-                "seen": bool(self.determined[i]),
-                "profile_95": as_data(self.profiles[i].intervals) if self.profiles else None,
-            }
-            for i, name in enumerate(self.names)
-        ]
-        starts = [
-            {"sum_of_squares": s.sum_of_squares, "value": as_data(s.value), "count": s.count}
-            for s in self.starts
-        ]
-        return {
-            "law": type(self.law).__name__,
-            "method": self.method,
-            "parameters": parameters,
-            "rms": self.rms,
-            "noise": as_data(self.noise),
-            "degrees_of_freedom": self.degrees_of_freedom,
-            "rank": self.rank,
-            "identifiability": list(self.identifiability),
-            "warnings": list(self.warnings),
-            "verdict": self.verdict,
-            "reservations": list(self.reservations),
-            "seed": self.seed,
-            "converged": self.converged,
-            "covariance": as_data(self.covariance),
-            "correlation": as_data(self.correlation),
-            "starts": starts,
-            "shots": [] if self.experiments is None else list(self.experiments.shots),
-            "predicted": as_data(self.predicted),
-            "residual": as_data(self.residual),
-            "status": [STATUS[code].name for code in self.status],
+
+def verdict(fit: "Fit") -> str:
+    """`Fit.verdict`."""
+    law = type(fit.law).__name__
+    if not fit.converged:
+        return f"No answer: the search for the parameters of {law} has not converged."
+    reserved, sentence = joined_words(fit.reservations), _values_in_words(fit)
+    against = _objection(fit)
+    if against:
+        nearest = f"it comes nearest with {sentence}" if fit.determined.any() else sentence
+        sentence = f"{law} {against}; {nearest}"
+    if reserved:
+        sentence += f"; {'and' if against else 'but'} {reserved}"
+    return f"{sentence}."
+
+
+def report(fit: "Fit") -> str:
+    """The report: the verdict, then a block each."""
+    blocks = [
+        [fit.verdict],
+        [_headline(fit)],
+        _parameters(fit),
+        _quality(fit),
+        _section("What the data do not determine", fit.identifiability),
+        _minima(fit),
+        _section("Warnings", fit.warnings),
+        _shots(fit),
+    ]
+    return "\n\n".join("\n".join(block) for block in blocks if block)
+
+
+def as_record(fit: "Fit") -> dict[str, Any]:
+    """`Fit.to_dict`."""
+    as_they_are = (
+        *("method", "rms", "noise", "degrees_of_freedom", "rank", "identifiability"),
+        *("warnings", "verdict", "reservations", "seed", "converged", "covariance"),
+        *("correlation", "predicted", "residual"),
+    )
+    parameters = [
+        {
+            "name": name,
+            "value": fit.value[i],
+            "standard_error": fit.standard_error[i],
+            "confidence_interval_95": ends,
+            "at_bound": fit.at_bound[i],
+            "seen": fit.determined[i],
+            "profile_95": fit.profiles[i].intervals if fit.profiles else None,
         }
-
-    @property
-    def verdict(self) -> str:
-        """The result in one sentence that can be quoted: the first one of `print(fit)`.
-
-        Values with their errors, what they assume, and what speaks against them.
-        """
-        law = type(self.law).__name__
-        if not self.converged:
-            return f"No answer: the search for the parameters of {law} has not converged."
-        reserved, sentence = joined_words(self.reservations), _values_in_words(self)
-        against = _objection(self)
-        if against:
-            nearest = f"it comes nearest with {sentence}" if self.determined.any() else sentence
-            sentence = f"{law} {against}; {nearest}"
-        if reserved:
-            sentence += f"; {'and' if against else 'but'} {reserved}"
-        return f"{sentence}."
-
-    def save(self, path: str | Path) -> Path:
-        """Write the fit to a file (JSON) that `ji.load` reads: problem, result, versions.
-
-        Args:
-            path: the file; an existing file is replaced.
-
-        Returns:
-            The path.
-
-        Raises:
-            ValueError: a fit of something else than shots, or with ties: functions cannot be saved.
-        """
-        problem = self.problem
-        if self.experiments is None:
-            raise ValueError("Argument `fit` must be to shots to be saved: functions cannot be.")
-        if problem.ties:
-            raise ValueError("Argument `fit` must have no ties to be saved: functions cannot be.")
-        names = [field.name for field in dataclasses.fields(self) if field.name != _REBUILT]
-        record = {
-            "format": FORMAT,
-            "versions": versions(),
-            "problem": {
-                "law": _encoded(problem.law),
-                "scene": _encoded(problem.scene),
-                "experiments": _encoded(self.experiments),
-                "free": {name: label.tolist() for name, label in problem.parameters.labels.items()},
-                "bounds": _encoded(dict(zip(problem.names, problem.domains.tolist()))),
-                "priors": {problem.names[i]: [mean, std] for i, mean, std in problem.priors},
-                "used": (~np.isnan(problem.measured).all(axis=1)).tolist(),
-                "notes": list(problem.notes),
-                "left_out": list(problem.left_out),
-            },
-            "result": {name: _encoded(getattr(self, name)) for name in names},
-        }
-        path = Path(path)
-        path.write_text(json.dumps(record, allow_nan=False, indent=1) + "\n", encoding="utf-8")
-        return path
-
-    def to_pandas(self) -> Any:
-        """The parameters as a `pandas.DataFrame`, which must be installed."""
-        return super().to_pandas().set_index("parameter")
-
-    def to_xarray(self) -> Any:
-        """Parameters, covariance, every shot as an `xarray.Dataset`, which must be installed."""
-        pair = ("parameter", "parameter_2")
-        arrays: dict[str, Any] = {
-            "value": ("parameter", self.value),
-            "standard_error": ("parameter", self.standard_error),
-            "determined": ("parameter", self.determined),
-            "covariance": (pair, self.covariance),
-            "correlation": (pair, self.correlation),
-        }
-        coordinates: dict[str, Any] = {axis: list(self.names) for axis in pair}
-        measured, data = np.asarray(self.problem.measured, float), self.experiments
-        axes: tuple[str, ...] = tuple(f"value_{i + 1}" for i in range(measured.ndim))
-        if data is not None:
-            axes = ("shot", "velocity")
-            units = data.units
-            coordinates |= {"shot": list(data.shots), "unit": ("velocity", list(units))}
-            arrays["before"] = (axes, np.asarray(data.pre))
-            arrays["status"] = ("shot", [STATUS[code].name for code in self.status])
-        for name, values in (
-            ("measured", measured),
-            ("predicted", self.predicted),
-            ("residual", self.residual),
-        ):
-            arrays[name] = (axes, values)
-        about = {"law": type(self.law).__name__, "verdict": self.verdict, "rms": self.rms}
-        return needed("xarray", "pip install xarray").Dataset(arrays, coordinates, about)
-
-    def __str__(self) -> str:
-        """The report: the verdict, then a block each."""
-        blocks = [
-            [self.verdict],
-            [_headline(self)],
-            _parameters(self),
-            _quality(self),
-            _section("What the data do not determine", self.identifiability),
-            _minima(self),
-            _section("Warnings", self.warnings),
-            _shots(self),
-        ]
-        return "\n\n".join("\n".join(block) for block in blocks if block)
+        for i, (name, ends) in enumerate(zip(fit.names, fit.confidence_interval()))
+    ]
+    record = {
+        "law": type(fit.law).__name__,
+        "parameters": parameters,
+        "starts": [
+            {"sum_of_squares": s.sum_of_squares, "value": s.value, "count": s.count}
+            for s in fit.starts
+        ],
+        "shots": [] if fit.experiments is None else fit.experiments.shots,
+        "status": [STATUS[code].name for code in fit.status],
+    }
+    return as_data(record | {name: getattr(fit, name) for name in as_they_are})
 
 
-def load_fit(path: str | Path) -> Fit[Any]:
+# ---------------------------------------------------------------------------- in a file
+
+
+def save_fit(fit: "Fit", path: str | Path) -> Path:
+    """`Fit.save`."""
+    problem = fit.problem
+    if fit.experiments is None:
+        raise ValueError("Argument `fit` must be to shots to be saved: functions cannot be.")
+    if problem.ties:
+        raise ValueError("Argument `fit` must have no ties to be saved: functions cannot be.")
+    names = [field.name for field in dataclasses.fields(fit) if field.name != _REBUILT]
+    record = {
+        "format": FORMAT,
+        "versions": versions(),
+        "problem": {
+            "law": _encoded(problem.law),
+            "scene": _encoded(problem.scene),
+            "experiments": _encoded(fit.experiments),
+            "free": {name: label.tolist() for name, label in problem.parameters.labels.items()},
+            "bounds": _encoded(dict(zip(problem.names, problem.domains.tolist()))),
+            "priors": {problem.names[i]: [mean, std] for i, mean, std in problem.priors},
+            "used": (~np.isnan(problem.measured).all(axis=1)).tolist(),
+            "notes": list(problem.notes),
+            "left_out": list(problem.left_out),
+        },
+        "result": {name: _encoded(getattr(fit, name)) for name in names},
+    }
+    path = Path(path)
+    path.write_text(json.dumps(record, allow_nan=False, indent=1) + "\n", encoding="utf-8")
+    return path
+
+
+def load_fit(path: str | Path) -> "Fit":
     """The fit that `Fit.save` wrote, to the last digit; `ji.load` reads motions, too.
 
     The classes of its law and scene are imported by name, so read only files that you trust.
@@ -505,10 +455,9 @@ def load_fit(path: str | Path) -> Fit[Any]:
     >>> ji.load_fit(path).verdict == fit.verdict
     True
     """
+    from jimpact.fits.uncertainty import Fit  # which imports this module
+
     return Fit(**_read_fit(Path(path)))
-
-
-# ---------------------------------------------------------------------------- in a file
 
 
 def versions() -> dict[str, str]:

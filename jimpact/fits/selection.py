@@ -9,9 +9,9 @@ import numpy as np
 from scipy.special import chdtrc, fdtrc, stdtr
 
 from jimpact._checks import check_choice, check_kind
-from jimpact.files.records import as_data, number, table
+from jimpact.files.records import Column, Table, Tabular, as_data
 from jimpact.fits.data import Experiments
-from jimpact.fits.fitting import Fit, fit, leave_one_out
+from jimpact.fits.fitting import Fit, fit, leave_one_out, rms
 from jimpact.fits.matrices import admissible_start
 from jimpact.fits.parameters import OF_SPEED, default_free
 from jimpact.fits.problem import FEW
@@ -21,7 +21,7 @@ from jimpact.fits.uncertainty import check_squares
 from jimpact.law import Law, free_parameters_of, with_parameter
 from jimpact.laws.velocity_dependent import VelocityDependent
 from jimpact.progress import progress_bar
-from jimpact.registry import registered_laws, simplest_first
+from jimpact.registry import REGISTRY, registered_laws, simplest_first
 from jimpact.scene import Scene
 from jimpact.status import STATUS
 
@@ -62,19 +62,22 @@ class LawFit:
 
     def to_dict(self) -> dict[str, Any]:
         """What a JSON file can hold."""
-        record = {
-            "parameters": self.parameters,
-            "rms": self.fit.rms,
-            "left_out_error": self.left_out_error,
-            "aicc": self.aicc,
-            "adequate": self.adequate,
-            "verdict": self.verdict,
-        }
-        return as_data(record) | {"fit": self.fit.to_dict()}
+        names = ("parameters", "left_out_error", "aicc", "adequate", "verdict", "fit")
+        return as_data({"rms": self.fit.rms} | {name: getattr(self, name) for name in names})
+
+
+_COLUMNS = (
+    Column("law"),
+    Column("parameters", head="free"),
+    Column("rms_m_per_s", ".4g", "rms"),
+    Column("left_out_m_per_s", ".4g", "left out"),
+    Column("aicc", ".1f", "AICc"),
+    Column("verdict"),
+)
 
 
 @dataclass(frozen=True, eq=False)
-class LawFits:
+class LawFits(Tabular):
     """The result of `fit_laws`: `entries` by name, the simplest adequate law first.
 
     `left_out` says by name why a law was not tried; `speed` whether the first law's e depends on
@@ -103,14 +106,14 @@ class LawFits:
             )
         return f"No law fits; the nearest is {best.name} ({best.verdict}): {best.fit.verdict}"
 
-    def rows(self) -> tuple[list[str], list[list[Any]]]:
-        """Heads and rows of the table, a row a law."""
-        heads = ["law", "parameters", "rms_m_per_s", "left_out_m_per_s", "aicc", "verdict"]
+    @property
+    def table(self) -> Table:
+        """A row a law."""
         rows = [
             [name, x.parameters, x.fit.rms, x.left_out_error, x.aicc, x.verdict]
             for name, x in self.entries.items()
         ]
-        return heads, [[None if x != x else x for x in row] for row in rows]
+        return Table(_COLUMNS, rows)
 
     def to_dict(self) -> dict[str, Any]:
         """What a JSON file can hold."""
@@ -118,21 +121,16 @@ class LawFits:
         return record | as_data({"laws": self.entries, "speed": self.speed})
 
     def __str__(self) -> str:
-        heads = ["law", "free", "rms", "left out", "AICc", "verdict", "values"]
-        rows = []
-        for name, x in self.entries.items():
-            values = named_values(x.fit, x.fit.value)
-            numbers = [number(x.fit.rms, ".4g"), number(x.left_out_error, ".4g")]
-            aicc = number(x.aicc, ".1f")
-            rows.append([name, str(x.parameters), *numbers, aicc, x.verdict, values])
-        lines = table(heads, rows, left=["verdict", "values"])
-        lines.append("rms and error of shots left out in m/s; simplest adequate law first.")
-        if not all(x.fit.determined.all() for x in self.entries.values()):
-            lines.append("Values in brackets are starts, which the data do not determine.")
-        lines += [f"{name} is left out: it {reason}" for name, reason in self.left_out.items()]
+        fits = [entry.fit for entry in self.entries.values()]
+        rows = [(*row, named_values(x, x.value)) for row, x in zip(self.table.rows, fits)]
+        notes = ["rms and error of shots left out in m/s; simplest adequate law first."]
+        if not all(x.determined.all() for x in fits):
+            notes.append("Values in brackets are starts, which the data do not determine.")
+        notes += [f"{name} is left out: it {reason}" for name, reason in self.left_out.items()]
         if self.speed is not None:
-            lines.append(f"Restitution that depends on the speed ({self.best.name}): {self.speed}")
-        return "\n".join([self.verdict, "", *lines])
+            notes.append(f"Restitution that depends on the speed ({self.best.name}): {self.speed}")
+        columns = (*_COLUMNS, Column("values"))
+        return str(Table(columns, rows, head=[self.verdict, ""], notes=notes))
 
 
 class NestedTest(NamedTuple):
@@ -207,14 +205,20 @@ def nested_test(simple: Fit, full: Fit) -> NestedTest:
             f"but has {full.rank} and {simple.rank}."
         )
     names = tuple(x for x in full.names if x not in simple.names) or full.names
-    left, rest = full.starts[0].sum_of_squares, full.degrees_of_freedom
-    gain = max(simple.starts[0].sum_of_squares - left, 0.0)
+    gain = max(simple.starts[0].sum_of_squares - full.starts[0].sum_of_squares, 0.0)
     if full.problem.sigma is not None and full.noise <= 1:
         return NestedTest(gain, more, None, float(chdtrc(more, gain)), names)
+    return NestedTest(*_f_test(gain, more, full), names)
+
+
+def _f_test(gain: float, more: int, full: Fit) -> tuple[float, int, int, float]:
+    """F of a fit whose `more` parameters lower the sum of squares by `gain`, and its p-value."""
+    rest = full.degrees_of_freedom
     if rest < 1:
-        return NestedTest(np.nan, more, rest, 1.0, names)
-    ratio = gain / more / (max(left, full.problem.exact_squares) / rest)
-    return NestedTest(ratio, more, rest, float(fdtrc(more, rest, ratio)), names)
+        return np.nan, more, rest, 1.0
+    left = max(full.starts[0].sum_of_squares, full.problem.exact_squares)
+    ratio = gain / more / (left / rest)
+    return ratio, more, rest, float(fdtrc(more, rest, ratio))
 
 
 def fit_laws(
@@ -339,8 +343,6 @@ def _candidates(
         left_out.pop("velocity_dependent", None)  # an option of the others, see `speed`
     built = {name: law for name, law in built.items() if name not in left_out}
     if laws is not None:
-        from jimpact.laws import REGISTRY
-
         wanted = tuple(laws)
         for name in wanted:
             check_choice("laws", name, tuple(REGISTRY))
@@ -401,7 +403,7 @@ def _judged(fits: dict[str, Fit]) -> dict[str, LawFit]:
     squares = {name: _per_shot(fits[name], errors[name]) for name in fits}
     usable = [name for name in fits if against[name][0] != "fails"] or list(fits)
     many = all(np.isfinite(squares[name]).sum() >= _LEAST for name in usable)
-    least = {name: _total(squares[name]) if many else _variance(fits[name]) for name in usable}
+    least = {name: np.nansum(squares[name]) if many else _variance(fits[name]) for name in usable}
     best = min(usable, key=lambda name: (least[name], len(fits[name].names)))
     entries = []
     for name, each in fits.items():
@@ -413,7 +415,7 @@ def _judged(fits: dict[str, Fit]) -> dict[str, LawFit]:
         if tier != "fails" and chance < level:
             worse = f"{worse} than {best} (p-value {chance:.1g})"
             tier, verdict = "worse", f"{verdict}, {worse}" if tier != "fits" else worse
-        error = _left_out_rms(each, errors[name])
+        error = rms(each.problem, errors[name])
         entries.append(LawFit(name, each, error, _aicc(each), verdict, tier))
     return {x.name: x for x in sorted(entries, key=_order)}
 
@@ -469,11 +471,6 @@ def _per_shot(result: Fit, error: np.ndarray) -> np.ndarray:
     return np.where(np.isnan(error).all(axis=1), np.nan, squares)
 
 
-def _total(squares: np.ndarray) -> float:
-    """The sum of these squares; 0 where there are none."""
-    return float(np.nansum(squares)) if np.isfinite(squares).any() else 0.0
-
-
 def _chance(squares: np.ndarray, best: np.ndarray) -> float:
     """That a law predicting as well as the best shows such errors: paired t tests over shots.
 
@@ -505,22 +502,9 @@ def _variance(result: Fit) -> float:
 
 def _by_residuals(result: Fit, best: Fit) -> float:
     """Chance of residuals so much larger, as if the better law had one parameter more at least."""
+    gain = result.starts[0].sum_of_squares - best.starts[0].sum_of_squares
     more = max(best.rank - result.rank, 1)
-    variance = _variance(best)
-    gain = (result.starts[0].sum_of_squares - best.starts[0].sum_of_squares) / more
-    if not np.isfinite(variance) or gain <= 0:
-        return 1.0
-    least = best.problem.exact_squares
-    return float(fdtrc(more, best.degrees_of_freedom, gain / max(variance, least)))
-
-
-def _left_out_rms(result: Fit, error: np.ndarray) -> float:
-    """Root mean square error of shots left out [m/s]."""
-    data = result.problem.experiments
-    assert data is not None
-    if np.isnan(error).all():
-        return np.nan
-    return float(np.sqrt(np.nanmean((error / data.natural_errors(result.problem.scene)) ** 2)))
+    return _f_test(gain, more, best)[-1] if gain > 0 else 1.0
 
 
 def _aicc(result: Fit) -> float:

@@ -7,7 +7,7 @@ One pass evaluates residual and Jacobian together, so that an impact is compiled
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
@@ -25,9 +25,6 @@ if TYPE_CHECKING:
 
     from jimpact.fits.problem import FitProblem
 
-# residual (R,), Jacobian (R, P), anything else to keep of the best point y (P,)
-Evaluated = tuple[jax.Array, jax.Array, Any]
-Evaluate = Callable[[jax.Array], Evaluated]
 Method: TypeAlias = "str | optax.GradientTransformation"
 
 # Steps of one start before the solver gives up: more only costs time.
@@ -78,7 +75,9 @@ START_RESTITUTION = 0.5
 # residual, and their values by less than this share of a standard error, or of a natural scale
 # where the data do not determine them. What starts leave is a tenth of that.
 SAME_COST, SAME_ERRORS, SAME_VALUE = 1e-2, 0.2, 1e-3
-FLAT = 1e-6  # share of the largest singular value below which data do not determine a direction
+# Singular values of the scaled Jacobian below this share of the largest are zero: derivatives of
+# an impact are good to about 1e-7 (float64; 1e-4 in float32), so smaller ones may be errors.
+RANK_TOLERANCE = {"float64": 1e-6, "float32": 1e-3}
 # Starts up to so many variances above the best are solved to their ends, the others only to
 # where minima can be told apart: intervals of all levels end before.
 HARDLY_WORSE = 100.0
@@ -88,40 +87,26 @@ STARTS, ROUNDS = 12, 6  # by default, and how often others around the best follo
 # times more values take ten times as long, ten times fewer step over minima.
 SCANNED, SCAN_FACTOR, SCANS = 24, 100.0, 2
 NEAR_SPREAD = 2.0  # of starts around the best, in standard errors
-NEAR_RCOND = 1e-10  # directions that the data do not determine are not searched
 SETTLED, SETTLING = 1e-5, 10  # change (natural scales) and rounds, where errors of v- are passed on
 
 
-class Box(eqx.Module):
-    """The box `low <= y <= high`."""
+def _free_gradient(problem: "FitProblem", y: jax.Array, gradient: jax.Array) -> jax.Array:
+    """The gradient without variables that sit on a bound and are pushed against it."""
+    pushed = ((y <= problem.low) & (gradient > 0)) | ((y >= problem.high) & (gradient < 0))
+    return jnp.where(pushed, 0.0, gradient)
 
-    low: jax.Array
-    high: jax.Array
 
-    def retract(self, y: jax.Array) -> jax.Array:
-        """The nearest point of the box."""
-        return jnp.clip(y, self.low, self.high)
-
-    def free_gradient(self, y: jax.Array, gradient: jax.Array) -> jax.Array:
-        """The gradient without variables that sit on a bound and are pushed against it."""
-        pushed = ((y <= self.low) & (gradient > 0)) | ((y >= self.high) & (gradient < 0))
-        return jnp.where(pushed, 0.0, gradient)
-
-    def step(
-        self, y: jax.Array, residual: jax.Array, jacobian: jax.Array, damping: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """Damped Gauss-Newton step of the free variables, and the decrease it promises."""
-        gradient = jacobian.T @ residual
-        pushed = (self.free_gradient(y, gradient) == 0) & (gradient != 0)
-        jacobian = jnp.where(pushed[None, :], 0.0, jacobian)
-        gradient = jnp.where(pushed, 0.0, gradient)
-        hessian = jacobian.T @ jacobian
-        curvature = jnp.diagonal(hessian)
-        largest = jnp.max(curvature)
-        curvature = jnp.maximum(curvature, jnp.where(largest > 0, _FLAT * largest, 1.0))
-        factor = jax.scipy.linalg.cho_factor(hessian + jnp.diag(damping * curvature))
-        move = -jax.scipy.linalg.cho_solve(factor, gradient)
-        return move, -(gradient @ move) - 0.5 * jnp.sum((jacobian @ move) ** 2)
+def _damped_step(
+    gradient: jax.Array, jacobian: jax.Array, damping: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Damped Gauss-Newton step, and the decrease it promises."""
+    hessian = jacobian.T @ jacobian
+    curvature = jnp.diagonal(hessian)
+    largest = jnp.max(curvature)
+    curvature = jnp.maximum(curvature, jnp.where(largest > 0, _FLAT * largest, 1.0))
+    factor = jax.scipy.linalg.cho_factor(hessian + jnp.diag(damping * curvature))
+    move = -jax.scipy.linalg.cho_solve(factor, gradient)
+    return move, -(gradient @ move) - 0.5 * jnp.sum((jacobian @ move) ** 2)
 
 
 class Damping(NamedTuple):
@@ -161,10 +146,10 @@ class SolverState(eqx.Module):
     stuck: jax.Array  # no step lowers the cost
 
 
-def check_method(method: Any) -> None:
-    """Raise a ValueError unless `method` is a known name or an optax transformation."""
+def default_steps(method: Any) -> int:
+    """Step limit where the user gives none; raises a ValueError for an unknown method."""
     if isinstance(method, str) and method in DEFAULT_STEPS:
-        return
+        return DEFAULT_STEPS[method]
     import optax
 
     if not isinstance(method, optax.GradientTransformation):
@@ -172,15 +157,11 @@ def check_method(method: Any) -> None:
             f"Argument `method` must be one of {', '.join(map(repr, DEFAULT_STEPS))} or an "
             f"optax.GradientTransformation, but has value {method!r}."
         )
+    return DEFAULT_STEPS["adam"]
 
 
-def default_steps(method: Method) -> int:
-    """Step limit where the user gives none."""
-    return DEFAULT_STEPS[method if isinstance(method, str) else "adam"]
-
-
-def begin(y: Any, first: Evaluated, search: "Search") -> SolverState:
-    """States before the first pass from y (S, P); `first`: arrays like what `evaluate` returns."""
+def begin(problems: Any, y: Any, search: "Search") -> SolverState:
+    """States before the first pass of S problems from y (S, Q), on the host."""
     count, dtype = len(y), y.dtype
 
     def all_are(value: Any, dtype: Any = dtype) -> Any:
@@ -194,82 +175,92 @@ def begin(y: Any, first: Evaluated, search: "Search") -> SolverState:
         memory = jax.device_get(jax.vmap(init)(y))
     costs = all_are(np.inf), all_are(np.inf)
     ends = all_are(0, int), all_are(False, bool), all_are(False, bool)
-    # copies: states are written in place
-    return jax.tree.map(np.array, SolverState(y, *first, *costs, y, memory, *ends))
+    trial = np.clip(y, problems.low, problems.high)
+    residual, jacobian, aux = problems.blank(y)
+    state = SolverState(y, residual, jacobian, aux, *costs, trial, memory, *ends)
+    return jax.tree.map(np.array, state)  # copies: states are written in place
 
 
-def advance(
-    evaluate: Evaluate,
-    box: Box,
-    method: Method,
-    max_steps: int,
-    state: SolverState,
-    passes: int,
-    stop: Any,
+@quick_jit
+def advance_all(
+    problems: Any, states: SolverState, method: Method, max_steps: int, stop: jax.Array
 ) -> SolverState:
-    """Up to `passes` passes more, fewer if done or at the step limit; `stop`: see `FINE`."""
-    last = jnp.minimum(state.steps + passes, max_steps)
-    state = eqx.tree_at(lambda s: s.trial, state, box.retract(state.trial))
+    """Up to `PASSES` passes more of every problem; `stop`: see `FINE`."""
 
-    def one(state: SolverState) -> SolverState:
-        """One pass."""
-        residual, jacobian, aux = evaluate(state.trial)
-        cost = 0.5 * jnp.sum(residual**2)
-        better = cost < state.cost
-        here = (state.trial, residual, jacobian, aux, cost)
-        best = (state.y, state.residual, state.jacobian, state.aux, state.cost)
-        best = jax.tree.map(lambda a, b: jnp.where(better, a, b), here, best)
-        y, r, jac, aux, least = best
-        dtype = str(y.dtype)
-        floor = jnp.asarray(_LEAST[dtype], y.dtype)
-        if method == "levenberg-marquardt":
-            memory = state.memory.after(state.cost - cost)
-            step = partial(box.step, y, r, jac)
-            moves, gains = jax.vmap(step)(jnp.stack([floor, memory.value]))  # compiled once
-            gain, trial = gains[0], box.retract(y + moves[1])
-            change = jac @ (trial - y)
-            memory = memory._replace(promised=-(r @ change) - 0.5 * jnp.sum(change**2))
-            stuck = memory.value > _STUCK
-        else:
-            gain = box.step(y, r, jac, floor)[1]
-            gradient = box.free_gradient(state.trial, jacobian.T @ residual)
-            # optax itself mixes integers and floats: it needs the standard promotion
-            with jax.numpy_dtype_promotion("standard"):
-                move, memory = _transformation(method, max_steps).update(
-                    gradient,
-                    state.memory,
-                    state.trial,
-                    value=cost,
-                    grad=gradient,
-                    value_fn=lambda y: _cost(evaluate, box.retract(y)),
-                )
-            trial = box.retract(state.trial + move)
-            stuck = jnp.asarray(False)
-        finest = stop * least / residual.shape[0] + STOP_EXACT[dtype]
-        rounding = ROUNDING[dtype] * least / residual.shape[0] + ROUNDING_EXACT[dtype]
-        small = gain <= jnp.where(better, finest, jnp.maximum(finest, rounding))
-        return SolverState(
-            y, r, jac, aux, least, gain, trial, memory, state.steps + 1, small | stuck, stuck
-        )
+    def one(problem: Any, state: SolverState) -> SolverState:
+        """One problem, until it is done or at the step limit."""
+        last = jnp.minimum(state.steps + PASSES, max_steps)
+        one_pass = partial(_pass, problem, method, max_steps, stop)
+        return jax.lax.while_loop(lambda s: ~s.done & (s.steps < last), one_pass, state)
 
-    return jax.lax.while_loop(lambda s: ~s.done & (s.steps < last), one, state)
+    return eqx.filter_vmap(one)(problems, states)
 
 
-def _cost(evaluate: Evaluate, y: jax.Array) -> jax.Array:
-    """`|r|^2 / 2`, its derivative taken from the Jacobian that `evaluate` gives (line searches)."""
+def _pass(
+    problem: "FitProblem", method: Method, max_steps: int, stop: jax.Array, state: SolverState
+) -> SolverState:
+    """Residual and Jacobian of the trial, and the next one."""
+    residual, jacobian, aux = problem.evaluate(state.trial)
+    cost = 0.5 * jnp.sum(residual**2)
+    better = cost < state.cost
+    here = (state.trial, residual, jacobian, aux, cost)
+    best = (state.y, state.residual, state.jacobian, state.aux, state.cost)
+    best = jax.tree.map(lambda a, b: jnp.where(better, a, b), here, best)
+    y, r, jac, aux, least = best
+    dtype = str(y.dtype)
+    slope = jac.T @ r
+    free = _free_gradient(problem, y, slope)
+    of_free = jnp.where((free == 0) & (slope != 0), 0.0, jac)
+    floor = jnp.asarray(_LEAST[dtype], y.dtype)
+    if method == "levenberg-marquardt":
+        memory = state.memory.after(state.cost - cost)
+        dampings = jnp.stack([floor, memory.value])  # compiled once
+        moves, gains = jax.vmap(partial(_damped_step, free, of_free))(dampings)
+        gain, trial = gains[0], jnp.clip(y + moves[1], problem.low, problem.high)
+        change = jac @ (trial - y)
+        memory = memory._replace(promised=-(r @ change) - 0.5 * jnp.sum(change**2))
+        stuck = memory.value > _STUCK
+    else:
+        gain = _damped_step(free, of_free, floor)[1]
+        gradient = _free_gradient(problem, state.trial, jacobian.T @ residual)
+        # optax itself mixes integers and floats: it needs the standard promotion
+        with jax.numpy_dtype_promotion("standard"):
+            move, memory = _transformation(method, max_steps).update(
+                gradient,
+                state.memory,
+                state.trial,
+                value=cost,
+                grad=gradient,
+                value_fn=partial(_cost, problem),
+            )
+        trial = jnp.clip(state.trial + move, problem.low, problem.high)
+        stuck = jnp.asarray(False)
+    finest = stop * least / residual.shape[0] + STOP_EXACT[dtype]
+    rounding = ROUNDING[dtype] * least / residual.shape[0] + ROUNDING_EXACT[dtype]
+    small = gain <= jnp.where(better, finest, jnp.maximum(finest, rounding))
+    return SolverState(
+        y, r, jac, aux, least, gain, trial, memory, state.steps + 1, small | stuck, stuck
+    )
+
+
+def _cost(problem: "FitProblem", y: jax.Array) -> jax.Array:
+    """`|r|^2 / 2` at the nearest point in the bounds, for line searches.
+
+    Its derivative is taken from the Jacobian that `evaluate` gives.
+    """
 
     @jax.custom_jvp
     def cost(y: jax.Array) -> jax.Array:
         """Half the sum of squares."""
-        return 0.5 * jnp.sum(evaluate(y)[0] ** 2)
+        return 0.5 * jnp.sum(problem.evaluate(y)[0] ** 2)
 
     @cost.defjvp
     def _rule(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
         """The derivative by the Jacobian."""
-        residual, jacobian, _ = evaluate(primals[0])
+        residual, jacobian, _ = problem.evaluate(primals[0])
         return 0.5 * jnp.sum(residual**2), (jacobian.T @ residual) @ tangents[0]
 
-    return cost(y)
+    return cost(jnp.clip(y, problem.low, problem.high))
 
 
 def _transformation(method: Method, max_steps: int) -> "optax.GradientTransformationExtraArgs":
@@ -303,6 +294,7 @@ class Ends(NamedTuple):
 
     y: np.ndarray  # (S, Q)
     squares: np.ndarray  # (S,) |r|^2
+    residual: np.ndarray  # (S, R)
     jacobian: np.ndarray  # (S, R, Q)
     predicted: np.ndarray
     status: np.ndarray
@@ -324,30 +316,40 @@ def minimize(
     stop: float = 0.0,
     rivals: bool = False,
     what: str = "fits",
+    fixed: np.ndarray | None = None,
 ) -> Ends:
-    """Minima of S problems (`FitProblem.program` with a leading axis) from y (S, Q).
+    """Minima of S problems (`stacked`) from y (S, Q).
 
     As many as `problems.lanes(S)` are solved side by side; those that are done make room for
     others. `stop`: see `FINE`, which it is at least. `rivals`: all are starts of one problem, and
-    those that creep or will not become the best are given up. Progress counts `what`. A matrix that
-    must be admissible is sought without that, and then the best admissible one.
+    those that creep or will not become the best are given up. Progress counts `what`. `fixed`
+    (S, Q): which entries of y stay as they are. A matrix that must be admissible is sought without
+    that, and then the best admissible one.
     """
-    dtype, matrix = problems.low.dtype, problems.matrix
+    points = points.astype(problems.low.dtype)
+    dtype, matrix = str(points.dtype), problems.matrix
+    if fixed is not None:
+        low, high = (np.where(fixed, points, end) for end in (problems.low, problems.high))
+        problems, matrix = replace(problems, low=low, high=high), None
     problems = replace(problems, matrix=None)
-    rule = (max(FINE[str(dtype)], stop), rivals, what)
-    states, converged = _descended(problems, points.astype(dtype), search, *rule)
+    rule = (max(FINE[dtype], stop), rivals, what)
+    states, converged = _descended(problems, points, search, *rule)
     y, steps, stuck = np.asarray(states.y), states.steps, states.stuck
     once, moved = search._replace(max_steps=1), np.full(len(y), matrix is not None)
     for _ in range(SETTLING):
         if not moved.any():
             break
-        inside = _in_lanes(best_inside, problems.lanes(len(y)), matrix, states)
+        inside = np.empty_like(y)
+        every = np.arange(len(y)), problems.lanes(len(y))
+        for rows, nearest in _in_lanes(best_inside, *every, matrix, states):
+            inside[rows] = nearest
         states, _ = _descended(problems, inside, once, *rule)
         moved, y = np.abs(inside - y).max(axis=1) > SETTLED, inside
     size = np.asarray(problems.size, float)
     return Ends(
         y=np.asarray(states.y, float),
         squares=2 * np.asarray(states.cost, float) * size**2,
+        residual=np.asarray(states.residual, float) * size[:, None],
         jacobian=np.asarray(states.jacobian, float) * size[:, None, None],
         predicted=np.asarray(states.aux[0], float),
         status=states.aux[1],
@@ -355,16 +357,18 @@ def minimize(
         converged=converged & ~moved,
         stuck=np.asarray(stuck),
         steps=np.asarray(steps),
-        exact=EXACT[str(dtype)] * size**2,
+        exact=EXACT[dtype] * size**2,
     )
 
 
-def _in_lanes(compiled: Callable[..., Any], lanes: int, *trees: Any) -> np.ndarray:
-    """Rows of the results of a compiled function of so many rows."""
-    count = len(jax.tree.leaves(trees[-1])[0])
-    some = [np.arange(first, first + lanes) for first in range(0, count, lanes)]
-    rows = [np.minimum(each, count - 1) for each in some]
-    return np.concatenate([compiled(*(_rows(x, each) for x in trees)) for each in rows])[:count]
+def _in_lanes(
+    compiled: Callable[..., Any], which: np.ndarray, lanes: int, *trees: Any
+) -> Iterator[tuple[np.ndarray, Any]]:
+    """Which rows of the trees, so many side by side, and what a compiled function makes of them."""
+    for first in range(0, len(which), lanes):
+        rows = which[np.minimum(np.arange(first, first + lanes), len(which) - 1)]
+        pick = partial(jax.tree.map, lambda x, rows=rows: x[rows] if eqx.is_array(x) else x)
+        yield rows, compiled(*map(pick, trees))
 
 
 @quick_jit
@@ -390,14 +394,17 @@ def _descended(
     if not descends:
         limit = np.asarray(limit)  # one program serves all limits
     rule: Any = (search.method, limit, np.asarray(stop, dtype))
-    states = begin(points, problems.blank(points), search)
+    states = begin(problems, points, search)
+
+    def advance(problems: Any, states: SolverState) -> SolverState:
+        """Some of them."""
+        return advance_all(problems, states, *rule)
+
     converged = np.zeros(count, bool)
     active, lanes = np.arange(count), problems.lanes(count)
     while len(active):
         before = states.cost.copy()
-        for first in range(0, len(active), lanes):
-            rows = active[np.minimum(np.arange(first, first + lanes), len(active) - 1)]
-            some = advance_all(_rows(problems, rows), _rows(states, rows), *rule)
+        for rows, some in _in_lanes(advance, active, lanes, problems, states):
             for leaf, value in zip(jax.tree.leaves(states), jax.tree.leaves(some)):
                 leaf[rows] = value
         converged = _converged(states, DESCENDED if descends else CONVERGED)
@@ -422,50 +429,17 @@ def _converged(states: SolverState, enough: float) -> np.ndarray:
     return small | (squares <= EXACT[str(states.y.dtype)]) | states.stuck
 
 
-@quick_jit
-def advance_all(
-    problems: Any, states: SolverState, method: Method, max_steps: int, stop: jax.Array
-) -> SolverState:
-    """Up to `PASSES` passes more of every problem."""
-
-    def one(problem: Any, state: SolverState) -> SolverState:
-        """One problem."""
-        box = Box(problem.low, problem.high)
-        return advance(problem.evaluate, box, method, max_steps, state, PASSES, stop)
-
-    return eqx.filter_vmap(one)(problems, states)
-
-
-def _rows(tree: Any, rows: np.ndarray) -> Any:
-    """These rows of all arrays."""
-    return jax.tree.map(lambda leaf: leaf[rows] if eqx.is_array(leaf) else leaf, tree)
-
-
-def repeated(problem: "FitProblem", count: int) -> Any:
-    """So many times the same problem, without copies."""
-
-    def each(leaf: Any) -> Any:
-        """The array without copies."""
-        return np.broadcast_to(leaf, (count, *np.shape(leaf))) if eqx.is_array(leaf) else leaf
-
-    return jax.tree.map(each, problem.program())
-
-
-def stacked(problems: "list[FitProblem]", each: int = 1) -> Any:
-    """The problems side by side, each so many times."""
+def stacked(problems: "Sequence[FitProblem]", each: int = 1) -> Any:
+    """The problems as compiled functions take them, side by side, each so many times."""
     filled = [problem.program() for problem in problems]
-    many = jax.tree.map(lambda *x: np.stack([np.asarray(leaf) for leaf in x]), *filled)
-    return many if each == 1 else jax.tree.map(lambda x: np.repeat(x, each, axis=0), many)
 
+    def side_by_side(*leaves: Any) -> Any:
+        """Arrays with a leading axis; what is no array is the same for all."""
+        if not eqx.is_array(leaves[0]):
+            return leaves[0]
+        return np.repeat(np.stack([np.asarray(leaf) for leaf in leaves]), each, axis=0)
 
-def minimize_with(
-    many: Any, points: np.ndarray, fixed: np.ndarray, search: Search, stop: float = 0.0
-) -> Ends:
-    """Minima of S problems from y (S, Q) with the `fixed` (S, Q) entries of y as they are."""
-    points = points.astype(many.low.dtype)
-    low, high = (np.where(fixed, points, end) for end in (many.low, many.high))
-    many = replace(many, low=low, high=high, matrix=None)
-    return minimize(many, points, search, stop, what="fixed values")
+    return jax.tree.map(side_by_side, *filled)
 
 
 # ---------------------------------------------------------------------------- distinct minima
@@ -476,14 +450,16 @@ class FitMinimum:
     """A minimum that starts ended in: sum of squared (weighted) residuals, values, how many.
 
     `standard_error` is None where it fits so much worse that it does not matter. A search knows the
-    `jacobian` (R, P) of the scaled parameters.
+    `residual` (R,) of what was measured, then that of the priors, and its `jacobian` (R, P) in the
+    scaled parameters.
     """
 
     sum_of_squares: float
     value: np.ndarray
     count: int
     standard_error: np.ndarray | None = None
-    jacobian: np.ndarray | None = None
+    jacobian: np.ndarray = None  # type: ignore[assignment]  # of a result: what a search knows
+    residual: np.ndarray = None  # type: ignore[assignment]
 
 
 class Solution(NamedTuple):
@@ -507,9 +483,7 @@ class Solution(NamedTuple):
     @property
     def jacobian(self) -> np.ndarray:
         """(R, P), of the scaled parameters at the best."""
-        jacobian = self.minima[0].jacobian
-        assert jacobian is not None
-        return jacobian
+        return self.minima[0].jacobian
 
 
 def solution(
@@ -518,7 +492,10 @@ def solution(
     """The distinct minima among ends; counts: of the starts that an end is for."""
     counts = np.ones(len(ends.y), int) if counts is None else counts
     count, measured = len(problem.names), problem.measured
-    groups = _groups(ends, count)
+    groups = _groups(problem, ends)
+    # without what filled up, and parameters that have no prior
+    first_prior = ends.residual.shape[1] - len(problem.low)
+    own = [*range(measured.size), *(first_prior + prior.parameter for prior in problem.priors)]
     best, y = groups[0][0], ends.y[:, :count]
     # starts that did not converge have no minimum to report, unless they are the best there is
     kept = [[i for i in group if ends.converged[i] or i == best] for group in groups]
@@ -527,7 +504,9 @@ def solution(
             float(ends.squares[group[0]]),
             problem.values_at(ends.y[group[0]]),
             int(counts[group].sum()),
-            jacobian=ends.jacobian[group[0]][: measured.size, :count],  # without what filled up
+            None,
+            ends.jacobian[group[0]][own, :count],
+            ends.residual[group[0]][own],
         )
         for group in kept
         if group
@@ -561,11 +540,11 @@ def find_minima(problem: "FitProblem", starts: int | None, seed: int, search: Se
 
     def rough(points: np.ndarray) -> Ends:
         """To where minima can be told apart."""
-        many = repeated(problem, len(points))
+        many = stacked([problem], len(points))
         return minimize(many, points, search, COARSE, rivals=True, what="starts")
 
     if starts == 1:
-        return solution(problem, minimize(repeated(problem, 1), points, search, what="starts"))
+        return solution(problem, minimize(stacked([problem]), points, search, what="starts"))
     if rounds > 1:
         points = np.concatenate([points, _scanned(problem)])
     ends = rough(points)
@@ -575,22 +554,17 @@ def find_minima(problem: "FitProblem", starts: int | None, seed: int, search: Se
         ends = jax.tree.map(lambda a, b: np.concatenate([a, b]), ends, more)
         if not np.nanmin(more.squares) < least * (1 - 1 / ends.jacobian.shape[1]):
             break
-    groups, total = _groups(ends, len(problem.names)), len(ends.y)
-    firsts = np.array([group[0] for group in groups])
-    converged = ends.converged | (np.arange(total) == firsts[0])
-    counts = np.array([converged[group].sum() for group in groups])
-    variance = ends.squares[firsts[0]] / ends.jacobian.shape[1]
-    near = ends.squares[firsts] <= ends.squares[firsts[0]] + HARDLY_WORSE * variance
-    near &= converged[firsts]
-    points = ends.y[firsts[near]]
-    fine = minimize(repeated(problem, len(points)), points, search, what="minima")
+    firsts = np.array([group[0] for group in _groups(problem, ends)])
+    best, variance = firsts[0], ends.squares[firsts[0]] / ends.jacobian.shape[1]
+    near = ends.squares[firsts] <= ends.squares[best] + HARDLY_WORSE * variance
+    near = firsts[near & (ends.converged[firsts] | (firsts == best))]
+    fine = minimize(stacked([problem], len(near)), ends.y[near], search, what="minima")
+    fine = fine._replace(steps=fine.steps + ends.steps[near])
+    for leaf, value in zip(jax.tree.leaves(ends), jax.tree.leaves(fine)):
+        leaf[near] = value
+    total = len(ends.y)
     search.show(f"fit: {total} of {total} starts done", total, total)
-    steps = ends.steps.max() + fine.steps.max()
-    others = converged[firsts] & ~near
-    ends = jax.tree.map(lambda a, b: np.concatenate([b, a[firsts[others]]]), ends, fine)
-    counts = np.concatenate([counts[near], counts[others]])
-    lost = total - int(counts.sum())
-    return solution(problem, ends, counts, lost)._replace(steps=int(steps))
+    return solution(problem, ends)
 
 
 def start_points(problem: "FitProblem", starts: int, rng: np.random.Generator) -> np.ndarray:
@@ -626,20 +600,22 @@ def _near(problem: "FitProblem", ends: Ends, count: int, rng: np.random.Generato
     """Points (count, Q) around the best, as far off as its standard errors, inside the bounds."""
     best = int(np.nanargmin(ends.squares))
     jacobian, measured = np.nan_to_num(ends.jacobian[best]), int(np.sum(problem.weight > 0))
-    inverse = np.linalg.pinv(jacobian.T @ jacobian, rcond=NEAR_RCOND, hermitian=True)
+    # directions that the data do not determine are not searched
+    least = RANK_TOLERANCE[problem.precision] ** 2
+    inverse = np.linalg.pinv(jacobian.T @ jacobian, rcond=least, hermitian=True)
     spread = NEAR_SPREAD * np.sqrt(ends.squares[best] / measured * np.diag(inverse))
     y = ends.y[best]
     points = y + np.minimum(spread, START_SCALES) * rng.normal(size=(count, len(y)))
     return np.clip(points, problem.low, problem.high)
 
 
-def _groups(ends: Ends, count: int) -> list[list[int]]:
+def _groups(problem: "FitProblem", ends: Ends) -> list[list[int]]:
     """Ends in the same minimum, best minimum first.
 
     Of equally good ends a converged one comes first, then the earliest start: the first start is
     the user's own.
     """
-    squares, y, least = ends.squares, ends.y[:, :count], np.nanmin(ends.squares)
+    squares, y, least = ends.squares, ends.y[:, : len(problem.names)], np.nanmin(ends.squares)
     unit, exact = SAME_COST / ends.jacobian.shape[1], ends.exact[0]
     equal = squares <= least * (1 + unit) + exact
     order = np.lexsort((np.arange(len(y)), ~ends.converged, np.where(equal, least, squares)))
@@ -648,7 +624,7 @@ def _groups(ends: Ends, count: int) -> list[list[int]]:
         for group in groups:
             first = group[0]
             close = abs(squares[i] - squares[first]) <= unit * squares[first] + exact
-            if close and _same_values(ends, first, y[i] - y[first]):
+            if close and _same_values(problem, ends, first, y[i] - y[first]):
                 group.append(int(i))
                 break
         else:
@@ -656,7 +632,7 @@ def _groups(ends: Ends, count: int) -> list[list[int]]:
     return groups
 
 
-def _same_values(ends: Ends, first: int, apart: np.ndarray) -> bool:
+def _same_values(problem: "FitProblem", ends: Ends, first: int, apart: np.ndarray) -> bool:
     """Whether values (P,) so far apart from those of an end are the same."""
     if np.abs(apart).max() < SAME_VALUE:
         return True
@@ -664,7 +640,7 @@ def _same_values(ends: Ends, first: int, apart: np.ndarray) -> bool:
     if not np.isfinite(jacobian).all():
         return False
     _, singular, directions = np.linalg.svd(jacobian, full_matrices=False)
-    determined = singular > FLAT * singular[0]
+    determined = singular > RANK_TOLERANCE[problem.precision] * singular[0]
     noise = np.sqrt(ends.squares[first] / len(jacobian))
     errors = np.where(determined, noise / np.where(determined, singular, 1.0), 0.0)
     allowed = np.maximum(SAME_ERRORS * errors, SAME_VALUE)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Generic, NamedTuple
 
 import jax
@@ -10,6 +11,7 @@ import numpy as np
 from scipy.special import ndtri, stdtrit
 
 from jimpact._checks import check_choice, check_kind, check_values
+from jimpact.files.records import Column, Table, Tabular
 from jimpact.fits.data import Experiments
 from jimpact.fits.parameters import (
     AnyLaw,
@@ -20,13 +22,10 @@ from jimpact.fits.parameters import (
     value_of,
 )
 from jimpact.fits.problem import FitProblem
-from jimpact.fits.solve import FitMinimum, Search, minimize_with, repeated, solution
-from jimpact.law import Law, parameters_of
+from jimpact.fits.report import as_record, pieces_in_words, report, save_fit, verdict
+from jimpact.fits.solve import RANK_TOLERANCE, FitMinimum, Search, minimize, solution, stacked
+from jimpact.law import parameters_of
 from jimpact.scene import Scene
-
-# Singular values of the scaled Jacobian below this share of the largest are zero: derivatives of
-# an impact are good to about 1e-7 (float64; 1e-4 in float32), so smaller ones may be errors.
-RANK_TOLERANCE = {"float64": 1e-6, "float32": 1e-3}
 
 # A parameter takes part in an undetermined combination if its share of that direction exceeds this;
 # shares of parameters that take no part are errors of the derivatives, about 1e-6.
@@ -73,16 +72,13 @@ def uncertainty(
         noise: s; None: as stated, or from |r|^2.
     """
     scale = problem.steps_at(minimum.value)
-    _, of_priors = problem.prior_errors(minimum.value)
-    assert minimum.jacobian is not None
-    jacobian = np.vstack([minimum.jacobian, of_priors * scale])
-    _, singular, directions = np.linalg.svd(jacobian, full_matrices=True)
+    _, singular, directions = np.linalg.svd(minimum.jacobian, full_matrices=True)
     singular = np.pad(singular, (0, len(scale) - len(singular)))
     rank = int(np.sum(singular > RANK_TOLERANCE[problem.precision] * singular[0]))
     freedom = problem.values - rank
     if noise is None and problem.sigma is not None:
         noise = 1.0
-    elif noise is None and (freedom < 1 or reproduced(problem, minimum)):
+    elif noise is None and (freedom < 1 or minimum.sum_of_squares <= problem.exact_squares):
         noise = np.nan
     elif noise is None:
         noise = float(np.sqrt(minimum.sum_of_squares / freedom))
@@ -98,11 +94,6 @@ def uncertainty(
     np.fill_diagonal(correlation, 1.0)
     words = tuple(_in_words(problem, row, scale) for row in _reduced(null))
     return Uncertainty(rank, singular, freedom, noise, covariance, correlation, error, words)
-
-
-def reproduced(problem: FitProblem, minimum: FitMinimum) -> bool:
-    """Whether all measured values are reproduced to the last digit."""
-    return minimum.sum_of_squares <= problem.exact_squares
 
 
 def _reduced(null: np.ndarray) -> np.ndarray:
@@ -198,21 +189,6 @@ def joined(pieces: Iterable[tuple[float, float]]) -> tuple[tuple[float, float], 
     return tuple(union)
 
 
-def pieces_in_words(pieces: Iterable[tuple[float, float]], domain: tuple[float, float]) -> str:
-    """Pieces of an interval; an end of the domain is left out."""
-    return " or ".join(_piece(*ends, domain) for ends in pieces)
-
-
-def _piece(low: float, high: float, domain: tuple[float, float]) -> str:
-    """One piece of an interval in words."""
-    open_low, open_high = low <= domain[0], high >= domain[1]
-    if open_low and open_high:
-        return "anything"
-    if open_low or open_high:
-        return f"at most {high:.5g}" if open_low else f"at least {low:.5g}"
-    return f"{low:.5g} to {high:.5g}"
-
-
 # ---------------------------------------------------------------------------- the result
 
 
@@ -242,7 +218,7 @@ class Predicted(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class FitResult(Generic[AnyLaw]):
+class Fit(Tabular, Generic[AnyLaw]):
     """The result of `fit`. `print(fit)` gives its report.
 
     P free parameters, K shots of n velocities.
@@ -312,17 +288,50 @@ class FitResult(Generic[AnyLaw]):
     seed: int = 0
     profiles: tuple[Profile, ...] = ()
     reservations: tuple[str, ...] = ()
+    picture = "fit"
+
+    def __str__(self) -> str:
+        return report(self)
+
+    @property
+    def verdict(self) -> str:
+        """The result in one sentence that can be quoted: the first one of `print(fit)`.
+
+        Values with their errors, what they assume, and what speaks against them.
+        """
+        return verdict(self)
+
+    @property
+    def table(self) -> Table:
+        """A row a parameter: value, standard error, ends of its 95 % interval, whether seen."""
+        names = ("value", "standard_error", "low_95", "high_95", "at_bound", "determined")
+        ends = self.confidence_interval().T
+        columns = (self.value, self.standard_error, *ends, self.at_bound, self.determined)
+        rows = list(zip(self.names, *(column.tolist() for column in columns)))
+        return Table([Column(name) for name in ("parameter", *names)], rows)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything a JSON file can hold; numbers that are not finite become None."""
+        return as_record(self)
+
+    def save(self, path: str | Path) -> Path:
+        """Write the fit to a file (JSON) that `ji.load` reads: problem, result, versions.
+
+        Args:
+            path: the file; an existing file is replaced.
+
+        Returns:
+            The path.
+
+        Raises:
+            ValueError: a fit of something else than shots, or with ties: functions cannot be saved.
+        """
+        return save_fit(self, path)
 
     @property
     def scene(self) -> Scene | None:
         """The scene of all shots, with what was fitted of it; None: the shots have their own."""
         return self.problem.to_scene(self.value)
-
-    @property
-    def law_in_scene(self) -> Law:
-        """The law, and with it the parts of the scene that were fitted."""
-        fitted = isinstance(self.problem.law, LawInScene)
-        return self.problem.law_in_scene(self.value) if fitted else self.law
 
     @property
     def determined(self) -> np.ndarray:
@@ -360,9 +369,12 @@ class FitResult(Generic[AnyLaw]):
         return dict(zip(tied_names(problem.law, ties), pairs))
 
     def errors_of(self, slope: np.ndarray) -> np.ndarray:
-        """Standard errors of what has these derivatives (..., P) in the parameters.
+        """Standard errors of what depends on the parameters.
 
         Equation: `sqrt(J C J^T)`; inf where it depends on what the data do not determine.
+
+        Args:
+            slope: its derivatives (..., P) in the parameters.
         """
         seen = self.determined
         known = slope[..., seen]
@@ -406,33 +418,25 @@ class FitResult(Generic[AnyLaw]):
             )
         check_values("shots", data)
         data = Experiments(data, np.zeros_like(np.asarray(data, float)), scenes=scenes, units=units)
-        law, own = self.placed(scene)
-        largest = own if scenes is None else max(scenes, key=lambda each: each.contacts)
-        self._check_scene(largest, len(units))
-        ties = dict(self.problem.ties)
-        problem = FitProblem.from_shots(law, own, data, self.problem.parameters.labels, ties=ties)
-        point, every = problem.point(problem.start)[None], np.ones((1, len(problem.low)), bool)
-        ends = minimize_with(repeated(problem, 1), point, every, Search(max_steps=1))
-        there = solution(problem, ends)
-        slope = there.jacobian.reshape((*problem.measured.shape, len(problem.names)))
-        error = self.errors_of(problem.errors_of(slope / problem.steps_at(problem.start)))
-        value, noise = there.predicted, self._noise_of(shots)
-        half = quantile * np.hypot(error, noise)
-        return Predicted(value, error, np.asarray(there.status), noise, value - half, value + half)
-
-    def placed(self, scene: Scene | None) -> tuple[Law, Scene | None]:
-        """The law, with the parts of the scene that were fitted, and the scene of new shots.
-
-        Raises:
-            ValueError: another scene than that of which parts were fitted.
-        """
-        law = self.law_in_scene
+        law = self.problem.law_in_scene(self.value)
         if isinstance(law, LawInScene) and scene is not None:
             raise ValueError(
                 "Argument `scene` must be left out where parts of the scene were fitted: they hold "
                 "for that of the fit only."
             )
-        return law, self.problem.scene if scene is None else scene
+        own = self.problem.scene if scene is None else scene
+        largest = own if scenes is None else max(scenes, key=lambda each: each.contacts)
+        self._check_scene(largest, len(units))
+        ties = dict(self.problem.ties)
+        problem = FitProblem.from_shots(law, own, data, self.problem.parameters.labels, ties=ties)
+        point, every = problem.point(problem.start)[None], np.ones((1, len(problem.low)), bool)
+        ends = minimize(stacked([problem]), point, Search(max_steps=1), fixed=every)
+        there = solution(problem, ends)
+        slope = problem.of_data(there.jacobian)
+        error = self.errors_of(problem.errors_of(slope / problem.steps_at(problem.start)))
+        value, noise = there.predicted, self._noise_of(shots)
+        half = quantile * np.hypot(error, noise)
+        return Predicted(value, error, np.asarray(there.status), noise, value - half, value + half)
 
     def _check_scene(self, scene: Any, size: int) -> None:
         """Raise unless this is a scene for the law that was fitted and velocities of this size."""
@@ -454,10 +458,8 @@ class FitResult(Generic[AnyLaw]):
             stretched = 1.0 if self.problem.sigma is None else self.noise
             return stretched * np.asarray(shots.sigma, float)
         pre = shots.pre if isinstance(shots, Experiments) else shots
-        weight = self.problem.weight
-        variance = np.where(weight > 0, 1 / np.where(weight > 0, weight, 1.0) ** 2, 0.0).sum(axis=0)
-        count = (weight > 0).sum(axis=0)
-        each = np.sqrt(variance / np.where(count > 0, count, np.nan))  # NaN: never measured
+        weight = np.ma.masked_equal(np.asarray(self.problem.weight, float), 0.0)
+        each = np.sqrt((1 / weight**2).mean(axis=0)).filled(np.nan)  # NaN: never measured
         return np.broadcast_to(self.noise * each, np.shape(pre))
 
     @property
@@ -585,6 +587,9 @@ class FitResult(Generic[AnyLaw]):
 
 def check_squares(name: str, fit: Any) -> None:
     """Raise an error unless argument `name` is a fit by least squares."""
-    check_kind(name, fit, FitResult)
+    check_kind(name, fit, Fit)
     if fit.loss != "squares":
         raise ValueError(f"Argument `{name}` must be by least squares, but has loss {fit.loss!r}.")
+
+
+FitResult = Fit  # as `jimpact.plot` still calls it

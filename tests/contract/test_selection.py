@@ -49,9 +49,8 @@ def test_laws_that_agree_are_listed_by_what_they_must_know(every):
     reported = json.loads(json.dumps(every.to_dict(), allow_nan=False))
     assert reported["best"] == "newton"
     assert len(reported["laws"]["moreau"]["fit"]["shots"]) == 12
-    heads, rows = every.rows()
-    assert len(heads) == len(rows[0])
-    assert [row[0] for row in rows] == ["newton", "moreau"]
+    assert [row[0] for row in every.table.rows] == ["newton", "moreau"]
+    assert every.to_csv().startswith("law,parameters,rms_m_per_s,")
 
 
 def test_the_criterion_without_sigma_is_corrected_for_few_values():

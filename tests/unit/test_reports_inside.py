@@ -115,9 +115,7 @@ def test_values_that_the_data_do_not_determine_are_marked():
 def test_tables_of_a_fit(monkeypatch):
     found = canned(4)
     pytest.importorskip("pandas")
-    pytest.importorskip("xarray")
-    assert found.to_pandas().loc["restitution[1]", "standard_error"] == 0.01
-    assert found.to_xarray()["residual"].dims == ("shot", "velocity")
+    assert found.to_pandas()["standard_error"][0] == 0.01
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(ImportError, match="pandas must be installed"):
         found.to_pandas()
