@@ -590,6 +590,3 @@ def check_squares(name: str, fit: Any) -> None:
     check_kind(name, fit, Fit)
     if fit.loss != "squares":
         raise ValueError(f"Argument `{name}` must be by least squares, but has loss {fit.loss!r}.")
-
-
-FitResult = Fit  # as `jimpact.plot` still calls it

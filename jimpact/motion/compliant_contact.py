@@ -110,7 +110,10 @@ def _run(problem: MotionProblem, max_events: int, until_apart: bool) -> MotionEn
 
     end = jax.lax.while_loop(going, lambda run: _one_pass(problem, max_events, run), start)
     flight = end.flight
-    return MotionEnd(end.table, flight.sample, end.event_count, flight.steps, end.status, None)
+    counts = jnp.stack([flight.sample, end.event_count])
+    return MotionEnd(
+        end.table, flight.sample, end.event_count, flight.steps, end.status, counts, None
+    )
 
 
 def _begin(problem: MotionProblem, max_events: int) -> _CompliantRun:
@@ -182,6 +185,7 @@ def _with_friction(problem: MotionProblem, run: _CompliantRun) -> _CompliantRun:
         left = cone_margins(known, mu, held)
         within = WITHIN * friction_acceleration(known, mu, held.normal)
         # what passes the flat position turns: no forces hold both of its corners
+        assert held.tangential is not None
         both = jnp.concatenate([held.normal, held.tangential])
         growth = length(by_contact((known.approach + known.delassus @ both)[m:], m))
         holds = (growth <= within) & (left >= jnp.where(let_go, within, 0.0))

@@ -64,6 +64,7 @@ class _EventRun(NamedTuple):
     scales: Scales
     table: MotionTable
     event_count: jax.Array
+    smooth: jax.Array  # (2,) samples and events before normals jumped
     status: jax.Array
 
 
@@ -117,7 +118,9 @@ def _run(problem: MotionProblem, max_events: int) -> MotionEnd:
     flight, past = end.flight, None
     if problem.past is not None:
         past = _pack_checkpoint(end, problem.past.numbers.shape[0])
-    return MotionEnd(end.table, flight.sample, end.event_count, flight.steps, status, past)
+    return MotionEnd(
+        end.table, flight.sample, end.event_count, flight.steps, status, end.smooth, past
+    )
 
 
 def _remembered(run: _EventRun) -> Any:
@@ -177,6 +180,7 @@ def _begin(problem: MotionProblem, max_events: int) -> _EventRun:
         scales=Scales(zero, zero, zero),
         table=empty_table(problem, state, max_events),
         event_count=jnp.int32(0),
+        smooth=jnp.stack([flight.sample, jnp.int32(0)]),
         status=status,
     )
 
@@ -247,9 +251,11 @@ def _flown(problem: MotionProblem, run: _EventRun, flies: jax.Array) -> _EventRu
     samples = put(
         run.table.samples, packed(flight.state)[:, 0], jnp.where(flies, begin.sample, last)
     )
+    counts = jnp.stack([flight.sample, run.event_count])
     return run._replace(
         flight=flight,
         waits=run.waits | (flies & jnp.any(flight.event)),
+        smooth=jnp.where(flight.jumped, run.smooth, counts),
         table=run.table._replace(samples=samples),
     )
 

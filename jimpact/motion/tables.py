@@ -78,23 +78,24 @@ class MotionEnd(NamedTuple):
     event_count: jax.Array
     steps: jax.Array
     status: jax.Array
-    more: jax.Array | None  # what else the run tells
+    smooth: jax.Array  # (2,) samples and events before normals jumped
+    more: jax.Array | None  # what the next run takes over
 
 
 def differentiable(problem: Any, run: Callable[[Any], MotionEnd]) -> MotionEnd:
-    """`run(problem)` with derivatives in both modes; those of what is not reached are NaN."""
+    """`run(problem)` with derivatives in both modes; NaN of what is not reached, or not smooth."""
     end: MotionEnd = by_jacobian(run, problem)
 
     def known(rows: jax.Array, count: jax.Array) -> jax.Array:
-        """The first `count` () rows; derivatives of others, but of the last one, are NaN."""
+        """Rows, of which the first `count` () and the last one have derivatives, others NaN."""
         index = jnp.arange(len(rows), dtype=count.dtype)
         there = (index < count) | (index == len(rows) - 1)
-        some = jnp.where(there[:, None], rows, 0.0)
+        some = jnp.where(there[:, None], rows, jax.lax.stop_gradient(rows))
         return some + nan_derivatives(problem, there).astype(rows.dtype)
 
     samples, events = (
-        known(end.table.samples, end.reached),
-        known(end.table.events, end.event_count),
+        known(end.table.samples, jnp.minimum(end.reached, end.smooth[0])),
+        known(end.table.events, jnp.minimum(end.event_count, end.smooth[1])),
     )
     return end._replace(table=MotionTable(samples, events, end.table.marks))
 
@@ -125,7 +126,7 @@ def nan_unless(known: jax.Array, rows: jax.Array) -> jax.Array:
 
 
 def nan_derivatives(inputs: Any, known: jax.Array) -> jax.Array:
-    """Rows (r, 1): 0 where `known` (r,); elsewhere all derivatives by all inputs are NaN.
+    """Zeros (r, 1); where not `known` (r,) all their derivatives by all inputs are NaN.
 
     A motion that has ended does not determine what would come later. In reverse mode what nobody
     differentiates (a cotangent of 0) leaves the gradient as it is.
@@ -135,13 +136,14 @@ def nan_derivatives(inputs: Any, known: jax.Array) -> jax.Array:
         if eqx.is_inexact_array(x):
             # the sine has derivatives of all orders
             wave = jnp.sin(jnp.where(jnp.isfinite(x), x, 0.0) + 1)
+            wave = wave - jax.lax.stop_gradient(wave)
             total = total + jnp.sum(_nan_unless_zero(wave, jnp.any(unknown))).astype(total.dtype)
     each = _nan_unless_zero(jnp.broadcast_to(total, known.shape), unknown)
     return jnp.where(known, 0.0, each)[:, None]
 
 
 def _nan_unless_zero(x: jax.Array, chosen: jax.Array) -> jax.Array:
-    """x, but NaN where `chosen` unless it is 0: products, so that this holds transposed as well."""
+    """x, but NaN where `chosen` unless it is 0: products, so that derivatives are, too."""
     huge = jnp.where(chosen, jnp.finfo(x.dtype).max, 1.0).astype(x.dtype)
     times_infinity = jnp.where(chosen, 0.0, 1.0).astype(x.dtype) * (huge * (huge * x))
     return huge * (huge * times_infinity)

@@ -10,7 +10,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from jimpact.fits.profiles import Contour
-from jimpact.fits.uncertainty import FitResult
+from jimpact.fits.uncertainty import Fit
 from jimpact.plot.style import (
     COLOURS,
     GREY,
@@ -26,8 +26,8 @@ from jimpact.plot.style import (
 _LABELLED = 16  # up to this number of shots each has a label
 
 
-@styled(FitResult)
-def fit(fit: FitResult, others: Mapping[str, FitResult] | None = None, title: str = "") -> Figure:
+@styled(Fit)
+def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> Figure:
     """Velocities after every shot, or what else was measured, and fitted, above the residuals.
 
     Error bars are sigma where the data state it, else the estimated noise. `others` are further
@@ -127,7 +127,7 @@ def _in_rows(values: np.ndarray) -> np.ndarray:
     return values.reshape(len(values) if values.ndim else 1, -1)
 
 
-def _error_bars(fit: FitResult) -> np.ndarray | None:
+def _error_bars(fit: Fit) -> np.ndarray | None:
     """Sigma, else the estimated noise, a row a shot; None where neither is known."""
     shape = fit.predicted.shape
     if fit.problem.sigma is not None:
@@ -135,7 +135,7 @@ def _error_bars(fit: FitResult) -> np.ndarray | None:
     return _in_rows(np.full(shape, fit.noise)) if np.isfinite(fit.noise) else None
 
 
-def _shot_axis(axes: Axes, fit: FitResult, dodge: np.ndarray) -> None:
+def _shot_axis(axes: Axes, fit: Fit, dodge: np.ndarray) -> None:
     """Bodies on the axis of a single shot; else shots, all labelled or every so many."""
     data, labels = fit.experiments, fit.problem.labels
     if data is not None and len(labels) == 1:
@@ -150,9 +150,7 @@ def _shot_axis(axes: Axes, fit: FitResult, dodge: np.ndarray) -> None:
     axes.set_xlim(-0.6, len(labels) - 0.4)
 
 
-def _legend(
-    figure: Figure, fit: FitResult, others: Mapping[str, FitResult], has_bars: bool
-) -> None:
+def _legend(figure: Figure, fit: Fit, others: Mapping[str, Fit], has_bars: bool) -> None:
     """Markers of measured and fitted values, of other fits, and of bodies."""
     bars = ""
     if has_bars:

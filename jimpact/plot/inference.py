@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from scipy.special import chdtri, ndtri
 
 from jimpact._checks import check_choice, check_kind
-from jimpact.fits.uncertainty import FitResult, Profile
+from jimpact.fits.uncertainty import Fit, Profile
 from jimpact.plot.style import COLOURS, GREY, SMALL, new_figure, new_panels, styled
 
 _TITLE = 45  # letters of a line of a panel's title
@@ -60,8 +60,8 @@ def profiles(result: tuple[Profile, ...] | list[Profile]) -> Figure:
     return figure
 
 
-@styled(FitResult)
-def correlation(fit: FitResult) -> Figure:
+@styled(Fit)
+def correlation(fit: Fit) -> Figure:
     """Correlations of the parameters' errors; empty where the data cannot see one of them.
 
     Args:
@@ -96,8 +96,8 @@ def correlation(fit: FitResult) -> Figure:
     return figure
 
 
-@styled(FitResult)
-def residuals(fit: FitResult) -> Figure:
+@styled(Fit)
+def residuals(fit: Fit) -> Figure:
     """Measured against fitted; residuals in standard errors over the speed, and their quantiles.
 
     Without sigma the standard error is the estimated noise. What the law explains leaves no trend
@@ -149,7 +149,7 @@ def residuals(fit: FitResult) -> Figure:
     return figure
 
 
-def _over(fit: FitResult) -> tuple[np.ndarray, str]:
+def _over(fit: Fit) -> tuple[np.ndarray, str]:
     """The abscissa of residuals: the fastest approach (K, 1) of shots, else the fitted values."""
     data, scene = fit.experiments, fit.problem.scene
     if data is None:
@@ -157,8 +157,8 @@ def _over(fit: FitResult) -> tuple[np.ndarray, str]:
     return data.approach_speed(scene)[:, None], "fastest approach [m/s]"
 
 
-@styled(FitResult)
-def corner(fit: FitResult, draws: Any = None, names: Sequence[str] | None = None) -> Figure:
+@styled(Fit)
+def corner(fit: Fit, draws: Any = None, names: Sequence[str] | None = None) -> Figure:
     """Every parameter, and every pair of them: intervals and regions of the fit, or of draws.
 
     Lines are the normal density of each parameter and the ellipses in which two of them lie with
@@ -211,7 +211,7 @@ def corner(fit: FitResult, draws: Any = None, names: Sequence[str] | None = None
     return figure
 
 
-def _drawn(fit: FitResult, draws: Any) -> np.ndarray:
+def _drawn(fit: Fit, draws: Any) -> np.ndarray:
     """Draws (N, P) of the parameters of a fit."""
     if hasattr(draws, "posterior"):
         columns = [np.ravel(draws.posterior[name]) for name in fit.names]
@@ -225,7 +225,7 @@ def _drawn(fit: FitResult, draws: Any) -> np.ndarray:
     return values
 
 
-def _one(axes: Axes, fit: FitResult, i: int, values: np.ndarray | None) -> None:
+def _one(axes: Axes, fit: Fit, i: int, values: np.ndarray | None) -> None:
     """The density of one parameter."""
     x = fit.value[i] + fit.standard_error[i] * np.linspace(-_WIDE, _WIDE, 121)
     z = (x - fit.value[i]) / fit.standard_error[i]
@@ -236,7 +236,7 @@ def _one(axes: Axes, fit: FitResult, i: int, values: np.ndarray | None) -> None:
     axes.set_yticks([])
 
 
-def _pair(axes: Axes, fit: FitResult, i: int, j: int, values: np.ndarray | None) -> None:
+def _pair(axes: Axes, fit: Fit, i: int, j: int, values: np.ndarray | None) -> None:
     """The region of two parameters."""
     if values is not None:
         axes.plot(values[:, i], values[:, j], ".", ms=2, color=COLOURS[4], alpha=0.5)

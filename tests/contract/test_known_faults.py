@@ -218,6 +218,27 @@ def test_a_domino_reaches_the_next_one():
     assert np.abs(times - 0.11298).min() < 1e-5
 
 
+@pytest.mark.release
+def test_a_corner_that_slides_over_an_edge_takes_no_energy():
+    """Its normal jumps there: it strikes or parts. It lost .039 J, of which only the ledger told."""
+    blocks = ji.Bodies([ji.Block(0.3, 0.17), ji.Block(0.33, 0.16, mass=2.5)], pairs=[(0, 1)])
+    q = np.array([0, 0.085, 0, -0.025, 0.39, -1.0])
+    system, law = ji.System(blocks, gravity=True), ji.Moreau(0.0, friction=0.1)
+
+    def place(slip):
+        v = jnp.array([0, 0, 0, 0.23, -0.06, 0.77]).at[3].add(slip)
+        motion = ji.simulate(system, law, q, v, 0.5, samples=11, max_events=20)
+        return motion.q[:, 4], motion
+
+    slope, motion = jax.jacfwd(place, has_aux=True)(0.0)
+    ji.raise_on_failure(motion)
+    # 10 J; the step over the edge is right to its tolerance
+    np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-8)
+    known = np.isfinite(np.asarray(slope))
+    assert known[:5].all()  # what comes before has derivatives
+    assert not known[-3:].any()
+
+
 # ------------------------------------------------------------------------------ fits
 
 WALL_SHOTS = np.array(
