@@ -43,7 +43,7 @@ WORTH_SHARING = "0.2"  # seconds
 # neither the count nor BUDGET depends on how fast the machine is or which process runs which test.
 COUNTS_FROM = 200  # operations of StableHLO
 # Programs of the default suite, over all processes.
-BUDGET = 310
+BUDGET = 270
 COMPILED = "/jax/core/compile/backend_compile_duration"
 
 # XLA's newer emitters of loops take twice as long to compile; users compile batches with them. A
