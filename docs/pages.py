@@ -263,7 +263,6 @@ def unit_of(comment: str) -> str:
 
 
 @functools.cache
-@functools.cache
 def constants() -> dict[str, list[tuple[str, str, str]]]:
     """Constants of all modules, by path in the package."""
     package = ROOT / "jimpact"
@@ -357,7 +356,8 @@ def rooms_svg() -> str:
 def pictures() -> dict[str, str]:
     """Name and caption of each picture: the functions of `gallery.py`."""
     tree = ast.parse((DOCS / "gallery.py").read_text(encoding="utf-8"))
-    made = [x for x in tree.body if isinstance(x, ast.FunctionDef) and x.decorator_list]
+    made = [x for x in tree.body if isinstance(x, ast.FunctionDef)
+            and any(ast.unparse(y) == "picture" for y in x.decorator_list)]  # fmt: skip
     return {x.name: " ".join((ast.get_docstring(x) or "").split()) for x in made}
 
 
