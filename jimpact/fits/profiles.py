@@ -16,6 +16,7 @@ import numpy as np
 from jimpact._checks import as_whole, check_choice, check_kind
 from jimpact.fits.problem import scaled, unscaled
 from jimpact.fits.solve import (
+    RANK_TOLERANCE,
     SAME_VALUE,
     START_SCALES,
     Ends,
@@ -90,22 +91,26 @@ class Deviances:
         self.variance = float(fit.noise**2) if known else self.problem.exact_squares
         self.error = fit.standard_error / self.problem.steps_at(fit.value)
         self.starts: list[Lowest] = []
+        self.in_a_valley = fit.rank < len(fit.names)  # the best minimum
         self.add_starts(fit.starts)
 
-    def add_starts(self, minima: Iterable[FitMinimum]) -> None:
+    def add_starts(self, minima: Sequence[FitMinimum]) -> None:
         """Start from these minima, too: the lowest, and others near it that are apart."""
         starts = [Lowest(end.sum_of_squares, self.problem.point(end.value)) for end in minima]
-        starts = [*self.starts, *starts]
-        self.best, self.starts = starts[0], []
-        for start in starts:
+        self.best = [*self.starts, *starts][0]
+        for start, end in zip(starts, minima):
             if self._is_below(start.squares, self.best.squares):
                 self.best = start
+                self.in_a_valley = np.linalg.matrix_rank(
+                    end.jacobian, rtol=RANK_TOLERANCE[self.problem.precision]
+                ) < len(self.fit.names)
+        starts, self.starts = [*self.starts, *starts], []
         self.lowest = self.best
         for start in (self.best, *starts):
             apart = all(np.abs(start.y - other.y).max() > SAME_VALUE for other in self.starts)
             if apart and self.of(start.squares) <= self.limit:
                 self.starts.append(start)
-        if self.fit.rank < len(self.fit.names):  # they are ends in one valley
+        if self.in_a_valley:  # they are ends in it
             self.starts = [self.best]
 
     def minimize(self, trials: Sequence[tuple[Index, Sequence[float], np.ndarray]]) -> Ends:

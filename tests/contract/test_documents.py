@@ -96,7 +96,7 @@ def documents(paths, long_run=()):
     ]
 
 
-LONGEST = ("mujoco", "gradient_descent", "waves", "03", "05", "06", "10")
+LONGEST = ("mujoco", "gradient_descent", "waves", "03", "05", "06", "10", "11", "17")
 
 
 @pytest.mark.parametrize("path", documents(p for p in DOCS if any(code_of(p))))
@@ -264,7 +264,7 @@ def shell():
     matplotlib.use(backend)
 
 
-# running takes most of the time of the last three
+# running takes most of the time of these
 @pytest.mark.parametrize("path", documents(NOTEBOOKS, long_run=("01", "11", "17")))
 def test_notebook_runs(path, shell):
     for cell in nbformat.read(path, as_version=4).cells:

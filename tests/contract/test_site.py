@@ -136,7 +136,7 @@ def test_names_link_to_where_they_are_documented(site):
 
 def test_every_picture_of_the_docs_has_its_code():
     code = (ROOT / "docs" / "gallery.py").read_text(encoding="utf-8")
-    made = set(re.findall(r"@picture\ndef (\w+)", code))
+    made = set(re.findall(r"@picture\n(?:@.*\n)*def (\w+)", code))
     assert made == {path.stem for path in (ROOT / "docs" / "pictures").glob("*.png")}
 
 
