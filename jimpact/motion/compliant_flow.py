@@ -206,9 +206,10 @@ class CompliantFlow(MotionFlow):
         before, after = (self.constants(x).phase[:, None] for x in (before, after))
         return any_of((after == COMPRESSION) & ((before == OPEN) | (before == SLACK)))
 
-    def projected(self, const: Phases, at: State) -> State:
-        """Slip of contacts that stick set to 0, in the metric of M."""
-        return at if self.mu is None else self.without_slip(const.side, at)
+    def projected(self, const: Phases, at: State) -> tuple[State, jax.Array]:
+        """Slip of contacts that stick set to 0, in the metric of M; normals may turn."""
+        new = at if self.mu is None else self.without_slip(const.side, at)
+        return new, jnp.zeros(0, bool)
 
     def stopped(self, which: jax.Array, at: State) -> State:
         """Slip of contacts (m,) set to 0."""

@@ -226,13 +226,9 @@ class MotionFlow(eqx.Module, stepper.Flow):
             rows.append(log_rates(self.axes, modes, contacts, force)[:, None])
         return rows
 
-    def projected(self, const: Any, at: State) -> State:
-        """The state back on the constraints of its modes."""
-        return at
-
-    def jumps(self, const: Any, at: State) -> jax.Array:
-        """Which contacts have got another normal within a step: none."""
-        return jnp.zeros(0, bool)
+    def projected(self, const: Any, at: State) -> tuple[State, jax.Array]:
+        """The state back on the constraints of its modes; which contacts have another normal."""
+        return at, jnp.zeros(0, bool)
 
     def switch(
         self, modes: jax.Array, y: jax.Array, which: jax.Array
@@ -314,16 +310,15 @@ class MechanicalFlow(MotionFlow):
         margins = watched(contacts, self.mu, const, self.scales, self.below, slip)
         return self.from_margins(margins, at)
 
-    def jumps(self, const: Modes, at: State) -> jax.Array:
-        """Which persistent contacts (m,) have a gap velocity that steps do not leave."""
-        rate = self.contacts(at).normal.rate
-        most = max(not_rounding(JUMP, rate.dtype), MORE_THAN_STEPS * self.rtol)
-        return const.active & (jnp.abs(rate) > most * self.scales.speed)
+    def projected(self, const: Modes, at: State) -> tuple[State, jax.Array]:
+        """Gaps and velocities of persistent contacts set to 0, in the metric of M.
 
-    def projected(self, const: Modes, at: State) -> State:
-        """Gaps and velocities of persistent contacts set to 0, in the metric of M."""
+        But not where one of them has another normal since the step began: which (m,) have.
+        """
         contacts = self.contacts(at)
         value, rate = contacts.normal.value, contacts.normal.rate
+        most = max(not_rounding(JUMP, rate.dtype), MORE_THAN_STEPS * self.rtol)
+        jumps = const.active & (jnp.abs(rate) > most * self.scales.speed)
         if contacts.tangent is not None:  # tangentially only velocities drift
             value = jnp.concatenate([value, jnp.zeros_like(contacts.tangent.rate)])
             rate = jnp.concatenate([rate, contacts.tangent.rate])
@@ -331,7 +326,8 @@ class MechanicalFlow(MotionFlow):
                 const = straightened(self.axes, const, contacts.tangent.rate)
         p = constraint_impulse(contacts, self.mu, const, jnp.stack([value, rate], axis=1))
         move = contacts.moved @ p
-        return at._replace(q=self.system.body.moved(at.q, move[:, 0]), v=at.v + move[:, 1])
+        back = at._replace(q=self.system.body.moved(at.q, move[:, 0]), v=at.v + move[:, 1])
+        return selected(jnp.any(jumps), at, back), jumps
 
 
 def check_rtol(rtol: float, dtype: jnp.dtype) -> None:
@@ -505,11 +501,11 @@ def _rows(flow: MotionFlow, state: State) -> jax.Array:
 
 
 def _reached(flow: MotionFlow, aim: stepper.Step, y: jax.Array) -> tuple[State, jax.Array]:
-    """The state of rows at the end of a step, at a sample with its time to the last digit; and
-    which contacts have got another normal, whose velocities are left as they are."""
-    const, at = flow.constants(aim.modes), unpacked(flow.like, y)
-    jumps = flow.jumps(const, at)
-    new = selected(jnp.any(jumps), at, flow.projected(const, at))
+    """The state of rows at the end of a step, at a sample with its time to the last digit.
+
+    And which contacts have another normal than at its beginning: velocities are as they were.
+    """
+    new, jumps = flow.projected(flow.constants(aim.modes), unpacked(flow.like, y))
     return new._replace(t=jnp.where(aim.target[-1, 0], flow.sample, new.t)), jumps
 
 
