@@ -331,7 +331,7 @@ def _least(
     k = jnp.where(both, scaled, jnp.eye(len(held), dtype=w.dtype))
     right = jnp.where(held[:, None], right * scale[:, None], 0.0)
     ridges = jnp.where(held, ridge, 0.0)[:, None]
-    z = regularized(k[..., None], right, ridges, _REFINEMENTS, without_null=True)
+    z = regularized(k, right, ridges, _REFINEMENTS, without_null=True)
     return (scale * weight)[:, None] * z
 
 

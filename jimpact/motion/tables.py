@@ -131,15 +131,24 @@ def nan_derivatives(inputs: Any, known: jax.Array) -> jax.Array:
     A motion that has ended does not determine what would come later. In reverse mode what nobody
     differentiates (a cotangent of 0) leaves the gradient as it is.
     """
-    unknown, total = ~known, jnp.zeros(())
-    for x in jax.tree.leaves(inputs):
-        if eqx.is_inexact_array(x):
-            # the sine has derivatives of all orders
-            wave = jnp.sin(jnp.where(jnp.isfinite(x), x, 0.0) + 1)
-            wave = wave - jax.lax.stop_gradient(wave)
-            total = total + jnp.sum(_nan_unless_zero(wave, jnp.any(unknown))).astype(total.dtype)
-    each = _nan_unless_zero(jnp.broadcast_to(total, known.shape), unknown)
-    return jnp.where(known, 0.0, each)[:, None]
+    arrays = [x for x in jax.tree.leaves(inputs) if eqx.is_inexact_array(x)]
+    return _undetermined(arrays, ~known)[:, None]
+
+
+@jax.custom_jvp
+def _undetermined(arrays: list[jax.Array], unknown: jax.Array) -> jax.Array:
+    """Zeros (r,), of which the `unknown` (r,) have derivatives NaN, of every order."""
+    return jnp.zeros(unknown.shape)
+
+
+@_undetermined.defjvp
+def _undetermined_tangent(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
+    """Of the sum of all inputs, times a factor that is 1 and is itself undetermined."""
+    arrays, unknown = primals
+    factor = 1 + jnp.sum(_undetermined(arrays, unknown))
+    total = sum(jnp.sum(_nan_unless_zero(x, jnp.any(unknown))) for x in tangents[0])
+    each = _nan_unless_zero(jnp.broadcast_to(total * factor, unknown.shape), unknown)
+    return jnp.zeros(unknown.shape), jnp.where(unknown, each, 0.0).astype(float)
 
 
 def _nan_unless_zero(x: jax.Array, chosen: jax.Array) -> jax.Array:

@@ -63,7 +63,9 @@ def unit(matrix: jax.Array) -> jax.Array:
 
 
 def times(matrix: jax.Array, vector: jax.Array) -> jax.Array:
-    """`matrix @ vector` (a, B) of (a, b, B) and (b, B)."""
+    """`matrix @ vector` (a, B) of (a, b, B) and (b, B), or of one matrix (a, b) for all columns."""
+    if matrix.ndim == 2:
+        return matrix @ vector
     if matrix.shape[1] > COLUMNS_WRITTEN_OUT:
         return jnp.sum(matrix * vector[None], axis=1)
     columns = [matrix[:, j] * vector[j : j + 1] for j in range(matrix.shape[1])]
@@ -288,6 +290,7 @@ def regularized(
 ) -> jax.Array:
     """`matrix z = right` (n, B) where it may be singular: solved with a ridge (n, B) added to it.
 
+    Matrices are (n, n, B), or one (n, n) for all right sides with a ridge (n, 1).
     Each refinement removes what the ridge changes where the matrix is regular, and makes the
     derivatives right in one order more: the inverse has none. In its null space the inverse is
     large, and so is its rounding: `without_null` subtracts this part of what it gives.
@@ -296,7 +299,8 @@ def regularized(
     """
     kept = jax.lax.optimization_barrier
     matrix, right = kept(matrix), kept(right)  # apart: only the right side is linear in tangents
-    inverted = jax.lax.stop_gradient(inverse(matrix + unit(matrix) * ridge[:, None]))
+    on_diagonal = ridge if matrix.ndim == 2 else ridge[:, None]
+    inverted = jax.lax.stop_gradient(inverse(matrix + unit(matrix) * on_diagonal))
 
     def solved(right: jax.Array) -> jax.Array:
         """What the inverse gives."""
