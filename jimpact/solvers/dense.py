@@ -37,6 +37,9 @@ from jimpact.loops import cond, fori_loop, while_loop
 # times as fast for 4 rows. With ten times more the cubic cost of many contacts would not be
 # blocked.
 _BY_LOOP = 16
+# Rows up to which a loop of our own eliminates block by block: as many again take eight times as
+# long, which LAPACK does in half of that.
+_BLOCKS = 64
 # Columns up to which products are written out: a reduction does not fuse with what follows it, and
 # is no vector operation: four times as long for the 12 of four contacts with friction in space. Ten
 # times more would make large programs of long chains.
@@ -187,8 +190,14 @@ def block_inverse(matrix: jax.Array) -> jax.Array:
 
 
 def block_solve(matrix: jax.Array, right: jax.Array) -> jax.Array:
-    """`matrix^-1 right` (m, b, c) of one matrix (m, b, m, b), block by block, without pivots."""
+    """`matrix^-1 right` (m, b, c) of one matrix (m, b, m, b), block by block, without pivots.
+
+    Of more than `_BLOCKS` rows by LAPACK.
+    """
     m, b = matrix.shape[:2]
+    if m * b > _BLOCKS:
+        flat = matrix.reshape(m * b, m * b), right.reshape(m * b, -1)
+        return jnp.linalg.solve(*flat).reshape(right.shape)
     perturbation = float(jnp.finfo(matrix.dtype).eps) ** 2  # of a block that is singular
     rows = jnp.concatenate([matrix.reshape(m, b, m * b), right], axis=2)
 

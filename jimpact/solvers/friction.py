@@ -34,13 +34,15 @@ _ITERATIONS = 8  # of Newton's method for the directions of slip; 4 to 6 are usu
 # Part of the largest mu p: the weight in the sharing of a contact without load. Ten times more: it
 # takes a visible share.
 _LEAST_SHARE = 1e-6
-DENSE = 64  # contacts up to which interior points are used; ten times more take a minute
 # Projections at most, and steps of Newton's method after them. Ten times more: jammed scenes end
 # later.
 _PROJECTIONS, _POLISHES = 5000, 3
 # Added to the diagonal of the equations of Newton's method, which are singular where impulses are
 # free. Ten times more: another step of it.
 _RIDGE = 1e-8
+# Rows of the equations up to which free impulses are shared out, by their singular values. Ten
+# times more: a minute for an impact.
+_SHARED = 256
 # `distribute`: sweeps at most; part of the largest limit below which a sweep changes nothing; part
 # of the limit below which a force is inside its disc, or a rate is 0. Ten times more of the last
 # two: contacts on the rim of their cone stick.
@@ -179,7 +181,8 @@ def solve(
     free = inverted.weight.reshape(-1, 1) * inverted.pairs.T
     moves = jnp.abs(fixed.matrix.reshape(free.shape) @ free)
     root = float(jnp.finfo(matrix.dtype).eps) ** 0.5
-    code = jnp.where(jnp.any(free != 0), CODE["impulse_not_unique"], CODE["ok"])
+    not_unique = jnp.any(free != 0) | (jnp.max(jnp.abs(inverted.inverse)) > _RIDGE**-0.5)
+    code = jnp.where(not_unique, CODE["impulse_not_unique"], CODE["ok"])
     code = jnp.where(jnp.any(moves > root), CODE["several_outcomes"], code)
     status = jnp.maximum(status, code)
     x = _on_modes(problem, modes, inverted, x)
@@ -197,7 +200,9 @@ def solve(
 
 def _rates(problem: _FrictionProblem, x: jax.Array) -> jax.Array:
     """(r, s) (m, b, N) of impulses (m, b, N)."""
-    return problem.rate[..., None] + _times(problem.matrix[..., None], x)
+    if len(x) <= ENUMERATED:
+        return problem.rate[..., None] + _times(problem.matrix[..., None], x)
+    return problem.rate[..., None] + jnp.tensordot(problem.matrix, x, 2)  # never computed twice
 
 
 def _times(matrix: jax.Array, x: jax.Array) -> jax.Array:
@@ -394,7 +399,8 @@ class _Inverted(NamedTuple):
     """Of the equations E of modes, with the weights D of the sharing and no derivatives.
 
     B = E D = U S V^T: `inverse` (n, n) of B + U_0 V_0^T, `pairs` U_0 V_0^T of its null vectors,
-    and D (m, b). `held`: free contacts remain free, as the least is not allowed.
+    and D (m, b). `held`: free contacts remain free, as the least is not allowed. Of more than
+    `_SHARED` rows the inverse is that of B with a ridge, and the pairs are 0.
     """
 
     inverse: jax.Array
@@ -409,6 +415,9 @@ def _inverted(problem: _FrictionProblem, modes: _Modes, x: jax.Array) -> _Invert
     matrix, _ = _equations(problem, _turned(problem, modes, x[..., None]))
     weight = 1 / jnp.sqrt(_weights(problem, x))
     scaled = (matrix[..., 0] * weight[None, None]).reshape(n, n)
+    if n > _SHARED:
+        eye = jnp.eye(n, dtype=x.dtype)
+        return _Inverted(jnp.linalg.inv(scaled + _RIDGE * eye), 0 * eye, weight, jnp.asarray(True))
     left, values, right, null = singular_values(scaled)
     inverse = (right.T / jnp.where(null, 1.0, values)[None]) @ left.T
     return _Inverted(inverse, jnp.where(null[None], left, 0.0) @ right, weight, jnp.asarray(True))
@@ -425,8 +434,10 @@ def _most_at_rest(
 ) -> tuple[_Modes, _Inverted]:
     """Modes with the velocities of x where all sticks that can, if its shared impulses are allowed.
 
-    Otherwise the modes as they are.
+    Otherwise, and of more than `_SHARED` rows, the modes as they are.
     """
+    if x.size > _SHARED:
+        return modes, _inverted(problem, modes, x)
     rest = _at_rest(problem, x, jnp.asarray(problem.tolerance, x.dtype))
     both = jax.tree.map(lambda *leaf: jnp.stack(leaf), rest, modes)
     inverted = jax.lax.map(lambda modes: _inverted(problem, modes, x), both)
@@ -477,8 +488,8 @@ def _modes_at(problem: _FrictionProblem, x: jax.Array) -> _Modes:
 
 
 def _search(problem: _FrictionProblem) -> tuple[_Modes, jax.Array, jax.Array]:
-    """Modes, x (m, b) and status of many contacts: by interior points up to DENSE of them, by
-    projections where these find nothing, and by Newton's method on the modes of either."""
+    """Modes, x (m, b) and status of many contacts: by interior points, by projections where these
+    find nothing, and by Newton's method on the modes of either."""
 
     def misfit(x: jax.Array) -> jax.Array:
         """How far x is from the law."""
@@ -491,9 +502,7 @@ def _search(problem: _FrictionProblem) -> tuple[_Modes, jax.Array, jax.Array]:
         return x + block_solve(matrix + _RIDGE * unit, missed)[..., 0]
 
     unit = jnp.eye(problem.rate.size, dtype=problem.rate.dtype).reshape(problem.matrix.shape)
-    x = jnp.zeros_like(problem.rate)
-    if len(x) <= DENSE:
-        x = within_cones(cones_of(*problem), misfit, polish, problem.tolerance)
+    x = within_cones(cones_of(*problem), misfit, polish, problem.tolerance)
     if problem.complementary:
         x = _projected(problem, x, misfit, polish)
     status = jnp.where(misfit(x) <= problem.tolerance, CODE["ok"], CODE["max_steps"])
