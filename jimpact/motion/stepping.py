@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jimpact.bodies.closed_pairs import ActivePairs, block, over_blocks, with_block
+from jimpact.bodies.closed_pairs import ActivePairs
 from jimpact.derive import without_derivatives
 from jimpact.impacts import impact
 from jimpact.law import Law, within_domains
@@ -37,18 +37,16 @@ from jimpact.motion.dynamics import (
     gaps,
     is_pile,
     mass_at,
-    normals_at,
     recorded_gaps,
-    seen_from_base,
     user_force,
 )
 from jimpact.motion.flow import State, out_of_range, status_at_start
 from jimpact.motion.record import KIND_CODE, Events, no_events, with_row
+from jimpact.motion.step_contacts import ActiveContacts, AllContacts, PileImpulses, contacts_of_step
 from jimpact.motion.system import System
 from jimpact.motion.tables import Course
 from jimpact.motion.transitions import FAILS, scene_at
 from jimpact.scene import Scene
-from jimpact.solvers.dense import solve_mass_matrix
 from jimpact.solvers.many_contacts import Many, solve_many
 from jimpact.status import CODE
 
@@ -82,142 +80,6 @@ WHY = (
 )
 
 
-class _AllContacts(NamedTuple):
-    """All contacts of a body in one step; those that are open are 0."""
-
-    gap: jax.Array  # (m,), of open contacts, too
-    normals: jax.Array  # (n, m), of open contacts, too
-    closed: jax.Array  # (m,)
-    directions: jax.Array  # (n, m, b): normals, tangents
-    moved: jax.Array  # M^-1 of them
-    matrix: jax.Array  # (m, b, m, b) Delassus matrix
-
-    def rates(self, v: jax.Array) -> jax.Array:
-        """Gap velocities and slips (m, b) of v (n,)."""
-        return jnp.tensordot(v, self.directions, axes=1)
-
-    def fastest(self, v: jax.Array) -> jax.Array:
-        """Gap velocity () that the speeds of v could give."""
-        return jnp.max(jnp.abs(v) @ jnp.abs(self.directions[:, :, 0]))
-
-    def velocity_change(self, x: jax.Array) -> jax.Array:
-        """Change of velocity (n,) by impulses x (m, b)."""
-        return jnp.tensordot(self.moved, x, axes=2)
-
-    def generalized_impulse(self, x: jax.Array) -> jax.Array:
-        """Generalized impulse (n,) of impulses x (m, b)."""
-        return jnp.tensordot(self.directions, x, axes=2)
-
-    def product(self, x: jax.Array) -> jax.Array:
-        """Rates (m, b) that impulses x (m, b) give."""
-        return jnp.tensordot(self.matrix, x, axes=2)
-
-    @property
-    def diagonal(self) -> jax.Array:
-        """Of the Delassus matrix (m, b)."""
-        m, b = self.matrix.shape[:2]
-        return jnp.diagonal(self.matrix.reshape(m * b, m * b)).reshape(m, b)
-
-    def warm_start(self, last: Any) -> jax.Array:
-        """Impulses (m, b) of the last step."""
-        return jnp.where(self.closed[:, None], last, 0.0)
-
-    def kept(self, x: jax.Array) -> jax.Array:
-        """Impulses x (m, b) in the form in which the next step reads them."""
-        return x
-
-    def recorded(self, values: jax.Array) -> jax.Array:
-        """Values of contacts (.., m) as the record holds them."""
-        return values
-
-
-class _PileImpulses(NamedTuple):
-    """Impulses of the closed contacts of a pile, by increasing numbers of the contacts."""
-
-    number: jax.Array  # (m,)
-    impulse: jax.Array  # (m, b)
-
-
-class _ActiveContacts(NamedTuple):
-    """The closed contacts of a pile in one step; methods as those of `_AllContacts`."""
-
-    pairs: ActivePairs
-    inverse: jax.Array  # 1 / M (k + 1, velocities of a body), 0 for walls
-
-    @property
-    def closed(self) -> jax.Array:
-        """(m,)."""
-        return self.pairs.closed
-
-    def rates(self, v: jax.Array) -> jax.Array:
-        """Gap velocities and slips (m, b) of v (n,)."""
-        of_bodies = jnp.pad(v.reshape(-1, self.inverse.shape[1]), ((0, 1), (0, 0)))
-
-        def one(row: jax.Array, rates: jax.Array) -> jax.Array:
-            bodies, directions = (block(x, row) for x in (self.pairs.bodies, self.pairs.directions))
-            values = jnp.sum(directions * of_bodies[bodies][:, None], axis=(2, 3))
-            return with_block(rates, values, row)
-
-        start = jnp.zeros(self.pairs.directions.shape[:2], v.dtype)
-        return over_blocks(self.pairs.filled, one, start)
-
-    def fastest(self, v: jax.Array) -> jax.Array:
-        """Gap velocity () that the speeds of v could give."""
-        return 2 * jnp.max(jnp.abs(v))
-
-    def velocity_change(self, x: jax.Array) -> jax.Array:
-        """Change of velocity (n,) by impulses x (m, b)."""
-        return self.generalized_impulse(x) * self.inverse[:-1].reshape(-1)
-
-    def generalized_impulse(self, x: jax.Array) -> jax.Array:
-        """Generalized impulse (n,) of impulses x (m, b)."""
-
-        def one(row: jax.Array, impulses: jax.Array) -> jax.Array:
-            bodies, directions = (block(y, row) for y in (self.pairs.bodies, self.pairs.directions))
-            each = jnp.sum(directions * block(x, row)[:, :, None, None], axis=1)
-            return impulses.at[bodies].add(each)
-
-        start = jnp.zeros_like(self.inverse)
-        return over_blocks(self.pairs.filled, one, start)[:-1].reshape(-1)
-
-    def product(self, x: jax.Array) -> jax.Array:
-        """Rates (m, b) that impulses x (m, b) give."""
-        return self.rates(self.velocity_change(x))
-
-    @property
-    def diagonal(self) -> jax.Array:
-        """Of the Delassus matrix (m, b)."""
-
-        def one(row: jax.Array, diagonal: jax.Array) -> jax.Array:
-            bodies, directions = (block(x, row) for x in (self.pairs.bodies, self.pairs.directions))
-            squares = directions**2 * self.inverse[bodies][:, None]
-            return with_block(diagonal, jnp.sum(squares, axis=(2, 3)), row)
-
-        start = jnp.zeros(self.pairs.directions.shape[:2], self.inverse.dtype)
-        return over_blocks(self.pairs.filled, one, start)
-
-    def warm_start(self, last: Any) -> jax.Array:
-        """Impulses (m, b) of the last step, 0 where the contact was open."""
-        row = jnp.searchsorted(last.number, self.pairs.number)
-        row = jnp.minimum(row, last.number.size - 1)
-        same = self.closed & (last.number[row] == self.pairs.number)
-        return jnp.where(same[:, None], last.impulse[row], 0.0)
-
-    def kept(self, x: jax.Array) -> _PileImpulses:
-        """Impulses x (m, b) in the form in which the next step reads them."""
-
-        def in_order() -> _PileImpulses:
-            order = jnp.argsort(self.pairs.number)
-            return _PileImpulses(self.pairs.number[order], x[order])
-
-        as_it_is = _PileImpulses(self.pairs.number, x)
-        return jax.lax.cond(self.pairs.filled > 0, in_order, lambda: as_it_is)
-
-    def recorded(self, values: jax.Array) -> jax.Array:
-        """Values of contacts (.., m) as the record holds them: their sum (.., 1)."""
-        return jnp.sum(values, axis=-1, keepdims=True)
-
-
 class _StepProblem(NamedTuple):
     """Quantities that are the same in all steps."""
 
@@ -234,7 +96,7 @@ class _Progress(NamedTuple):
 
     state: State
     speed: jax.Array  # () largest gap velocity that velocities could give so far
-    last_impulses: jax.Array | _PileImpulses  # of the last step
+    last_impulses: jax.Array | PileImpulses  # of the last step
     residual_velocity: jax.Array  # gap velocity () that these leave unsolved
     inverse_step_size: jax.Array  # of the solver, see `solve_many`
     steps_since_impact: jax.Array  # (m,) of each contact
@@ -252,7 +114,7 @@ class _Setup(NamedTuple):
     q: jax.Array  # in the middle
     mass: jax.Array
     base_velocity: jax.Array  # (n,)
-    contacts: _AllContacts | _ActiveContacts
+    contacts: AllContacts | ActiveContacts
     speed: jax.Array  # as in `_Progress`
     noise: jax.Array  # () gap velocities below it are rounding
     slow: jax.Array  # (m,) those that the free acceleration makes in a step, and rounding
@@ -338,7 +200,7 @@ def step_of_pile(
     state, _ = _end_state(problem, start, setup, trial)
     status, reported = _status(problem, start, setup, trial, state)
     contacts = setup.contacts
-    assert isinstance(contacts, _ActiveContacts)
+    assert isinstance(contacts, ActiveContacts)
     return contacts.pairs, trial.solution.impulse, trial.v, jnp.where(status > 0, status, reported)
 
 
@@ -357,7 +219,7 @@ def _begin(
 
     def first() -> tuple[jax.Array, Any]:
         """Rates of contacts, and their impulses as steps keep them."""
-        at = _contacts(system, q0, times[0], q0, times[0], closed_below, mu is not None)
+        at = contacts_of_step(system, q0, times[0], q0, times[0], closed_below, mu is not None)
         rates = at.rates(v0)
         return rates, at.kept(rates)
 
@@ -383,38 +245,6 @@ def _begin(
         status=status,
         reported=jnp.int32(CODE["ok"]),
     )
-
-
-def _contacts(
-    system: System,
-    q: jax.Array,
-    t: jax.Array,
-    q_end: jax.Array,
-    t_end: jax.Array,
-    closed_below: jax.Array,
-    friction: bool,
-) -> _AllContacts | _ActiveContacts:
-    """The contacts of a step whose middle is at (q, t), and its end, without contacts, at q_end."""
-    at, end = seen_from_base(system, q, t), seen_from_base(system, q_end, t_end)
-    mass = mass_at(system, q)
-    if is_pile(system):
-        pairs = system.body.active_pairs(at, end, closed_below)
-        pairs = pairs if friction else pairs._replace(directions=pairs.directions[:, :1])
-        of_bodies = 1 / mass.reshape(-1, pairs.directions.shape[-1])
-        return _ActiveContacts(pairs, jnp.pad(of_bodies, ((0, 1), (0, 0))))
-    gap, normals = gaps(system, q, t), normals_at(system, q, t)
-    n, m = normals.shape
-    directions = (normals + 0 * gap[None])[:, :, None]  # NaN where the gap is
-    if friction:
-        tangents = system.body.tangents(at)
-        assert tangents is not None
-        directions = jnp.concatenate([directions, tangents.reshape(n, m, -1)], axis=2)
-    least = jnp.minimum(gap, jnp.atleast_1d(system.body.gap_function(end)))
-    closed = ~(least > closed_below)  # NaN does not pass for open
-    directions = jnp.where(closed[:, None], directions, 0.0)
-    moved = solve_mass_matrix(mass, directions.reshape(n, -1)).reshape(directions.shape)
-    matrix = jnp.tensordot(directions, moved, axes=([0], [0]))
-    return _AllContacts(gap, normals, closed, directions, moved, matrix)
 
 
 def _one_step(problem: _StepProblem, progress: _Progress, t: jax.Array) -> _Progress:
@@ -456,7 +286,7 @@ def _set_up(problem: _StepProblem, progress: _Progress, t: jax.Array) -> _Setup:
     mass = mass_at(system, q)
     free = _loads(system, q, state.v, middle, mass)[1]
     q_predicted = body.moved(q, 0.5 * h * (state.v + h * free))
-    contacts = _contacts(system, q, middle, q_predicted, end, closed_below, mu is not None)
+    contacts = contacts_of_step(system, q, middle, q_predicted, end, closed_below, mu is not None)
     before = contacts.rates(state.v - base_velocity)
     eps = float(jnp.finfo(dtype).eps)
     speed = jnp.maximum(progress.speed, contacts.fastest(state.v))
@@ -584,7 +414,7 @@ def _status(
     fails = jnp.asarray(FAILS)[setup.law_status]
     status = jnp.where(fails, CODE["law_failed"], progress.status)
     status = jnp.where(out_of_range(system, state), CODE["out_of_range"], status)
-    if isinstance(contacts, _ActiveContacts):
+    if isinstance(contacts, ActiveContacts):
         status = jnp.where(contacts.pairs.overflows, CODE["room"], status)
     # a base that is NaN shows in its work, a coefficient in that of the contacts
     finite = jnp.all(jnp.isfinite(trial.v)) & jnp.isfinite(state.base_work)
@@ -593,7 +423,7 @@ def _status(
     if callable(system.mass):
         positive_definite = definite(setup.mass) | ~jnp.all(jnp.isfinite(setup.mass))
         status = jnp.where(positive_definite, status, CODE["singular_mass"])
-    if isinstance(contacts, _ActiveContacts):
+    if isinstance(contacts, ActiveContacts):
         velocities = trial.v.reshape(-1, contacts.inverse.shape[1])
         places = (velocities.shape[1] + 1) // 2  # 2 of 3 in a plane, 3 of 6 in space
         speeds = jnp.sum(velocities[:, :places] ** 2, axis=1)
@@ -632,7 +462,7 @@ def _closing_after(
 ) -> jax.Array:
     """Rates (m,) of gaps that close before the middle of the next step, 0 elsewhere."""
     contacts = setup.contacts
-    if isinstance(contacts, _ActiveContacts):
+    if isinstance(contacts, ActiveContacts):
         return progress.closing
     rate = contacts.normals.T @ (trial.v - setup.base_velocity)
     return _closing(contacts.gap, rate, problem.h, problem.closed_below)
@@ -648,7 +478,7 @@ def _recorded_impact(
 ) -> Events:
     """The events with the impact of this step, if there is one; a pile records none."""
     contacts, x, after = setup.contacts, setup.law_impulse, trial.v
-    if isinstance(contacts, _ActiveContacts):
+    if isinstance(contacts, ActiveContacts):
         return events
     if problem.joint:
         x = x + trial.solution.impulse

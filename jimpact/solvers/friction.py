@@ -124,7 +124,8 @@ def solve(
         all combined: solutions that none of them reaches are missed. Above 3 contacts other modes
         are not looked for. It is reported also where redundant contacts slide, so that how they
         share p changes their slip (a spinning cube flat on four corners).
-        `impulse_not_unique`: only the impulses differ. `infeasible`: no modes are consistent;
+        `impulse_not_unique`: only the impulses differ; of more than 256 rows no shares are computed,
+        and whether slip depends on them is not looked for. `infeasible`: no modes are consistent;
         `max_steps`: none were found (in space, above 3 contacts).
 
     Derivatives (up to the third, in any mode) hold the modes, which is one-sided where they are

@@ -1,0 +1,183 @@
+"""The contacts of one step of time stepping: products with their directions, dense or of a pile.
+
+Both classes have the same methods; of a pile only contacts that are closed are stored, and products
+go over the pairs of bodies, block by block.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jimpact.bodies.closed_pairs import ActivePairs, block, over_blocks, with_block
+from jimpact.motion.dynamics import gaps, is_pile, mass_at, normals_at, seen_from_base
+from jimpact.motion.system import System
+from jimpact.solvers.dense import solve_mass_matrix
+
+
+class AllContacts(NamedTuple):
+    """All contacts of a body in one step; those that are open are 0."""
+
+    gap: jax.Array  # (m,), of open contacts, too
+    normals: jax.Array  # (n, m), of open contacts, too
+    closed: jax.Array  # (m,)
+    directions: jax.Array  # (n, m, b): normals, tangents
+    moved: jax.Array  # M^-1 of them
+    matrix: jax.Array  # (m, b, m, b) Delassus matrix
+
+    def rates(self, v: jax.Array) -> jax.Array:
+        """Gap velocities and slips (m, b) of v (n,)."""
+        return jnp.tensordot(v, self.directions, axes=1)
+
+    def fastest(self, v: jax.Array) -> jax.Array:
+        """Gap velocity () that the speeds of v could give."""
+        return jnp.max(jnp.abs(v) @ jnp.abs(self.directions[:, :, 0]))
+
+    def velocity_change(self, x: jax.Array) -> jax.Array:
+        """Change of velocity (n,) by impulses x (m, b)."""
+        return jnp.tensordot(self.moved, x, axes=2)
+
+    def generalized_impulse(self, x: jax.Array) -> jax.Array:
+        """Generalized impulse (n,) of impulses x (m, b)."""
+        return jnp.tensordot(self.directions, x, axes=2)
+
+    def product(self, x: jax.Array) -> jax.Array:
+        """Rates (m, b) that impulses x (m, b) give."""
+        return jnp.tensordot(self.matrix, x, axes=2)
+
+    @property
+    def diagonal(self) -> jax.Array:
+        """Of the Delassus matrix (m, b)."""
+        m, b = self.matrix.shape[:2]
+        return jnp.diagonal(self.matrix.reshape(m * b, m * b)).reshape(m, b)
+
+    def warm_start(self, last: Any) -> jax.Array:
+        """Impulses (m, b) of the last step."""
+        return jnp.where(self.closed[:, None], last, 0.0)
+
+    def kept(self, x: jax.Array) -> jax.Array:
+        """Impulses x (m, b) in the form in which the next step reads them."""
+        return x
+
+    def recorded(self, values: jax.Array) -> jax.Array:
+        """Values of contacts (.., m) as the record holds them."""
+        return values
+
+
+class PileImpulses(NamedTuple):
+    """Impulses of the closed contacts of a pile, by increasing numbers of the contacts."""
+
+    number: jax.Array  # (m,)
+    impulse: jax.Array  # (m, b)
+
+
+class ActiveContacts(NamedTuple):
+    """The closed contacts of a pile in one step; methods as those of `AllContacts`."""
+
+    pairs: ActivePairs
+    inverse: jax.Array  # 1 / M (k + 1, velocities of a body), 0 for walls
+
+    @property
+    def closed(self) -> jax.Array:
+        """(m,)."""
+        return self.pairs.closed
+
+    def rates(self, v: jax.Array) -> jax.Array:
+        """Gap velocities and slips (m, b) of v (n,)."""
+        of_bodies = jnp.pad(v.reshape(-1, self.inverse.shape[1]), ((0, 1), (0, 0)))
+
+        def one(row: jax.Array, rates: jax.Array) -> jax.Array:
+            bodies, directions = (block(x, row) for x in (self.pairs.bodies, self.pairs.directions))
+            values = jnp.sum(directions * of_bodies[bodies][:, None], axis=(2, 3))
+            return with_block(rates, values, row)
+
+        start = jnp.zeros(self.pairs.directions.shape[:2], v.dtype)
+        return over_blocks(self.pairs.filled, one, start)
+
+    def fastest(self, v: jax.Array) -> jax.Array:
+        """Gap velocity () that the speeds of v could give."""
+        return 2 * jnp.max(jnp.abs(v))
+
+    def velocity_change(self, x: jax.Array) -> jax.Array:
+        """Change of velocity (n,) by impulses x (m, b)."""
+        return self.generalized_impulse(x) * self.inverse[:-1].reshape(-1)
+
+    def generalized_impulse(self, x: jax.Array) -> jax.Array:
+        """Generalized impulse (n,) of impulses x (m, b)."""
+
+        def one(row: jax.Array, impulses: jax.Array) -> jax.Array:
+            bodies, directions = (block(y, row) for y in (self.pairs.bodies, self.pairs.directions))
+            each = jnp.sum(directions * block(x, row)[:, :, None, None], axis=1)
+            return impulses.at[bodies].add(each)
+
+        start = jnp.zeros_like(self.inverse)
+        return over_blocks(self.pairs.filled, one, start)[:-1].reshape(-1)
+
+    def product(self, x: jax.Array) -> jax.Array:
+        """Rates (m, b) that impulses x (m, b) give."""
+        return self.rates(self.velocity_change(x))
+
+    @property
+    def diagonal(self) -> jax.Array:
+        """Of the Delassus matrix (m, b)."""
+
+        def one(row: jax.Array, diagonal: jax.Array) -> jax.Array:
+            bodies, directions = (block(x, row) for x in (self.pairs.bodies, self.pairs.directions))
+            squares = directions**2 * self.inverse[bodies][:, None]
+            return with_block(diagonal, jnp.sum(squares, axis=(2, 3)), row)
+
+        start = jnp.zeros(self.pairs.directions.shape[:2], self.inverse.dtype)
+        return over_blocks(self.pairs.filled, one, start)
+
+    def warm_start(self, last: Any) -> jax.Array:
+        """Impulses (m, b) of the last step, 0 where the contact was open."""
+        row = jnp.searchsorted(last.number, self.pairs.number)
+        row = jnp.minimum(row, last.number.size - 1)
+        same = self.closed & (last.number[row] == self.pairs.number)
+        return jnp.where(same[:, None], last.impulse[row], 0.0)
+
+    def kept(self, x: jax.Array) -> PileImpulses:
+        """Impulses x (m, b) in the form in which the next step reads them."""
+
+        def in_order() -> PileImpulses:
+            order = jnp.argsort(self.pairs.number)
+            return PileImpulses(self.pairs.number[order], x[order])
+
+        as_it_is = PileImpulses(self.pairs.number, x)
+        return jax.lax.cond(self.pairs.filled > 0, in_order, lambda: as_it_is)
+
+    def recorded(self, values: jax.Array) -> jax.Array:
+        """Values of contacts (.., m) as the record holds them: their sum (.., 1)."""
+        return jnp.sum(values, axis=-1, keepdims=True)
+
+
+def contacts_of_step(
+    system: System,
+    q: jax.Array,
+    t: jax.Array,
+    q_end: jax.Array,
+    t_end: jax.Array,
+    closed_below: jax.Array,
+    friction: bool,
+) -> AllContacts | ActiveContacts:
+    """The contacts of a step whose middle is at (q, t), and its end, without contacts, at q_end."""
+    at, end = seen_from_base(system, q, t), seen_from_base(system, q_end, t_end)
+    mass = mass_at(system, q)
+    if is_pile(system):
+        pairs = system.body.active_pairs(at, end, closed_below)
+        pairs = pairs if friction else pairs._replace(directions=pairs.directions[:, :1])
+        of_bodies = 1 / mass.reshape(-1, pairs.directions.shape[-1])
+        return ActiveContacts(pairs, jnp.pad(of_bodies, ((0, 1), (0, 0))))
+    gap, normals = gaps(system, q, t), normals_at(system, q, t)
+    n, m = normals.shape
+    directions = (normals + 0 * gap[None])[:, :, None]  # NaN where the gap is
+    if friction:
+        tangents = system.body.tangents(at)
+        assert tangents is not None
+        directions = jnp.concatenate([directions, tangents.reshape(n, m, -1)], axis=2)
+    least = jnp.minimum(gap, jnp.atleast_1d(system.body.gap_function(end)))
+    closed = ~(least > closed_below)  # NaN does not pass for open
+    directions = jnp.where(closed[:, None], directions, 0.0)
+    moved = solve_mass_matrix(mass, directions.reshape(n, -1)).reshape(directions.shape)
+    matrix = jnp.tensordot(directions, moved, axes=([0], [0]))
+    return AllContacts(gap, normals, closed, directions, moved, matrix)
