@@ -13,7 +13,6 @@ in proportion to mu p, and normal impulses are the least, wherever that is allow
 """
 
 import itertools
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -23,7 +22,7 @@ import numpy as np
 from jimpact.compiling import full_precision
 from jimpact.loops import fori_loop, while_loop
 from jimpact.solvers.dense import block_inverse, block_solve, load_shares, singular_values, times
-from jimpact.solvers.interior_points import cones_of, within_cones
+from jimpact.solvers.interior_points import ATTEMPTS, Best, better, cones_of, within_cones
 from jimpact.solvers.lcp import gathered_rounding
 from jimpact.solvers.many_contacts import solve_many
 from jimpact.status import CODE
@@ -34,9 +33,9 @@ _ITERATIONS = 8  # of Newton's method for the directions of slip; 4 to 6 are usu
 # Part of the largest mu p: the weight in the sharing of a contact without load. Ten times more: it
 # takes a visible share.
 _LEAST_SHARE = 1e-6
-# Projections at most, and steps of Newton's method after them. Ten times more: jammed scenes end
-# later.
-_PROJECTIONS, _POLISHES = 5000, 3
+# Projections at most, where interior points find nothing. Ten times more: jammed scenes end later.
+_PROJECTIONS = 5000
+_POLISHES = 8  # steps of Newton's method; 1 to 3 are usual, ten times more change nothing
 # Added to the diagonal of the equations of Newton's method, which are singular where impulses are
 # free. Ten times more: another step of it.
 _RIDGE = 1e-8
@@ -124,8 +123,8 @@ def solve(
         all combined: solutions that none of them reaches are missed. Above 3 contacts other modes
         are not looked for. It is reported also where redundant contacts slide, so that how they
         share p changes their slip (a spinning cube flat on four corners).
-        `impulse_not_unique`: only the impulses differ; of more than 256 rows no shares are computed,
-        and whether slip depends on them is not looked for. `infeasible`: no modes are consistent;
+        `impulse_not_unique`: only the impulses differ; of more than 256 rows no shares are
+        computed, nor whether slip depends on them. `infeasible`: no modes are consistent;
         `max_steps`: none were found (in space, above 3 contacts).
 
     Derivatives (up to the third, in any mode) hold the modes, which is one-sided where they are
@@ -489,8 +488,11 @@ def _modes_at(problem: _FrictionProblem, x: jax.Array) -> _Modes:
 
 
 def _search(problem: _FrictionProblem) -> tuple[_Modes, jax.Array, jax.Array]:
-    """Modes, x (m, b) and status of many contacts: by interior points, by projections where these
-    find nothing, and by Newton's method on the modes of either."""
+    """Modes, x (m, b) and status of many contacts.
+
+    By attempts of interior points, the last one by projections where contacts may part, each
+    with Newton's method on the modes that it leads to.
+    """
 
     def misfit(x: jax.Array) -> jax.Array:
         """How far x is from the law."""
@@ -502,46 +504,53 @@ def _search(problem: _FrictionProblem) -> tuple[_Modes, jax.Array, jax.Array]:
         missed = (right - jnp.sum(matrix * x[None, None], axis=(2, 3)))[..., None]
         return x + block_solve(matrix + _RIDGE * unit, missed)[..., 0]
 
-    unit = jnp.eye(problem.rate.size, dtype=problem.rate.dtype).reshape(problem.matrix.shape)
-    x = within_cones(cones_of(*problem), misfit, polish, problem.tolerance)
-    if problem.complementary:
-        x = _projected(problem, x, misfit, polish)
-    status = jnp.where(misfit(x) <= problem.tolerance, CODE["ok"], CODE["max_steps"])
-    return _modes_at(problem, x), x, status
+    def newton(state: tuple[jax.Array, Best, jax.Array]) -> tuple[jax.Array, Best, jax.Array]:
+        """One step, which may lead away for once."""
+        x = polish(state[0])
+        return x, better(misfit, state[1], x), state[2] + 1
 
+    def wrong(best: Best) -> jax.Array:
+        """Whether the law is not satisfied; also NaN."""
+        return ~(best.misfit <= problem.tolerance)
 
-def _projected(
-    problem: _FrictionProblem,
-    x: jax.Array,
-    misfit: Callable[[jax.Array], jax.Array],
-    polish: Callable[[jax.Array], jax.Array],
-) -> jax.Array:
-    """x (m, b) where it satisfies the law; elsewhere what projections and Newton's method make of
-    it."""
-
-    def improve(state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        """The impulses that projections lead to."""
-        solution = solve_many(
-            lambda x: jnp.sum(problem.matrix * x[None, None], axis=(2, 3)),
-            jnp.ones_like(problem.rate),
-            problem.rate,
-            problem.friction,
-            state[0],
-            jnp.ones((), x.dtype),
-            problem.tolerance,
-            _PROJECTIONS,
-            problem.load,
+    def attempt(state: tuple[Best, jax.Array]) -> tuple[Best, jax.Array]:
+        """The best so far, or what another attempt leads to."""
+        best, number = state
+        tried = within_cones(cones, misfit, number, problem.tolerance)
+        if problem.complementary:
+            last = number == ATTEMPTS
+            swept = _projected(problem, best.impulse, last)
+            tried = better(misfit, tried, jnp.where(last, swept, tried.impulse))
+        _, tried, _ = while_loop(
+            lambda s: wrong(s[1]) & (s[2] < _POLISHES),
+            newton,
+            (tried.impulse, tried, jnp.asarray(0)),
         )
-        swept = solution.impulse
-        refined = fori_loop(0, _POLISHES, lambda _, x: polish(x), swept)
-        better = misfit(refined) < misfit(swept)
-        return jnp.where(better, refined, swept), jnp.asarray(True)
+        less = tried.misfit < best.misfit
+        return jax.tree.map(lambda a, b: jnp.where(less, a, b), tried, best), number + 1
 
-    def unsolved(state: tuple[jax.Array, jax.Array]) -> jax.Array:
-        """Whether the law is not satisfied yet."""
-        return ~state[1] & ~(misfit(state[0]) <= problem.tolerance)
+    unit = jnp.eye(problem.rate.size, dtype=problem.rate.dtype).reshape(problem.matrix.shape)
+    cones, none = cones_of(*problem), jnp.zeros_like(problem.rate)
+    start = Best(none, jnp.inf + 0 * jnp.sum(problem.rate)), jnp.asarray(0)
+    most = ATTEMPTS + 1 if problem.complementary else ATTEMPTS
+    best, _ = while_loop(lambda s: wrong(s[0]) & (s[1] < most), attempt, start)
+    status = jnp.where(wrong(best), CODE["max_steps"], CODE["ok"])
+    return _modes_at(problem, best.impulse), best.impulse, status
 
-    return while_loop(unsolved, improve, (x, jnp.asarray(False)))[0]
+
+def _projected(problem: _FrictionProblem, x: jax.Array, needed: jax.Array) -> jax.Array:
+    """What projections make of x (m, b), if they are `needed` ()."""
+    return solve_many(
+        lambda x: jnp.sum(problem.matrix * x[None, None], axis=(2, 3)),
+        jnp.ones_like(problem.rate),
+        problem.rate,
+        problem.friction,
+        x,
+        jnp.ones((), x.dtype),
+        problem.tolerance,
+        jnp.where(needed, _PROJECTIONS, 0),
+        problem.load,
+    ).impulse
 
 
 # ------------------------------------------------------------------- known normal forces

@@ -1,4 +1,4 @@
-"""Contacts with friction, in the plane and in space: interior points, then Newton's method.
+"""Contacts with friction, in the plane and in space: interior points.
 
 With p = g a, p_t = h y, h / g = mu the disc |p_t| <= mu (p + load) is the cone |y| <= a + load.
 With the rates scaled alike, nu = g r and s -> h s, contact with friction is
@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact.compiling import full_precision
-from jimpact.loops import while_loop
+from jimpact.loops import fori_loop, while_loop
 from jimpact.solvers.dense import block_solve
 
 # Iterations of an attempt; 10 to 15 are usual. Ten times more: what diverges takes longer.
@@ -33,11 +33,11 @@ _MOST = 25
 # a nu and Y . K. Ten times more: slower where contacts slide; ten times less: contacts that nearly
 # stick turn their slip in each iteration. 4 of 1 000 scenes of 4 to 12 contacts need the last one.
 _SLIDES = np.array([100.0, 1.0, 1e-4])
+ATTEMPTS = len(_SLIDES)
 # Misfit, as a power of eps, at which Newton's method takes over in the first attempt, and part of
 # the tolerance in others. Ten times more: the modes are not yet right; ten times less: contacts
 # with p = r = 0 take all iterations.
 _CLOSE, _CLOSER = 0.5, 1e-2
-_POLISHES = 8  # steps of Newton's method; 1 to 3 are usual, ten times more change nothing
 # Of the way to the boundary of the cones, what an iteration goes at most. Closer to 1: those that
 # follow have no room.
 _WITHIN = 0.99
@@ -66,7 +66,7 @@ class _Inside(NamedTuple):
     slip: jax.Array
 
 
-class _Best(NamedTuple):
+class Best(NamedTuple):
     """The impulses (m, b) of the least misfit () so far."""
 
     impulse: jax.Array
@@ -91,63 +91,42 @@ def cones_of(
 
 @full_precision
 def within_cones(
-    cones: Cones,
-    misfit: Callable[[jax.Array], jax.Array],
-    polish: Callable[[jax.Array], jax.Array],
-    tolerance: float,
-) -> jax.Array:
-    """Impulses x = (p, p_t) (m, b) of contacts with friction.
+    cones: Cones, misfit: Callable[[jax.Array], jax.Array], attempt: jax.Array, tolerance: float
+) -> Best:
+    """Impulses x = (p, p_t) (m, b) of contacts with friction, by interior points.
 
     Args:
         cones: the problem, with a diagonal and rates of order 1.
         misfit: how far x (m, b) is from the law ().
-        polish: a step of Newton's method from x (m, b) on the modes that it has.
+        attempt: () number of the attempt; from ATTEMPTS on nothing is done.
         tolerance: of the misfit.
 
     Returns:
-        The x of the least misfit.
+        The x of the least misfit: that of the first attempt is close, others are closer.
     """
     first_close = float(jnp.finfo(cones.constant.dtype).eps) ** _CLOSE
     unit, none = jnp.ones_like(cones.load), jnp.zeros_like(cones.constant[:, 1:])
     nan = 0 * jnp.sum(cones.constant)  # NaN where a rate is not finite
     middle = _Inside(unit + nan, unit, none, unit, none)
+    slides = jnp.asarray(_SLIDES, unit.dtype)[attempt]
+    close = jnp.where(attempt == 0, first_close, _CLOSER * tolerance)
+    most = jnp.where(attempt < ATTEMPTS, _MOST, 0)
 
-    def better(best: _Best, x: jax.Array) -> _Best:
-        """The impulses of less misfit."""
-        wrong = misfit(x)
-        less = wrong < best.misfit
-        return _Best(jnp.where(less, x, best.impulse), jnp.where(less, wrong, best.misfit))
+    def iterate(state: tuple[_Inside, Best, jax.Array]) -> tuple[_Inside, Best, jax.Array]:
+        """One iteration."""
+        at = _corrected(cones, state[0], slides)
+        return at, better(misfit, state[1], _impulse(cones, at)), state[2] + 1
 
-    def attempt(state: tuple[_Best, jax.Array]) -> tuple[_Best, jax.Array]:
-        """Interior points from the middle of the cones, then Newton's method."""
-        slides = jnp.asarray(_SLIDES, unit.dtype)[state[1]]
-        close = jnp.where(state[1] == 0, first_close, _CLOSER * tolerance)
+    first = Best(_impulse(cones, middle), jnp.asarray(jnp.inf, unit.dtype) + nan)
+    start = middle, first, jnp.asarray(0)
+    return while_loop(lambda s: ~(s[1].misfit <= close) & (s[2] < most), iterate, start)[1]
 
-        def iterate(inner: tuple[_Inside, _Best, jax.Array]) -> tuple[_Inside, _Best, jax.Array]:
-            """One iteration."""
-            at = _corrected(cones, inner[0], slides)
-            return at, better(inner[1], _impulse(cones, at)), inner[2] + 1
 
-        def newton(inner: tuple[jax.Array, _Best, jax.Array]) -> tuple[jax.Array, _Best, jax.Array]:
-            """One step, which may lead away for once."""
-            x = polish(inner[0])
-            return x, better(inner[1], x), inner[2] + 1
-
-        start = middle, first, jnp.asarray(0)
-        _, best, _ = while_loop(lambda s: ~(s[1].misfit <= close) & (s[2] < _MOST), iterate, start)
-        _, best, _ = while_loop(
-            lambda s: ~(s[1].misfit <= tolerance) & (s[2] < _POLISHES),
-            newton,
-            (best.impulse, best, jnp.asarray(0)),
-        )
-        best = jax.tree.map(
-            lambda new, old: jnp.where(best.misfit < state[0].misfit, new, old), best, state[0]
-        )
-        return best, state[1] + 1
-
-    first = _Best(_impulse(cones, middle), jnp.asarray(jnp.inf, unit.dtype) + nan)
-    unfinished = lambda s: ~(s[0].misfit <= tolerance) & (s[1] < len(_SLIDES))  # noqa: E731
-    return while_loop(unfinished, attempt, (first, jnp.asarray(0)))[0].impulse
+def better(misfit: Callable[[jax.Array], jax.Array], best: Best, x: jax.Array) -> Best:
+    """The impulses of less misfit."""
+    wrong = misfit(x)
+    less = wrong < best.misfit
+    return Best(jnp.where(less, x, best.impulse), jnp.where(less, wrong, best.misfit))
 
 
 def _impulse(cones: Cones, at: _Inside) -> jax.Array:
@@ -185,9 +164,13 @@ def _corrected(cones: Cones, at: _Inside, slides: jax.Array) -> _Inside:
         part = jnp.minimum(1.0, _WITHIN * room)
         return jax.tree.map(lambda x, dx: x + part * dx, at, way)
 
-    predicted = _mean(cones, ahead(jnp.zeros_like(mean)))
-    share = jnp.maximum(jnp.minimum(predicted / mean, 1.0) ** 2, _LEAST_AIM)
-    return ahead(share * mean)
+    def look(_: int, state: tuple[_Inside, jax.Array]) -> tuple[_Inside, jax.Array]:
+        """The point ahead with the aim of the state, and the aim that follows from it."""
+        point = ahead(state[1])
+        share = jnp.maximum(jnp.minimum(_mean(cones, point) / mean, 1.0) ** 2, _LEAST_AIM)
+        return point, share * mean
+
+    return fori_loop(0, 2, look, (at, jnp.zeros_like(mean)))[0]
 
 
 def _linearized(

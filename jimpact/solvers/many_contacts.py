@@ -11,7 +11,7 @@ enough for a pile.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -62,7 +62,7 @@ def solve_many(
     start: jax.Array,
     inverse_step_size: jax.Array,
     tolerance: float,
-    most: int,
+    most: Any,
     load: jax.Array | None = None,
 ) -> Many:
     """Impulses x (m, b) of contacts with Coulomb friction, normals first (b = 1, 2, 3).
@@ -75,7 +75,7 @@ def solve_many(
         start: x (m, b) to begin with.
         inverse_step_size: estimate of the largest eigenvalue of A, scaled to a diagonal of 1.
         tolerance: misfit at which it ends, of the largest of `rate`.
-        most: iterations.
+        most: iterations, an int or ().
         load: (m,) normal impulses in addition to p, which friction includes; None: 0.
 
     Source: Nesterov (1983), O'Donoghue and Candes (2015) for the restart; Mazhar, Heyn, Negrut and
@@ -138,14 +138,14 @@ def _projected(x: jax.Array, slope: jax.Array, load: jax.Array | None) -> jax.Ar
     return jnp.concatenate([p, side * shrink], axis=1)
 
 
-def _with_momentum(at: _At, x: jax.Array, ax: jax.Array, most: int) -> _At:
+def _with_momentum(at: _At, x: jax.Array, ax: jax.Array, most: Any) -> _At:
     """The iteration after a projected step to x; a step that overshoots is taken back."""
     step, bent = x - at.y, ax - at.ay
     square = jnp.vdot(step, step)
     long = jnp.vdot(step, bent) > at.inverse_step_size * square * (1 + 1e-9)
     back = long | (jnp.vdot(step, x - at.x) < 0)
     weight = (1 + jnp.sqrt(1 + 4 * at.weight**2)) / 2
-    allowed = jnp.asarray(MOMENTUM, x.dtype)[len(MOMENTUM) * at.tries // most]
+    allowed = jnp.asarray(MOMENTUM, x.dtype)[len(MOMENTUM) * at.tries // jnp.maximum(most, 1)]
     gain = jnp.where(back, 0.0, jnp.minimum((at.weight - 1) / weight, allowed))
     x, ax = jnp.where(long, at.x, x), jnp.where(long, at.ax, ax)
     misfit = jnp.where(long, jnp.inf, at.inverse_step_size * jnp.max(jnp.abs(step)))
