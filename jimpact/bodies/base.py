@@ -390,23 +390,6 @@ def as_planes(planes: Any, dimension: int) -> jax.Array:
     return jnp.stack(rows) if rows else jnp.zeros((0, d + 1))
 
 
-def floors_of(planes: Any) -> list[tuple[float, float]]:
-    """(angle, offset) of planes (k, 3), for pictures."""
-    return [(float(np.arctan2(-x, y)), float(c)) for x, y, c in np.asarray(planes)]
-
-
-def turned(points: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Points (k, 2) of a planar body, in its own frame, at q = (x, y, theta)."""
-    c, s = np.cos(q[2]), np.sin(q[2])
-    return q[:2] + points @ np.array([[c, s], [-s, c]])
-
-
-def wheel(radius: Any, q: np.ndarray, middle: Any = (0.0, 0.0)) -> np.ndarray:
-    """A circle about `middle`, with the radius that shows how far it has turned."""
-    spoke = np.concatenate([[[0.0, 0.0]], CIRCLE])
-    return turned(float(radius) * spoke + np.asarray(middle), q)
-
-
 def lengths(vectors: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Lengths (g,) and unit vectors of vectors (g, d); one of length 0 has no direction."""
     square = jnp.sum(vectors**2, axis=1)
@@ -417,15 +400,6 @@ def lengths(vectors: jax.Array) -> tuple[jax.Array, jax.Array]:
 def dot(a: jax.Array, b: jax.Array) -> jax.Array:
     """Scalar products (..)."""
     return jnp.sum(a * b, axis=-1)
-
-
-def inertia_of(inertia: Any, homogeneous: Any, centre: Any) -> Any:
-    """The argument `inertia`, or that of a homogeneous body, whose centre of mass is known."""
-    if inertia is not None:
-        return inertia
-    if centre is not None:
-        raise ValueError("Argument `inertia` must be given with `centre`.")
-    return homogeneous
 
 
 _AZIMUTH, _ELEVATION = np.deg2rad(30.0), np.deg2rad(20.0)  # of the view of bodies in space

@@ -12,7 +12,7 @@ from jimpact.compiling import full_precision
 from jimpact.scene import Scene, check_mass
 
 
-class GivenBody(Body):
+class FunctionBody(Body):
     """A body given by functions, see `System` and `scene_from_gaps`."""
 
     gaps: Callable[[jax.Array], jax.Array]
@@ -85,4 +85,4 @@ def scene_from_gaps(
     >>> bouncing.normals.tolist()
     [[0.0], [1.0]]
     """
-    return GivenBody(gap_function, mass).scene(q, closed_below)
+    return FunctionBody(gap_function, mass).scene(q, closed_below)
