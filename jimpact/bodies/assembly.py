@@ -21,7 +21,6 @@ from jimpact.bodies import grid
 from jimpact.bodies.base import CIRCLE, as_planes, lengths, number
 from jimpact.bodies.closed_pairs import ActivePairs, listed_pairs
 from jimpact.bodies.distances import (
-    any_pair,
     changed_places,
     disc_on_polygon,
     facing_sides,
@@ -289,14 +288,6 @@ class Bodies(RigidBodies):
     def overlap(self) -> Any:
         """Penetration () [m] with which a motion may start."""
         return _OVERLAP * grid.least_radius(self) if self.room else 0.0
-
-    def pair_contacts(self, at: jax.Array, i: Any, j: Any) -> ContactPoints:
-        """Contacts of pairs (g,) of many: gaps (g, slots), points (g, slots, d), normals to i."""
-        a, b = (self.placed_at(at[x], self.points[x]).points for x in (i, j))
-        if grid.slots(self) == 1:
-            found = round_on_round(a[:, 0], b[:, 0], self.rims[i], self.rims[j])
-            return ContactPoints(*(x[:, None] for x in found))
-        return any_pair(a, b, self.rims[i], self.rims[j])
 
     def active_pairs(self, q: jax.Array, later: jax.Array, below: jax.Array) -> ActivePairs:
         """The contacts, at q, with gaps up to `below` at q or `later`."""

@@ -14,8 +14,9 @@ from jimpact.bodies.closed_pairs import (
     over_blocks,
     with_block,
 )
+from jimpact.bodies.distances import any_pair, round_on_round
 from jimpact.bodies.neighbours import Candidates, all_pairs, crowd_of, near_pairs
-from jimpact.bodies.rigid import tangents_of
+from jimpact.bodies.rigid import ContactPoints, tangents_of
 from jimpact.bodies.shapes import inner_radii
 from jimpact.compiling import full_precision
 
@@ -94,6 +95,15 @@ def _candidates(bodies: "Bodies", q: jax.Array, margin: jax.Array) -> Candidates
     return near_pairs(bodies.of_bodies(q)[:, : bodies.dimension], distance, bodies.crowd)
 
 
+def _of_pairs(bodies: "Bodies", at: jax.Array, i: Any, j: Any) -> ContactPoints:
+    """Contacts of pairs (g,): gaps (g, slots), points (g, slots, d), normals towards i."""
+    a, b = (bodies.placed_at(at[x], bodies.points[x]).points for x in (i, j))
+    r, s = bodies.rims[i], bodies.rims[j]
+    if slots(bodies) > 1:
+        return any_pair(a, b, r, s)
+    return ContactPoints(*(x[:, None] for x in round_on_round(a[:, 0], b[:, 0], r, s)))
+
+
 def least_gap(bodies: "Bodies", q: jax.Array) -> jax.Array:
     """The least gap () [m]; of bodies that are near each other if there are any."""
     others = jnp.asarray(np.arange(bodies.count, dtype=np.int32))
@@ -104,7 +114,7 @@ def least_gap(bodies: "Bodies", q: jax.Array) -> jax.Array:
         """Body by body, so that no table holds all pairs."""
 
         def with_one(i: jax.Array, least: jax.Array) -> jax.Array:
-            gaps = bodies.pair_contacts(at, jnp.full_like(others, i), others).gap
+            gaps = _of_pairs(bodies, at, jnp.full_like(others, i), others).gap
             alone = (others == i)[:, None]
             return jnp.minimum(least, jnp.min(jnp.where(alone, jnp.inf, gaps)))
 
@@ -142,7 +152,7 @@ def _near_gaps(
         """The next pairs."""
         used, place = chosen_rows(so_far, first, count)
         i, j = (jnp.where(used, x[place], 0) for x in (near.first, near.second))
-        both = jax.vmap(lambda at: bodies.pair_contacts(at, i, j).gap)(at)
+        both = jax.vmap(lambda at: _of_pairs(bodies, at, i, j).gap)(at)
         new = i, j, jnp.where(used[:, None], jnp.min(both, axis=0), jnp.inf)
         return tuple(with_block(x, part, first) for x, part in zip(filled, new))
 
@@ -216,7 +226,7 @@ def _of_contacts(
     i, partner = jnp.divmod(pair, jnp.int32(stride(bodies)))
     other, row = jnp.minimum(partner, bodies.count - 1), np.arange(len(number))
     at = bodies.of_bodies(q)
-    _, points, normals = bodies.pair_contacts(at, i, other)
+    _, points, normals = _of_pairs(bodies, at, i, other)
     point, n = points[row, slot], normals[row, slot]
     if len(bodies.planes):
         on_plane = (partner >= bodies.count)[:, None]

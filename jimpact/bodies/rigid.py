@@ -130,7 +130,7 @@ class RigidBodies(Body):
     @property
     def range_in_words(self) -> str:  # type: ignore[override]
         """What `valid` asks for."""
-        return "quaternions of length 1" if self.quaternions else super().range_in_words
+        return "a quaternion of length 1 each" if self.quaternions else super().range_in_words
 
     def of_bodies(self, q: jax.Array) -> jax.Array:
         """Coordinates or velocities (b, ..) of each body."""
