@@ -12,6 +12,7 @@ import numpy as np
 from jimpact._checks import (
     as_float_array,
     as_whole,
+    check_choice,
     check_concrete,
     check_shape,
     check_values,
@@ -29,7 +30,14 @@ from jimpact.bodies.distances import (
     polygon_on_polygon,
     round_on_round,
 )
-from jimpact.bodies.rigid import ContactPoints, Placed, RigidBodies, RigidBody, times
+from jimpact.bodies.rigid import (
+    ContactPoints,
+    Placed,
+    RigidBodies,
+    RigidBody,
+    times,
+    unit_quaternion,
+)
 from jimpact.compiling import full_precision, precise_jit
 from jimpact.scene import Scene
 
@@ -132,10 +140,14 @@ class Bodies(RigidBodies):
         places: Any = (),
         room: int | None = None,
     ):
-        bodies, every = tuple(bodies), (*bodies, *fixed)
+        for name, some in (("bodies", bodies), ("fixed", fixed)):
+            if not np.iterable(some):
+                raise TypeError(f"Argument `{name}` must be a list of bodies, but is {some!r}.")
+        bodies, fixed = tuple(bodies), tuple(fixed)
+        every = (*bodies, *fixed)
         if not bodies:
             raise ValueError("Argument `bodies` must hold one or more, but is empty.")
-        _check_kinds(bodies, tuple(fixed))
+        _check_kinds(bodies, fixed)
         d = bodies[0].dimension
         named = pairs is not None or len(fixed) > 0
         if room is not None and named:
@@ -160,6 +172,9 @@ class Bodies(RigidBodies):
         size = (len(fixed), self.places.shape[1])
         check_shape("places", self.places, size, "one for each of `fixed`")
         check_values("places", self.places)
+        if self.dimension == 3:
+            for place in self.places:
+                unit_quaternion(place[3:])
         self.pairs = _as_pairs(every, self.shapes, len(bodies), d, pairs)
         if not len(self.pairs_in_contact()):
             raise ValueError("Arguments `bodies`, `planes` and `pairs` must give a contact.")
@@ -178,10 +193,14 @@ class Bodies(RigidBodies):
     @property
     def _kinds(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Pairs (g, 2) of round bodies; of a round one and one with faces; of two with faces."""
-        pairs = self.pairs
-        every = np.stack(np.triu_indices(self.count, 1), axis=1) if pairs is None else pairs
-        each = np.array(every, np.int32).reshape(-1, 2)
-        is_round = np.array([shape.is_round for shape in self.shapes])[each]
+        if self.pairs is None:
+            each = np.stack(np.triu_indices(self.count, 1), axis=1).astype(np.int32)
+        else:
+            each = np.array(self.pairs, np.int32).reshape(-1, 2)
+        round_bodies = np.array([shape.is_round for shape in self.shapes])
+        if round_bodies.all():  # of thousands there are millions of pairs
+            return each, each[:0], each[:0]
+        is_round = round_bodies[each]
         mixed, swap = each[is_round[:, 0] != is_round[:, 1]], is_round[is_round.sum(axis=1) == 1]
         mixed = np.where(swap[:, :1], mixed, mixed[:, ::-1])
         return each[is_round.all(axis=1)], mixed, each[~is_round.any(axis=1)]
@@ -268,8 +287,12 @@ class Bodies(RigidBodies):
         self, angle: Any = 0.0, along: Any = 0.0, body: int = 0, plane: int = 0
     ) -> jax.Array:
         """(x, y, theta) of one body on one plane, turned by `angle` from it, `along` it [m]."""
-        if self.dimension == 3:
-            raise TypeError("Bodies in space have no `touching`: give `q` yourself, see `at`.")
+        if self.dimension == 3 or not len(self.planes):
+            raise TypeError(
+                "Bodies in space or without planes have no `touching`: give `q` yourself, see `at`."
+            )
+        check_choice("body", body, range(self.count))
+        check_choice("plane", plane, range(len(self.planes)))
         turn, distance = number("angle", angle), number("along", along)
         (n_x, n_y, offset) = self.planes[plane]
         low = jnp.sin(turn) * self.points[body, :, 0] + jnp.cos(turn) * self.points[body, :, 1]
@@ -428,8 +451,12 @@ def _as_pairs(
         ready = [i for i, shape in enumerate(shapes) if shape.faces or shape.is_round]
         pairs = [(i, j) for i in ready for j in ready if i < j and i < moving]
     for pair in pairs:
-        if np.shape(pair) != (2,) or not (
-            0 <= min(pair) < moving and max(pair) < count and pair[0] != pair[1]
+        if not (
+            np.shape(pair) == (2,)
+            and all(hasattr(i, "__index__") for i in pair)
+            and 0 <= min(pair) < moving
+            and max(pair) < count
+            and pair[0] != pair[1]
         ):
             fixed = f", one of which moves (0 to {moving - 1})" if count > moving else ""
             raise ValueError(

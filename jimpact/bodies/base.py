@@ -374,6 +374,8 @@ def as_planes(planes: Any, dimension: int) -> jax.Array:
     d = dimension
     if planes is None:
         return jnp.eye(1, d + 1, d - 1)
+    if not np.iterable(planes):
+        raise TypeError(f"Argument `planes` must be a list, one entry a plane, not {planes!r}.")
     rows = []
     for plane in planes:
         row = as_float_array("planes", plane)

@@ -25,7 +25,8 @@ class FunctionBody(Body):
             ("tangent_function", tangent_function),
         ):
             if not (callable(function) or (function is None and name != "gap_function")):
-                raise TypeError(f"Argument `{name}` must be a function, but is {function!r}.")
+                kinds = "a body or a function" if name == "gap_function" else "a function"
+                raise TypeError(f"Argument `{name}` must be {kinds}, but is {function!r}.")
         self.gaps, self.sliding = gap_function, tangent_function
         if callable(mass):
             self.mass_argument = mass

@@ -100,6 +100,13 @@ class RigidBodies(Body):
     planes: jax.Array  # (w, d + 1) unit normal, distance
     shapes: tuple[Shape, ...] = eqx.field(static=True)
 
+    def __repr__(self) -> str:
+        """What it is of, without its arrays."""
+        each = self.points.shape[1]
+        return (
+            f"{type(self).__name__}({self.count} of up to {each} points, {len(self.planes)} planes)"
+        )
+
     # ---- what there is
 
     @property
@@ -143,7 +150,7 @@ class RigidBodies(Body):
 
     def pairs_in_contact(self) -> np.ndarray:
         """Bodies i and j (m, 2) of each contact; j of a plane is -1."""
-        body = np.tile(self.rows()[0], len(self.planes))
+        body = np.tile(self.rows()[0].astype(np.int32), len(self.planes))
         return np.stack([body, np.full_like(body, -1)], axis=1)
 
     @property
@@ -300,7 +307,7 @@ class RigidBodies(Body):
         velocities = self.dimension + self.angular
         rows = jnp.zeros((*ways.shape[:2], self.count, velocities), q.dtype)
         moving = np.arange(self.count, dtype=np.int32)[None]
-        for sign, body in zip((1.0, -1.0), self.pairs_in_contact().astype(np.int32).T):
+        for sign, body in zip((1.0, -1.0), self.pairs_in_contact().T):
             if (body >= 0).any():  # a plane does not move
                 own = jnp.asarray(body)[:, None] == moving
                 speeds = sign * self.speeds(q, point, ways, body)[:, :, None]

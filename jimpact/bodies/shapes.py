@@ -485,7 +485,7 @@ class Coin(_Space):
 
     def pairs_in_contact(self) -> np.ndarray:
         """It and the plane (m, 2)."""
-        return np.array([[0, -1]] * (self.points.shape[1] or 2))
+        return np.array([[0, -1]] * (self.points.shape[1] or 2), np.int32)
 
     def valid(self, q: jax.Array) -> jax.Array:
         """Of the quaternion; of round coins also the tilt beyond `FLAT`."""
@@ -531,8 +531,11 @@ def _round_shape(
     middle = jnp.zeros(d, radius.dtype)
     if centre is not None:
         middle = -_vector("centre", centre, d)
-        far = jnp.sqrt(jnp.sum(middle**2))
-        check_values("centre", far, high=np.inf if is_traced(radius) else float(radius))
+        if not is_traced((middle, radius)) and not np.linalg.norm(middle) <= float(radius):
+            raise ValueError(
+                f"Argument `centre` must be at most {float(radius):g} m from the middle, but has "
+                f"value {(-middle).tolist()}."
+            )
     return Shape((0,), 1, False, isotropic and centre is None), middle
 
 

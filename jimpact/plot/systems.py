@@ -8,7 +8,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
-from jimpact._checks import check_kind, check_shape
+from jimpact._checks import check_kind, check_shape, check_values
 from jimpact.bodies.assembly import Bodies
 from jimpact.bodies.base import Body
 from jimpact.motion.system import System
@@ -52,6 +52,9 @@ def system(drawn: Scene | Body | System, state: Any, title: str = "") -> Figure:
         _row(axes, drawn, np.asarray(as_velocity(drawn, state)))
     else:
         body = drawn.body if isinstance(drawn, System) else drawn
+        if body.names:
+            check_shape("state", state, (len(body.names),), "one per coordinate of the body")
+        check_values("state", state)
         figure, axes = new_figure(3.6, title)
         draw_body(axes, body, np.asarray(state, float))
         axes.set(xlabel="x [m]", ylabel="height [m]")
@@ -86,7 +89,7 @@ def force_chains(pile: Bodies, q: Any, scene: Scene, impulse: Any, title: str = 
     1
     """
     if not (isinstance(pile, Bodies) and pile.room):
-        raise TypeError(f"Argument `pile` must be many `Bodies`, but is a {type(pile).__name__}.")
+        raise TypeError(f"Argument `pile` must be `Bodies` with `room` (many), but is {pile!r}.")
     check_kind("scene", scene, Scene)
     if scene.pairs is None or scene.size != pile.mass.shape[0]:
         raise TypeError("Argument `scene` must be `pile.closed_scene(q)`.")
