@@ -19,7 +19,7 @@ from jimpact._checks import (
     is_traced,
 )
 from jimpact.bodies import grid
-from jimpact.bodies.base import CIRCLE, as_planes, lengths, number
+from jimpact.bodies.base import as_planes, lengths, number
 from jimpact.bodies.closed_pairs import ActivePairs, listed_pairs
 from jimpact.bodies.distances import (
     changed_places,
@@ -212,12 +212,11 @@ class Bodies(RigidBodies):
             [super().pairs_in_contact(), discs, mixed, np.repeat(faces, 2, axis=0)]
         )
 
-    def placed(self, q: jax.Array) -> Placed:
-        """All bodies at q, the fixed ones last."""
-        at = self.of_bodies(q)
-        if len(self.places):
-            at = jnp.concatenate([at, self.places.astype(q.dtype)])
-        return self.placed_at(at, self.points)
+    def all_bodies(self, q: jax.Array) -> jax.Array:
+        """Coordinates (b, ..) of each body, the fixed ones last."""
+        if not len(self.places):
+            return self.of_bodies(q)
+        return jnp.concatenate([self.of_bodies(q), self.places.astype(q.dtype)])
 
     def contacts(self, q: jax.Array) -> ContactPoints:
         """Gaps, points and normals at q; `between` says of which bodies."""
@@ -233,8 +232,7 @@ class Bodies(RigidBodies):
             i, j = faces.T
             a, b = points[i], points[j]
             facing = facing_sides(a, b)
-            counts, angles = self._counts, self.of_bodies(q)[:, 2]
-            angles = jnp.concatenate([angles, self.places[:, 2].astype(q.dtype)])
+            counts, angles = self._counts, self.all_bodies(q)[:, 2]
             at, sizes = (angles[i], angles[j]), (counts[i], counts[j])
             both = polygon_on_polygon(a, b, facing, changed_places((a, b), at, sizes, facing))
             parts.append(ContactPoints(*(x.reshape(-1, *x.shape[2:]) for x in both)))
@@ -369,25 +367,6 @@ class Bodies(RigidBodies):
         if not directions[:, 0].any(axis=(1, 2)).all():
             raise ValueError("Argument `q` must hold bodies with different centres.")
         return scene
-
-    # ---- pictures
-
-    @property
-    def floors(self) -> list[tuple[float, float]]:
-        """The planes; of many spheres those that are seen edge-on from the side, along y."""
-        if not self.room or self.dimension == 2:
-            return super().floors
-        planes = np.asarray(self.planes)
-        return [(float(np.arctan2(-x, z)), float(d)) for x, y, z, d in planes if y == 0]
-
-    def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
-        """Those of all bodies, the fixed ones last; many spheres are seen along y."""
-        at = np.reshape(q, (self.count, -1))
-        if self.room and self.dimension == 3:
-            return [r * CIRCLE + x[[0, 2]] for r, x in zip(np.asarray(self.rims), at)]
-        if len(self.places):
-            at = np.concatenate([at, np.asarray(self.places)])
-        return self.curves(jnp.asarray(at, self.points.dtype))
 
 
 @precise_jit

@@ -143,6 +143,10 @@ class RigidBodies(Body):
         """Coordinates or velocities (b, ..) of each body."""
         return q.reshape(self.count, -1)
 
+    def all_bodies(self, q: jax.Array) -> jax.Array:
+        """Coordinates (b, ..) of each body, also of those that do not move."""
+        return self.of_bodies(q)
+
     def rows(self) -> tuple[np.ndarray, np.ndarray]:
         """Bodies (p,) of all contact points with a plane, and which points these are."""
         orders = [shape.order for shape in self.shapes[: self.count]]
@@ -210,17 +214,6 @@ class RigidBodies(Body):
         product = dot(jnp.tensordot(turn, table, (1, 2)), e[:, None])
         return jnp.concatenate([q[:, :3] + u[:, :3], product], axis=1).reshape(-1)
 
-    @full_precision
-    def pulled(self, q: jax.Array, gradient: jax.Array) -> jax.Array:
-        """Gradient in q as one in the displacements (n,), by `e' = e (0, omega) / 2`."""
-        if not self.quaternions:
-            return gradient
-        e, table = self.of_bodies(q)[:, 3:], _QUATERNION_PRODUCT[:, :, 1:].astype(q.dtype)
-        turns = 0.5 * jnp.tensordot(e / _length(e)[:, None], table, (1, 1))  # (b, 4, 3)
-        pull = self.of_bodies(gradient)
-        turning = jnp.sum(pull[:, 3:, None] * turns, axis=1)
-        return jnp.concatenate([pull[:, :3], turning], axis=1).reshape(-1)
-
     @property
     def base_directions(self) -> jax.Array:
         """All planes move along each axis (n, d)."""
@@ -246,8 +239,8 @@ class RigidBodies(Body):
         return jnp.stack([jnp.stack([c, -s], axis=1), jnp.stack([s, c], axis=1)], axis=1)
 
     def placed(self, q: jax.Array) -> Placed:
-        """The bodies at q."""
-        return self.placed_at(self.of_bodies(q), self.points)
+        """All bodies at q, in a `Bodies` the fixed ones last."""
+        return self.placed_at(self.all_bodies(q), self.points)
 
     def placed_at(self, at: jax.Array, points: jax.Array) -> Placed:
         """Bodies of these points (b, P, d) at (b, ..)."""
@@ -369,12 +362,7 @@ class RigidBodies(Body):
 
     def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
         """Polygons, wheels and rods; of space in projection, with a shadow on the first plane."""
-        at = jnp.asarray(np.reshape(q, (self.count, -1)), self.points.dtype)
-        return self.curves(at)
-
-    @full_precision
-    def curves(self, at: jax.Array) -> list[np.ndarray]:
-        """Outlines of bodies at (b, ..)."""
+        at = self.all_bodies(jnp.asarray(q, self.points.dtype))
         each = zip(self.shapes, self.points, self.rims, np.asarray(at), np.asarray(self.turns(at)))
         draw = self._plane_curves if self.dimension == 2 else self._space_curves
         return [

@@ -10,7 +10,7 @@ from matplotlib.patches import Circle, Rectangle
 
 from jimpact._checks import check_kind, check_shape, check_values
 from jimpact.bodies.assembly import Bodies
-from jimpact.bodies.base import Body
+from jimpact.bodies.base import Body, projected
 from jimpact.motion.system import System
 from jimpact.plot.motions import draw_body
 from jimpact.plot.style import COLOURS, GREY, SMALL, colour_of, new_figure, styled
@@ -65,7 +65,7 @@ def system(drawn: Scene | Body | System, state: Any, title: str = "") -> Figure:
 def force_chains(pile: Bodies, q: Any, scene: Scene, impulse: Any, title: str = "") -> Figure:
     """The impulses in a packing as lines between the centres, as thick as they are large.
 
-    Spheres are seen from the side, along y; lines in front cover those behind.
+    Spheres are seen in projection; large impulses cover small ones.
 
     Args:
         pile: its bodies.
@@ -96,7 +96,6 @@ def force_chains(pile: Bodies, q: Any, scene: Scene, impulse: Any, title: str = 
     p = np.asarray(impulse, float)
     check_shape("impulse", p, (scene.contacts,), "one per contact")
     d = pile.dimension
-    axis = [0, d - 1]  # seen from the side
     centres = np.asarray(q, float).reshape(pile.count, -1)[:, :d]
     first, second = scene.pairs.neighbours.bodies.T
     ends = np.where((second < 0)[:, None], _on_walls(pile, scene.pairs, centres), centres[second])
@@ -106,7 +105,8 @@ def force_chains(pile: Bodies, q: Any, scene: Scene, impulse: Any, title: str = 
     figure, axes = new_figure(5.0, title)
     for outline in pile.outlines(np.asarray(q, float), 0.0):
         axes.plot(*outline.T, color=GREY, lw=0.4, alpha=0.5)
-    lines = np.stack([centres[first], ends], axis=1)[drawn][:, :, axis]
+    lines = np.stack([centres[first], ends], axis=1)[drawn]
+    lines = lines if d == 2 else projected(lines)
     widths = _THICKEST * size[drawn]
     axes.add_collection(
         LineCollection(list(lines), linewidths=widths, colors=COLOURS[0], alpha=0.8)
