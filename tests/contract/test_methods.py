@@ -98,8 +98,8 @@ def test_gradients_and_the_other_methods():
     assert all("gradient" not in axes.get_xlabel() for axes in bare.axes)
 
 
-# of a disk on the ground that slides as it falls: mass 2, inertia 0.2, radius 0.5
-DISK = ji.Scene([2.0, 2.0, 0.2], [[0.0], [1.0], [0.0]], tangents=[[1.0], [0.0], [0.5]])
+# of a disc on the ground that slides as it falls: mass 2, inertia 0.2, radius 0.5
+DISC = ji.Scene([2.0, 2.0, 0.2], [[0.0], [1.0], [0.0]], tangents=[[1.0], [0.0], [0.5]])
 
 
 SLIDES, SLIP = [2.0, -1.0, 0.0], 2.0
@@ -142,7 +142,7 @@ def test_chart_of_a_box_on_a_corner():
         ({"law": ji.LZB(0.5, friction=0.1)}, ValueError, "`scene` must have tangents"),
         (
             {
-                "scene": DISK,
+                "scene": DISC,
                 "velocity": SLIDES,
                 "law": ji.LZB(0.5, friction=0.1),
                 "methods": ["rk4"],
@@ -355,18 +355,18 @@ def test_stability_map_of_a_scene_with_friction():
         (lambda: ji.stability_map(samples=-1), "`samples`"),
         (lambda: ji.stability_map(resolution=1), "`resolution`"),
         (lambda: ji.stability_map(axes={"friction": [0.1]}), "`axes` must be one of"),
-        (lambda: ji.stability_map(scene=DISK), "`velocity` must be given"),
+        (lambda: ji.stability_map(scene=DISC), "`velocity` must be given"),
         (lambda: ji.stability_map(velocity=SLIDES), "`velocity` must be None"),
         (
-            lambda: ji.stability_map(scene=DISK, velocity=[0.0, 1.0, 0.0]),
+            lambda: ji.stability_map(scene=DISC, velocity=[0.0, 1.0, 0.0]),
             "`velocity` must let a closed",
         ),
         (
-            lambda: ji.stability_map(["rk4"], scene=DISK, velocity=SLIDES),
+            lambda: ji.stability_map(["rk4"], scene=DISC, velocity=SLIDES),
             "`methods` must be one of",
         ),
         (
-            lambda: ji.stability_map(axes={"balls": [2]}, scene=DISK, velocity=SLIDES),
+            lambda: ji.stability_map(axes={"balls": [2]}, scene=DISC, velocity=SLIDES),
             "`axes` must be one of",
         ),
     ],
