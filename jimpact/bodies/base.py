@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_shape, check_values, is_traced
+from jimpact._checks import as_float_array, as_numbers, check_shape, check_values, is_traced
 from jimpact.bodies.closed_pairs import ActivePairs
 from jimpact.compiling import full_precision, quick_jit
 from jimpact.scene import Scene
@@ -339,17 +339,12 @@ class LinearPotential(eqx.Module):
 
 def positive(name: str, value: Any, low_allowed: bool = False) -> jax.Array:
     """A scalar > 0, or >= 0 where `low_allowed`."""
-    scalar = number(name, value)
-    check_values(name, scalar, low=0.0, open_low=not low_allowed)
-    return scalar
+    return as_numbers(name, value, (), "one number", low=0.0, open_low=not low_allowed)
 
 
 def number(name: str, value: Any) -> jax.Array:
     """A finite scalar."""
-    scalar = as_float_array(name, value)
-    check_shape(name, scalar, (), "one number")
-    check_values(name, scalar)
-    return scalar
+    return as_numbers(name, value, (), "one number")
 
 
 def positives(
@@ -359,11 +354,8 @@ def positives(
     numbers = as_float_array(name, value)
     if count is not None and numbers.ndim == 0:
         numbers = jnp.full(count, numbers)
-    if numbers.ndim != 1 or (count is not None and numbers.shape[0] != count):
-        size = "n" if count is None else count
-        raise ValueError(f"Argument `{name}` must have shape ({size},), but has {numbers.shape}.")
-    check_values(name, numbers, low=0.0, open_low=not low_allowed)
-    return numbers
+    shape = (numbers.size if count is None else count,)
+    return as_numbers(name, numbers, shape, "one of each", low=0.0, open_low=not low_allowed)
 
 
 def as_planes(planes: Any, dimension: int) -> jax.Array:

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_shape, check_values, is_traced
+from jimpact._checks import as_float_array, as_numbers, check_shape, is_traced
 from jimpact.bodies.base import (
     CIRCLE,
     PLANAR,
@@ -17,6 +17,7 @@ from jimpact.bodies.base import (
     lengths,
     number,
     numbered,
+    positive,
     projected,
 )
 from jimpact.compiling import full_precision
@@ -186,7 +187,7 @@ class RigidBodies(Body):
         """How much farther from 1 the quaternions' lengths may be ()."""
         if not self.quaternions:
             return super().valid(q)
-        return UNIT_WITHIN - jnp.max(jnp.abs(_length(self.of_bodies(q)[:, 3:]) - 1))
+        return UNIT_WITHIN - jnp.max(jnp.abs(lengths(self.of_bodies(q)[:, 3:])[0] - 1))
 
     @full_precision
     def moved(self, q: jax.Array, u: jax.Array) -> jax.Array:
@@ -210,7 +211,7 @@ class RigidBodies(Body):
     def _turned(self, q: jax.Array, u: jax.Array, turn: jax.Array) -> jax.Array:
         """q displaced by u, and turned by quaternions (b, 4)."""
         q, u, table = self.of_bodies(q), self.of_bodies(u), _QUATERNION_PRODUCT.astype(q.dtype)
-        e = q[:, 3:] / _length(q[:, 3:])[:, None]
+        _, e = lengths(q[:, 3:])
         product = dot(jnp.tensordot(turn, table, (1, 2)), e[:, None])
         return jnp.concatenate([q[:, :3] + u[:, :3], product], axis=1).reshape(-1)
 
@@ -314,9 +315,7 @@ class RigidBodies(Body):
         In the plane these are the centres of mass, in space the middles of the shapes.
         """
         d, count = self.dimension, self.count
-        places = as_float_array("positions", positions)
-        check_shape("positions", places, (count, d), "one for each body")
-        check_values("positions", places)
+        places = as_numbers("positions", positions, (count, d), "one for each body")
         if not self.quaternions:
             turning = jnp.zeros((count, self.angular)) if turns is None else turns
             turning = as_float_array("turns", turning).reshape(-1, self.angular)
@@ -409,6 +408,21 @@ class RigidBodies(Body):
 class RigidBody(RigidBodies):
     """One rigid body over the ground y = 0, or in space over a plane through the origin."""
 
+    def _set(
+        self,
+        points: jax.Array,
+        mass: Any,
+        inertia: jax.Array,
+        shape: Shape,
+        rim: Any,
+        normal: Any,
+    ) -> None:
+        """What it is: points (P, d), mass, inertia (1,), (3,) or (3, 3), rim, plane."""
+        self.masses, self.inertias = positive("mass", mass)[None], inertia[None]
+        self.points, self.shapes = points[None], (shape,)
+        self.rims = jnp.asarray(rim, points.dtype)[None]
+        self.planes = jnp.append(jnp.asarray(normal, points.dtype), 0.0)[None].astype(points.dtype)
+
     @property
     def corners(self) -> jax.Array:
         """Its contact points (k, d), in order, from the centre of mass [m]."""
@@ -437,8 +451,7 @@ class RigidBody(RigidBodies):
 
         In the plane this is the centre of mass, in space the middle of its shape.
         """
-        place = as_float_array("position", position)
-        check_shape("position", place, (self.dimension,), "a point")
+        place = as_numbers("position", position, (self.dimension,), "a point")
         return super().at(place[None], None if turn is None else [turn])
 
     def touching(self, turn: Any = None) -> jax.Array:
@@ -457,11 +470,6 @@ def rotation(e: jax.Array) -> jax.Array:
     outer = a[..., :, None] * a[..., None, :]
     one = jnp.broadcast_to(jnp.eye(3, dtype=e.dtype), across.shape)
     return one + 2 * (s * across + outer - dot(a, a)[..., None, None] * one) / square
-
-
-def _length(e: jax.Array) -> jax.Array:
-    """Lengths (b,) of quaternions (b, 4)."""
-    return jnp.sqrt(dot(e, e))
 
 
 def _cosine_and_sine_ratio(square: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -504,9 +512,7 @@ def _lowered(body: RigidBody, turn: jax.Array) -> jax.Array:
 
 def unit_quaternion(quaternion: Any) -> jax.Array:
     """A quaternion (4,) of length 1."""
-    e = as_float_array("quaternion", quaternion)
-    check_shape("quaternion", e, (4,), "scalar first")
-    check_values("quaternion", e)
+    e = as_numbers("quaternion", quaternion, (4,), "scalar first")
     if not is_traced(e) and abs(float(np.linalg.norm(e)) - 1) > UNIT_WITHIN:
         raise ValueError(
             f"Argument `quaternion` must have length 1, but has length {np.linalg.norm(e):g}."

@@ -9,9 +9,9 @@ import numpy as np
 
 from jimpact._checks import (
     as_float_array,
+    as_numbers,
     as_whole,
     check_choice,
-    check_shape,
     check_values,
     is_traced,
 )
@@ -34,14 +34,10 @@ class _Plane(RigidBody):
     """A body over the ground y = 0; q = (x, y, theta) of its centre of mass."""
 
     def _make(
-        self, points: jax.Array, mass: Any, inertia: jax.Array, shape: Shape, rim: Any = 0.0
+        self, points: jax.Array, mass: Any, inertia: Any, shape: Shape, rim: Any = 0.0
     ) -> None:
         """Set what all bodies have."""
-        self.masses = positive("mass", mass)[None]
-        self.inertias = positive("inertia", inertia)[None, None]
-        self.points, self.shapes = points[None], (shape,)
-        self.rims = jnp.asarray(rim, points.dtype)[None]
-        self.planes = jnp.eye(1, 3, 1, dtype=points.dtype)
+        self._set(points, mass, positive("inertia", inertia)[None], shape, rim, (0.0, 1.0))
 
 
 class Block(_Plane):
@@ -91,18 +87,13 @@ class Block(_Plane):
         self._make(points, mass, inertia, Shape(order, 4, True, False))
 
     @property
-    def _has_range(self) -> bool:
-        """Whether only the lower corners make contact."""
-        return len(self.shapes[0].order) == 2
-
-    @property
     def range_in_words(self) -> str:  # type: ignore[override]
         """What `valid` asks for."""
         return "no upper corner below the ground: or give corners='all'"
 
     def valid(self, q: jax.Array) -> jax.Array:
         """With the lower corners only: height () of the lower one of the upper corners [m]."""
-        if not self._has_range:
+        if len(self.shapes[0].order) == 4:
             return super().valid(q)
         return jnp.min(self.placed(q).points[0, 2:, 1])
 
@@ -146,7 +137,7 @@ class Polygon(_Plane):
         middle, about_middle = _moments(c)
         inertia = _given_inertia(inertia, positive("mass", mass) * about_middle, centre)
         if centre is not None:
-            middle = _vector("centre", centre, 2)
+            middle = as_numbers("centre", centre, (2,), "a vector")
         points = c - middle[None]
         if not is_traced(points) and not float(inner_radii(points[None])[0]) > 0:
             raise ValueError(
@@ -237,17 +228,14 @@ class _Space(RigidBody):
         rim: Any = 0.0,
     ) -> None:
         """Set what all bodies have; `homogeneous` are the moments of inertia over the mass."""
-        self.masses = positive("mass", mass)[None]
-        inertia = _given_inertia(inertia, self.masses * homogeneous, centre)
-        self.inertias = _moments_in_space(inertia)[None]
-        self.points, self.shapes = points[None], (shape,)
-        self.rims = jnp.asarray(rim, points.dtype)[None]
-        n = _vector("normal", normal, 3)
+        inertia = _given_inertia(inertia, positive("mass", mass) * homogeneous, centre)
+        n = as_numbers("normal", normal, (3,), "a vector")
         if not is_traced(n) and not float(n[2]) > 0:
             raise ValueError(
                 f"Argument `normal` must point up (its z > 0), but has value {n.tolist()}."
             )
-        self.planes = jnp.append(n / jnp.sqrt(jnp.sum(n**2)), 0.0)[None].astype(points.dtype)
+        n = n / jnp.sqrt(jnp.sum(n**2))
+        self._set(points, mass, _moments_in_space(inertia), shape, rim, n)
 
 
 class Box(_Space):
@@ -292,7 +280,7 @@ class Box(_Space):
     ):
         sizes = positives("sizes", as_float_array("sizes", sizes), 3)
         rounding = positive("rounding", rounding, low_allowed=True)
-        middle = -_vector("centre", np.zeros(3) if centre is None else centre, 3)
+        middle = -as_numbers("centre", np.zeros(3) if centre is None else centre, (3,), "a vector")
         if not is_traced((sizes, rounding, middle)):
             half = 0.5 * np.asarray(sizes)
             check_values("rounding", rounding, high=float(half.min()))
@@ -509,14 +497,6 @@ class Coin(_Space):
 # ------------------------------------------------------------------------------- construction
 
 
-def _vector(name: str, value: Any, d: int) -> jax.Array:
-    """A finite vector (d,)."""
-    vector = as_float_array(name, value)
-    check_shape(name, vector, (d,), "a vector")
-    check_values(name, vector)
-    return vector
-
-
 def _given_inertia(inertia: Any, homogeneous: jax.Array, centre: Any) -> Any:
     """The argument `inertia`, or that of a homogeneous body, whose centre of mass is known."""
     if inertia is None and centre is not None:
@@ -530,7 +510,7 @@ def _round_shape(
     """Of a disc or sphere; and its middle (d,) from the centre of mass."""
     middle = jnp.zeros(d, radius.dtype)
     if centre is not None:
-        middle = -_vector("centre", centre, d)
+        middle = -as_numbers("centre", centre, (d,), "a vector")
         if not is_traced((middle, radius)) and not np.linalg.norm(middle) <= float(radius):
             raise ValueError(
                 f"Argument `centre` must be at most {float(radius):g} m from the middle, but has "
