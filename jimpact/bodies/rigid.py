@@ -443,7 +443,7 @@ class RigidBody(RigidBodies):
         if self.dimension == 2:
             return tangents_of(normal)
         x, y, z = normal.T
-        first = jnp.stack([z, 0 * y, -x], axis=1) / jnp.sqrt(x**2 + z**2)[:, None]
+        first = jnp.stack([z, 0 * y, 0 * y - x], axis=1) / jnp.sqrt(x**2 + z**2)[:, None]
         return jnp.stack([first, cross(normal, first)], axis=1)
 
     def at(self, position: Any, turn: Any = None) -> jax.Array:

@@ -30,7 +30,7 @@ _CONVEX = "must be those of a convex polygon, in order around it"
 _SIGNS = np.array([*itertools.product((-1.0, 1.0), repeat=3)])  # corners of a box
 
 
-class _Plane(RigidBody):
+class _PlanarBody(RigidBody):
     """A body over the ground y = 0; q = (x, y, theta) of its centre of mass."""
 
     def _make(
@@ -40,7 +40,7 @@ class _Plane(RigidBody):
         self._set(points, mass, positive("inertia", inertia)[None], shape, rim, (0.0, 1.0))
 
 
-class Block(_Plane):
+class Block(_PlanarBody):
     """A rigid rectangle over the ground; q = (x, y, theta) of its centre, counter-clockwise.
 
     Equation: `f_{1,2} = y - (l/2) cos(theta) +/- (L/2) sin(theta)`, width L, height l; contact 1
@@ -98,7 +98,7 @@ class Block(_Plane):
         return jnp.min(self.placed(q).points[0, 2:, 1])
 
 
-class Polygon(_Plane):
+class Polygon(_PlanarBody):
     """A convex polygon over the ground; q = (x, y, theta) of its centre of mass.
 
     Equation: `f_i = y + (R(theta) c_i)_y`, c_i corner i from the centre of mass; tangents are the
@@ -146,7 +146,7 @@ class Polygon(_Plane):
         self._make(points, mass, inertia, Shape(order, len(order), True, False))
 
 
-class Disc(_Plane):
+class Disc(_PlanarBody):
     """A disc over the ground; q = (x, y, theta) of its centre of mass.
 
     Equation: `f = y + (R(theta) c)_y - r`, c the middle of the disc from the centre of mass; its
@@ -175,7 +175,7 @@ class Disc(_Plane):
         self._make(middle[None], mass, inertia, shape, radius)
 
 
-class Dimer(_Plane):
+class Dimer(_PlanarBody):
     """Two equal spheres on the ends of a rod, in a vertical plane; q = (x, y, theta).
 
     Equation: `f_{1,2} = y +/- (L/2 + R) sin(theta) - R`, contact 1 the right sphere. The lowest
@@ -210,7 +210,7 @@ class Dimer(_Plane):
 # --------------------------------------------------------------------------------- in space
 
 
-class _Space(RigidBody):
+class _SpatialBody(RigidBody):
     """A body over a plane through the origin, q = (x, y, z, e_0, e_1, e_2, e_3); see `RigidBodies`.
 
     Contact i slides along two directions in the plane, the first one that of x.
@@ -238,7 +238,7 @@ class _Space(RigidBody):
         self._set(points, mass, _moments_in_space(inertia), shape, rim, n)
 
 
-class Box(_Space):
+class Box(_SpatialBody):
     """A box in space over a plane; one contact per corner, eight contacts.
 
     Equation: c_i = middle + (+/- a/2, +/- b/2, +/- c/2), contacts in the order (-,-,-), (-,-,+),
@@ -300,7 +300,7 @@ class Box(_Space):
         return self.points[0, -1] - self.points[0, 0] + 2 * self.rims[0]
 
 
-class Sphere(_Space):
+class Sphere(_SpatialBody):
     """A sphere in space over a plane; one contact; q and velocities as of `Box`.
 
     Equation: `f = n . (x + R(e) c) - r`, c its middle from the centre of mass.
@@ -339,7 +339,7 @@ class Sphere(_Space):
         self._make(middle[None], mass, inertia, homogeneous, centre, normal, shape, radius)
 
 
-class SpatialDimer(_Space):
+class SpatialDimer(_SpatialBody):
     """Two equal spheres on the ends of a rod in space over a plane; q and velocities as of `Box`.
 
     Equation: the rod lies along the first axis of the body, `c_{1,2} = (+/- (L/2 + R), 0, 0)`;
@@ -380,7 +380,7 @@ class SpatialDimer(_Space):
         self._make(points, mass, inertia, jnp.ones(3), None, normal, shape, radius)
 
 
-class Coin(_Space):
+class Coin(_SpatialBody):
     """A coin, or wheel, in space over a plane; its axis is the third one of the body.
 
     Equation: with `u = R^T n` and `s = |(u_1, u_2)|` each of its two rims, at -h/2 and h/2 on the
