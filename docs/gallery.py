@@ -296,7 +296,7 @@ def force_chains():
     radii = np.append(np.where(small, 0.9 * radius, radius), radius)
     discs = ji.Bodies([ji.Disc(r) for r in radii])
     q = discs.at(at)
-    packing = discs.touching(q)
+    packing = discs.closed_scene(q)
     velocity = np.zeros(packing.size)
     velocity[-2] = -1.0
     law = ji.LZB(0.9, method="implicit")

@@ -25,7 +25,7 @@ GENERATED = DOCS / "generated"
 
 API = {  # a page, and the modules whose public names it holds: the longest match decides
     "Impacts": ("impacts", "audits", "laws.histories", "status"),
-    "Scenes": ("scene", "bodies.given.scene_from_gaps", "bodies.mujoco_scene", "contact"),
+    "Scenes": ("scene", "bodies.functions.scene_from_gaps", "bodies.mujoco_scene", "contact"),
     "Bodies": ("bodies",),
     "Laws": ("law", "registry", "laws"),
     "Contact forces": ("laws.forces", "laws.calibration", "laws.materials"),

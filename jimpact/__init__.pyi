@@ -4,17 +4,20 @@ from . import data as data, plot as plot, theory as theory
 from .audits import audit as audit, summary as summary
 from .bodies.assembly import Bodies as Bodies
 from .bodies.base import Body as Body
-from .bodies.blocks import Block as Block
-from .bodies.dimers import (
-    Dimer as Dimer,
-    SpatialDimer as SpatialDimer,
-)
-from .bodies.given import scene_from_gaps as scene_from_gaps
+from .bodies.functions import scene_from_gaps as scene_from_gaps
 from .bodies.mujoco_scene import from_mujoco as from_mujoco
 from .bodies.particles import Column as Column, Corner as Corner
 from .bodies.pendulums import PendulumCradle as PendulumCradle
-from .bodies.polygons import Disc as Disc, Polygon as Polygon
-from .bodies.solids import Box as Box, Coin as Coin, Sphere as Sphere
+from .bodies.shapes import (
+    Block as Block,
+    Box as Box,
+    Coin as Coin,
+    Dimer as Dimer,
+    Disc as Disc,
+    Polygon as Polygon,
+    SpatialDimer as SpatialDimer,
+    Sphere as Sphere,
+)
 from .cli.study_motion import read_study as read_study
 from .contact import (
     Contact as Contact,

@@ -45,7 +45,7 @@ ji.plot.system(balls, v, "Three equal balls")
 
 # %%
 law = ji.LZB(0.9, [1.0, 1.0], 1.5)
-settings = {"dop853": [1e-4, 1e-6, 1e-8], "rk4": [0.1, 0.03, 0.01]}
+settings = {"time": [1e-4, 1e-6, 1e-8], "rk4": [0.1, 0.03, 0.01]}
 laws = {"moreau": ji.Moreau(0.9), "binary": ji.Binary(0.9)}
 options = {"batch": 64, "repeats": 3, "gradients": False, "durations": False}
 chart = ji.work_precision(balls, v, law, list(settings), settings, laws, **options)
@@ -65,7 +65,7 @@ axes = {
     "restitution": [0.0, 1e-3, 0.05, 0.3, 0.9, 1.0],
     "stiffness_ratio": np.logspace(-6, 6, 7),
 }
-stable = ji.stability_map(["default", "rk4"], axes, max_steps=3000)
+stable = ji.stability_map(["time", "rk4"], axes, max_steps=3000)
 print(stable)
 
 # %%

@@ -5,7 +5,6 @@ import json
 from pathlib import Path
 
 import jimpact as ji
-from jimpact.bodies.rigid import Solid
 from jimpact.fits.fitting import LOSSES
 from jimpact.fits.solve import DEFAULT_STEPS
 from jimpact.methods.contenders import CONTENDERS
@@ -18,11 +17,10 @@ def bodies():
     """Whether each argument must be given, by name, of each public body."""
     public = {name: getattr(ji, name) for name in ji.__all__}
     kinds = {k: x for k, x in public.items() if isinstance(x, type) and issubclass(x, ji.Body)}
-    bodies = kinds | {"Bodies": ji.Bodies}
     arguments = {
         name: list(inspect.signature(kind).parameters.values())
-        for name, kind in bodies.items()
-        if kind not in (ji.Body, Solid)  # of which the others are made
+        for name, kind in kinds.items()
+        if kind is not ji.Body  # of which the others are made
     }
     return {k: {x.name: x.default is x.empty for x in rows} for k, rows in arguments.items()}
 

@@ -22,4 +22,4 @@ def force_chains():
     discs = piles.discs(1.0, [1.0] * 3, planes=[[0.0, 1.0, 0.0]])
     q = discs.at([[0.0, 1.0], [2.0, 1.0], [1.0, 1.0 + np.sqrt(3)]])
     impulse = [0.0, 2.0, 1.0, np.sqrt(3), np.sqrt(0.75)]  # 1-2, 1-3, 2-3, the floor
-    return ji.plot.force_chains(discs, q, discs.touching(q), impulse, "three discs")
+    return ji.plot.force_chains(discs, q, discs.closed_scene(q), impulse, "three discs")

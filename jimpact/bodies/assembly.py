@@ -1,95 +1,457 @@
 """Bodies on planes and on each other: few with all their contacts, many by a grid."""
 
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
-from jimpact.bodies.assemblies import PlanarBodies
-from jimpact.bodies.base import Body
-from jimpact.bodies.piles import Pile
-from jimpact.bodies.polygons import Cornered, Disc
-from jimpact.bodies.rigid import Solid
-from jimpact.bodies.solids import Sphere
-from jimpact.bodies.spatial_bodies import SpatialBodies
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact._checks import (
+    as_float_array,
+    as_whole,
+    check_choice,
+    check_concrete,
+    check_shape,
+    check_values,
+    is_traced,
+)
+from jimpact.bodies import grid
+from jimpact.bodies.base import as_planes, lengths, number
+from jimpact.bodies.closed_pairs import ActivePairs, listed_pairs
+from jimpact.bodies.distances import (
+    changed_places,
+    disc_on_polygon,
+    facing_sides,
+    from_box,
+    margin_of_places,
+    polygon_on_polygon,
+    round_on_round,
+)
+from jimpact.bodies.rigid import (
+    ContactPoints,
+    Placed,
+    RigidBodies,
+    RigidBody,
+    times,
+    unit_quaternion,
+)
+from jimpact.compiling import full_precision, precise_jit
+from jimpact.scene import Scene
 
 # Bodies above which a grid finds the closed contacts, unless their `pairs` are named. Ten times
 # more, and time stepping looks at thousands of pairs in each step.
 FEW = 10
 
+# Contacts per body that may be closed by default: equal discs have 3, equal spheres 6, and walls;
+# polygons two for each. Ten times more takes ten times the memory.
+ROOM = {"discs": 4, "polygons": 6, "spheres": 7}
 
-def Bodies(
-    bodies: Sequence[Body],
-    planes: Any = None,
-    pairs: Sequence[Any] | None = None,
-    fixed: Sequence[Body] = (),
-    places: Any = (),
-    room: int | None = None,
-) -> PlanarBodies | SpatialBodies | Pile:
+# Penetration over the least radius with which motions may start: each impact of a step leaves up
+# to h v / 2. Ten times more would start with bodies in each other.
+_OVERLAP = 0.1
+
+# Gap over the least radius up to which bodies touch but for rounding. Ten times more closes gaps of
+# 10 nm of bodies of a metre.
+_TOUCHING = 1e-9
+
+
+class Bodies(RigidBodies):
     """Bodies on planes and on each other, in the plane or in space; q holds one after the other.
 
     Equation: on a plane `n . x >= c` each contact point of a body has
     `f = n . (x + R c_i) - r - c`,
     round bodies `f = |x_1 - x_2| - r_1 - r_2`; a disc or sphere has its distance from a polygon or
-    box; two polygons have the two contacts of the sides that face each other. Few bodies have all
-    their contacts (`jimpact.bodies.assemblies`, `.spatial_bodies`: q as of each body). Many discs,
-    polygons and spheres are a pile (`.piles`): a grid finds closed contacts in
-    `simulate(method="time_stepping")`, `touching(q)` is the scene of those at q, and spheres keep
-    three turns [rad] in the place of a quaternion. `at(centres)` gives q, not turned.
+    box. Two polygons have the two contacts of two sides that face each other: at each end of the
+    first side, the distance of its corner from the second side, or, if that is less, that of the
+    second side's end from the first side; the least of both is the distance of the polygons.
+    Normals are unit vectors n from the second body to the first one, in the plane tangents are
+    (n_y, -n_x); both as rates of q. Contacts, in order: for each plane and body, its contact
+    points; then pairs of round bodies; round ones on those with faces; polygons, two contacts a
+    pair. `between` names their bodies.
+
+    Few bodies have all their contacts. Polygons choose their sides as they move, so that they may
+    roll over their corners, slide off each other and meet again anywhere. Of two in touch, one with
+    an odd number of sides, one with an even number, the normal from the first to the second must
+    not pass 2 rad (`valid`). In the plane gaps of discs hold while their centres are outside other
+    bodies; inside a box `f < 0` is the depth below its nearest face. Bodies that are no pair do not
+    feel each other.
+
+    Many discs, polygons and spheres are a pile: a grid finds closed contacts in
+    `simulate(method="time_stepping")`, `closed_scene(q)` is the scene of those at q, and spheres
+    keep three turns [rad] in the place of a quaternion, in the axes of space. `at(positions)` gives
+    q, not turned.
 
     Args:
         bodies: in the plane `Polygon`, `Block`, `Disc`, on planes only `Dimer`; in space `Box`,
-            `Sphere` (their own `normal` does not count).
+            `Sphere`, on planes only `SpatialDimer` and a `Coin` with corners (their own `normal`
+            does not count).
         planes: rows (n_x, n_y, c), in space (n_x, n_y, n_z, c) [m]; n is made a unit vector. In the
             plane also an angle a [rad], or (a, c): 0 is level, pi/2 a wall on the right. None: the
             ground; (): none.
-        pairs: (i, j) of bodies, counted from 0, in contact with each other; None: all but two
-            boxes.
-        fixed: in space, `Box`, `Sphere` that do not move: finite walls, tables; counted after the
-            others.
-        places: (f, 7) where the fixed ones are.
+        pairs: (i, j) of bodies, counted from 0, the fixed ones after the others, in contact with
+            each other; None: all of which one moves. Two boxes have no gap function: `from_mujoco`
+            finds their contacts at one instant, or at each time step.
+        fixed: bodies that do not move, or only with the base: finite walls, tables.
+        places: q of each fixed one, a row each.
         room: of many bodies, the largest number of closed contacts at once; given, bodies are many
             whatever their number. None: 4 a disc, 6 a polygon, 7 a sphere. Without it there are
             many from 11 on, unless `pairs` or `fixed` are given.
 
-    Returns:
-        A `Body`; `between` names the bodies of its contacts where they are few.
-
     Raises:
-        ValueError: no bodies or contacts, planes that are not finite or have no normal, pairs that
-            do not exist or of two boxes, `room` besides pairs or fixed bodies.
+        ValueError: no bodies or contacts, planes or places that are not finite, planes without a
+            normal, pairs that do not exist or of two boxes, `room` besides pairs or fixed bodies.
         TypeError: other bodies, or some in the plane and some in space.
 
-    Source: Ericson, Real-Time Collision Detection (2005), ch. 5 and 7.
+    Source: Ericson, Real-Time Collision Detection (2005), ch. 5 (nearest points, separating axes)
+    and 7 (grids).
 
     >>> import jimpact as ji
     >>> slope = ji.Bodies([ji.Block(0.2, 0.1)], planes=[0.3])
     >>> slope.scene(slope.touching()).closed.tolist()
     [True, True, False, False]
+    >>> stack = ji.Bodies([ji.Block(1.0, 1.0), ji.Block(1.0, 1.0)])
+    >>> stack.scene([0.0, 0.5, 0.0, 0.3, 1.5, 0.0]).gaps[-2:].tolist()
+    [0.0, 0.0]
+    >>> wall = ji.Box([0.1, 2.0, 1.0])
+    >>> ball = ji.Bodies([ji.Sphere(0.1)], fixed=[wall], places=[wall.at([0.55, 0.0, 0.5])])
+    >>> q = ball.at([[0.2, 0.0, 0.3]])
+    >>> [round(float(f), 6) for f in ball.scene(q).gaps]  # over the ground, to the wall
+    [0.2, 0.2]
     >>> pile = ji.Bodies([ji.Disc(0.1)] * 20, planes=[0.0, [1.0, 0.0, -0.5]])
-    >>> pile.at([[0.0, 0.1 + 0.2 * i] for i in range(20)]).shape
-    (60,)
+    >>> q = pile.at([[0.0, 0.1 + 0.2 * i] for i in range(20)])
+    >>> pile.closed_scene(q).contacts
+    20
     """
-    bodies = tuple(bodies)
-    if not bodies:
-        raise ValueError("Argument `bodies` must hold one or more, but is empty.")
-    named = pairs is not None or len(fixed) > 0
-    if room is not None and named:
-        raise ValueError("Argument `room` must be left out with `pairs` or `fixed`.")
-    many = room is not None or (len(bodies) > FEW and not named)
-    dimension = _pile_in(bodies) if many else 0
-    if dimension:
-        return Pile(bodies, dimension, planes, room)
-    if room is not None:
-        names = ", ".join(sorted({type(body).__name__ for body in bodies}))
-        raise TypeError(f"Argument `bodies` must be discs, polygons or spheres, not {names}.")
-    if isinstance(bodies[0], Solid):
-        return SpatialBodies(bodies, planes, pairs, fixed, places)  # type: ignore[arg-type]
-    if len(fixed):
-        raise ValueError("Argument `fixed` must be left out in the plane.")
-    return PlanarBodies(bodies, planes, pairs)  # type: ignore[arg-type]
+
+    places: jax.Array  # (f, ..) where the fixed bodies are
+    pairs: tuple[tuple[int, int], ...] | None = eqx.field(static=True)  # None: by the grid
+    room: int = eqx.field(static=True)  # 0 of few
+    crowd: int = eqx.field(static=True)  # see `near_pairs`; 0: every pair is looked at
+
+    def __init__(
+        self,
+        bodies: Sequence[RigidBody],
+        planes: Any = None,
+        pairs: Sequence[Any] | None = None,
+        fixed: Sequence[RigidBody] = (),
+        places: Any = (),
+        room: int | None = None,
+    ):
+        for name, some in (("bodies", bodies), ("fixed", fixed)):
+            if not np.iterable(some):
+                raise TypeError(f"Argument `{name}` must be a list of bodies, but is {some!r}.")
+        bodies, fixed = tuple(bodies), tuple(fixed)
+        every = (*bodies, *fixed)
+        if not bodies:
+            raise ValueError("Argument `bodies` must hold one or more, but is empty.")
+        _check_kinds(bodies, fixed)
+        d = bodies[0].dimension
+        named = pairs is not None or len(fixed) > 0
+        if room is not None and named:
+            raise ValueError("Argument `room` must be left out with `pairs` or `fixed`.")
+        self.shapes = tuple(body.shapes[0] for body in every)
+        many = (room is not None or len(bodies) > FEW) and not named and self._may_be_many(d)
+        if room is not None and not many:
+            names = ", ".join(sorted({type(body).__name__ for body in bodies}))
+            raise TypeError(f"Argument `bodies` must be discs, polygons or spheres, not {names}.")
+        self.masses = _stacked([body.masses[0] for body in bodies])
+        self.inertias = _stacked(_alike([body.inertias[0] for body in bodies]))
+        self.points = _stacked(_padded(every))
+        self.rims = _stacked([body.rims[0] for body in every])
+        self.planes = as_planes(planes, d).astype(self.points.dtype)
+        self.room, self.pairs, self.crowd = 0, None, 0
+        self.places = as_float_array("places", places).reshape(-1, 3 if d == 2 else 7)
+        if many:
+            kinds = "spheres" if d == 3 else "discs" if self.points.shape[1] == 1 else "polygons"
+            self.room = ROOM[kinds] * self.count if room is None else as_whole("room", room, 1)
+            self.crowd = grid.crowd_of_cells(self)
+            return
+        size = (len(fixed), self.places.shape[1])
+        check_shape("places", self.places, size, "one for each of `fixed`")
+        check_values("places", self.places)
+        if self.dimension == 3:
+            for place in self.places:
+                unit_quaternion(place[3:])
+        self.pairs = _as_pairs(every, self.shapes, len(bodies), d, pairs)
+        if not len(self.pairs_in_contact()):
+            raise ValueError("Arguments `bodies`, `planes` and `pairs` must give a contact.")
+
+    def _may_be_many(self, d: int) -> bool:
+        """Whether the grid knows their contacts."""
+        return all(s.centred if d == 3 else s.faces or s.is_round for s in self.shapes)
+
+    @property
+    def quaternions(self) -> bool:
+        """In space, unless they are many."""
+        return self.dimension == 3 and not self.room
+
+    # ---- all contacts
+
+    @property
+    def _kinds(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Pairs (g, 2) of round bodies; of a round one and one with faces; of two with faces."""
+        if self.pairs is None:
+            each = np.stack(np.triu_indices(self.count, 1), axis=1).astype(np.int32)
+        else:
+            each = np.array(self.pairs, np.int32).reshape(-1, 2)
+        round_bodies = np.array([shape.is_round for shape in self.shapes])
+        if round_bodies.all():  # of thousands there are millions of pairs
+            return each, each[:0], each[:0]
+        is_round = round_bodies[each]
+        mixed, swap = each[is_round[:, 0] != is_round[:, 1]], is_round[is_round.sum(axis=1) == 1]
+        mixed = np.where(swap[:, :1], mixed, mixed[:, ::-1])
+        return each[is_round.all(axis=1)], mixed, each[~is_round.any(axis=1)]
+
+    def pairs_in_contact(self) -> np.ndarray:
+        """Bodies i and j (m, 2) of each contact; j of a plane is -1."""
+        discs, mixed, faces = self._kinds
+        return np.concatenate(
+            [super().pairs_in_contact(), discs, mixed, np.repeat(faces, 2, axis=0)]
+        )
+
+    def all_bodies(self, q: jax.Array) -> jax.Array:
+        """Coordinates (b, ..) of each body, the fixed ones last."""
+        if not len(self.places):
+            return self.of_bodies(q)
+        return jnp.concatenate([self.of_bodies(q), self.places.astype(q.dtype)])
+
+    def contacts(self, q: jax.Array) -> ContactPoints:
+        """Gaps, points and normals at q; `between` says of which bodies."""
+        placed, rims = self.placed(q), self.rims
+        points, parts = placed.points, [self.on_planes(placed.points)]
+        discs, mixed, faces = self._kinds
+        if len(discs):
+            i, j = discs.T
+            parts.append(round_on_round(points[i, 0], points[j, 0], rims[i], rims[j]))
+        if len(mixed):
+            parts.append(self._round_on_faces(placed, *mixed.T))
+        if len(faces):
+            i, j = faces.T
+            a, b = points[i], points[j]
+            facing = facing_sides(a, b)
+            counts, angles = self._counts, self.all_bodies(q)[:, 2]
+            at, sizes = (angles[i], angles[j]), (counts[i], counts[j])
+            both = polygon_on_polygon(a, b, facing, changed_places((a, b), at, sizes, facing))
+            parts.append(ContactPoints(*(x.reshape(-1, *x.shape[2:]) for x in both)))
+        return ContactPoints(*(jnp.concatenate(rows) for rows in zip(*parts)))
+
+    @property
+    def _counts(self) -> np.ndarray:
+        """Points (b,) of each body."""
+        return np.array([shape.size for shape in self.shapes])
+
+    def _round_on_faces(self, placed: Placed, i: np.ndarray, j: np.ndarray) -> ContactPoints:
+        """Contacts of discs i with polygons j, of spheres i with boxes j."""
+        points, turns, rims = placed.points, placed.turns, self.rims
+        if self.dimension == 2:
+            return disc_on_polygon(points[i, 0], rims[i], points[j])
+        middle = 0.5 * (points[j, 0] + points[j, -1])
+        half = 0.5 * (self.points[j, -1] - self.points[j, 0])
+        from_middle = times(jnp.swapaxes(turns[j], 1, 2), points[i, 0] - middle)
+        distance, n = from_box(from_middle, half)
+        normal, away = times(turns[j], n), distance - rims[j]
+        return ContactPoints(away - rims[i], points[i, 0] - away[:, None] * normal, normal)
+
+    @full_precision
+    def valid(self, q: jax.Array) -> jax.Array:
+        """The least of the margins () [m], see the class; of many bodies it is not looked at."""
+        margin = super().valid(q)
+        if self.room or self.dimension == 3:
+            return margin
+        placed, margins = self.placed(q), [margin[None]]
+        points = placed.points
+        discs, mixed, faces = self._kinds
+        if len(discs):
+            margins.append(lengths(points[discs[:, 0], 0] - points[discs[:, 1], 0])[0])
+        if len(mixed):
+            margins.append(self._round_on_faces(placed, *mixed.T).gap + self.rims[mixed[:, 0]])
+        odd = self._counts[faces].sum(axis=1) % 2 == 1
+        if odd.any():
+            a, b = points[faces[odd, 0]], points[faces[odd, 1]]
+            margins.append(margin_of_places((a, b), facing_sides(a, b)))
+        return jnp.min(jnp.concatenate(margins))
+
+    @property
+    def range_in_words(self) -> str:  # type: ignore[override]
+        """What `valid` asks for."""
+        if self.dimension == 3:
+            return super().range_in_words
+        return "see `Bodies`: no centre of a disc in another body"
+
+    def touching(
+        self, angle: Any = 0.0, along: Any = 0.0, body: int = 0, plane: int = 0
+    ) -> jax.Array:
+        """(x, y, theta) of one body on one plane, turned by `angle` from it, `along` it [m]."""
+        if self.dimension == 3 or not len(self.planes):
+            raise TypeError(
+                "Bodies in space or without planes have no `touching`: give `q` yourself, see `at`."
+            )
+        check_choice("body", body, range(self.count))
+        check_choice("plane", plane, range(len(self.planes)))
+        turn, distance = number("angle", angle), number("along", along)
+        (n_x, n_y, offset) = self.planes[plane]
+        low = jnp.sin(turn) * self.points[body, :, 0] + jnp.cos(turn) * self.points[body, :, 1]
+        up = offset + self.rims[body] - jnp.min(low)
+        place = [n_y * distance + n_x * up, n_y * up - n_x * distance]
+        return jnp.stack([*place, turn + jnp.arctan2(-n_x, n_y)])
+
+    # ---- many bodies: closed contacts only
+
+    @property
+    def pair_count(self) -> int | None:
+        """The contacts of every pair (i, j), in both orders, and every corner with every plane."""
+        return grid.slots(self) * self.count * grid.stride(self) if self.room else None
+
+    @property
+    def overlap(self) -> Any:
+        """Penetration () [m] with which a motion may start."""
+        return _OVERLAP * grid.least_radius(self) if self.room else 0.0
+
+    def active_pairs(self, q: jax.Array, later: jax.Array, below: jax.Array) -> ActivePairs:
+        """The contacts, at q, with gaps up to `below` at q or `later`."""
+        return grid.active_pairs(self, q, later, below)
+
+    def least_gap(self, q: jax.Array) -> jax.Array:
+        """The least gap () [m]; of many, of bodies that are near each other if there are any."""
+        return grid.least_gap(self, q) if self.room else super().least_gap(q)
+
+    def closed_scene(self, q: Any, below: Any = None) -> Scene:
+        """The contacts of many bodies at q that are closed, as a scene without friction.
+
+        Only normals of two bodies each are stored, and W has few entries in a row: an impact of
+        `Moreau`, `Poisson`, `LZB` or `Compliant` costs what the contacts cost. (`scene` holds all
+        pairs and every gap.) Which bodies touch is compiled in: every packing compiles anew.
+        `TimeStepping.contacts` has friction.
+
+        Args:
+            q: (n,), see `at`; not traced.
+            below: gap >= 0 [m] up to which contacts count as closed; None: 1e-9 of the least
+                radius.
+
+        Returns:
+            `Scene` of n velocities; contacts of bodies i < j first, then those with planes.
+
+        Raises:
+            ValueError: nothing touches, more than `room` do, a bad `below`, two bodies in one
+                place. A warning says where bodies overlap by more than a tenth of the least radius.
+            TypeError: few bodies, which have `scene`.
+        """
+        if not self.room:
+            raise TypeError("Few bodies have no `closed_scene`: take `scene`, or give `room`.")
+        q = as_float_array("q", q)
+        check_concrete("q", q)
+        check_shape("q", q, self.mass.shape, "one number per velocity")
+        check_values("q", q)
+        below = _TOUCHING * float(grid.least_radius(self)) if below is None else below
+        check_values("below", below, low=0.0)
+        pairs, least = jax.device_get(_active_pairs(self, q, jnp.asarray(below, q.dtype)))
+        if least < -float(self.overlap):
+            warnings.warn(
+                f"Argument `q` holds bodies that overlap by {-least:.3g} m; normals mean little "
+                "there.",
+                stacklevel=2,
+            )
+        if not pairs.filled:
+            raise ValueError(
+                f"Argument `q` must hold bodies that touch, but no gap is up to {below:g}."
+            )
+        if pairs.overflows:
+            raise ValueError(
+                f"Argument `q` must hold at most {self.room} contacts (the argument `room` of "
+                "`Bodies`), but holds more."
+            )
+        _, _, directions, scene = listed_pairs(pairs, self.mass)
+        if not directions[:, 0].any(axis=(1, 2)).all():
+            raise ValueError("Argument `q` must hold bodies with different centres.")
+        return scene
 
 
-def _pile_in(bodies: tuple[Body, ...]) -> int:
-    """2 or 3: these bodies may be a pile in the plane or in space; 0: they may not."""
-    if all(isinstance(body, Sphere) and body.is_round for body in bodies):
-        return 3
-    return 2 if all(isinstance(body, Cornered | Disc) for body in bodies) else 0
+@precise_jit
+def _active_pairs(bodies: Bodies, q: jax.Array, below: jax.Array) -> tuple[ActivePairs, jax.Array]:
+    """The contacts that are closed at q, and the least gap."""
+    return bodies.active_pairs(q, q, below), bodies.least_gap(q)
+
+
+# ------------------------------------------------------------------------------ construction
+
+
+def _stacked(rows: Sequence[jax.Array]) -> jax.Array:
+    """Arrays of one shape; on the host where they are known: JAX takes long to stack thousands."""
+    return jnp.stack(rows) if is_traced(rows) else jnp.asarray(np.array(rows))
+
+
+def _alike(inertias: Sequence[jax.Array]) -> list[jax.Array]:
+    """Moments of inertia, all of them matrices if one is."""
+    if len({inertia.ndim for inertia in inertias}) == 1:
+        return list(inertias)
+    return [jnp.diag(x) if x.ndim == 1 else x for x in inertias]
+
+
+def _padded(bodies: Sequence[RigidBody]) -> list[Any]:
+    """Points (P, d) of each body, the last one repeated."""
+    most = max(body.points.shape[1] for body in bodies)
+    pad = jnp if is_traced([body.points for body in bodies]) else np
+    return [
+        pad.pad(body.points[0], ((0, most - body.points.shape[1]), (0, 0)), mode="edge")
+        for body in bodies
+    ]
+
+
+def _check_kinds(bodies: tuple[Any, ...], fixed: tuple[Any, ...]) -> None:
+    """Raise for what is no body with contact points, or of another dimension than the first one."""
+    for name, some in (("bodies", bodies), ("fixed", fixed)):
+        for body in some:
+            kind = type(body).__name__
+            if not (isinstance(body, RigidBody) and body.dimension == bodies[0].dimension):
+                raise TypeError(
+                    f"Argument `{name}` must hold planar bodies, or bodies in space only, but "
+                    f"holds a {kind}."
+                )
+            if not body.points.shape[1]:
+                raise TypeError(
+                    f"Argument `{name}` must hold bodies with contact points, but holds a {kind} "
+                    "with round rims: give it `corners`."
+                )
+
+
+def _as_pairs(
+    every: tuple[RigidBody, ...],
+    shapes: Sequence[Any],
+    moving: int,
+    d: int,
+    pairs: Sequence[Any] | None,
+) -> tuple[tuple[int, int], ...]:
+    """Pairs of bodies that have a gap function, of which the first `moving` ones move."""
+    count = len(every)
+    if pairs is None:
+        ready = [i for i, shape in enumerate(shapes) if shape.faces or shape.is_round]
+        pairs = [(i, j) for i in ready for j in ready if i < j and i < moving]
+    for pair in pairs:
+        if not (
+            np.shape(pair) == (2,)
+            and all(hasattr(i, "__index__") for i in pair)
+            and 0 <= min(pair) < moving
+            and max(pair) < count
+            and pair[0] != pair[1]
+        ):
+            fixed = f", one of which moves (0 to {moving - 1})" if count > moving else ""
+            raise ValueError(
+                f"Argument `pairs` must join different bodies, bodies 0 to {count - 1}{fixed}, but "
+                f"holds {pair!r}."
+            )
+        for i in pair:
+            if not (shapes[i].faces or shapes[i].is_round):
+                raise ValueError(
+                    "Argument `pairs` must join discs, polygons, spheres and boxes, but body "
+                    f"{i} is a {type(every[i]).__name__}."
+                )
+        if d == 3 and all(shapes[i].faces for i in pair):
+            raise ValueError(
+                f"Argument `pairs` must leave out the pair {tuple(pair)!r}: two boxes have no gap "
+                "function. Contacts of boxes come from `jimpact.from_mujoco`, in motion at each "
+                "step (docs/mujoco.md)."
+            )
+    return tuple((int(i), int(j)) for i, j in pairs)

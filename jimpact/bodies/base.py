@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_shape, check_values, is_traced
+from jimpact._checks import as_float_array, as_numbers, check_shape, check_values, is_traced
 from jimpact.bodies.closed_pairs import ActivePairs
 from jimpact.compiling import full_precision, quick_jit
 from jimpact.scene import Scene
@@ -339,17 +339,12 @@ class LinearPotential(eqx.Module):
 
 def positive(name: str, value: Any, low_allowed: bool = False) -> jax.Array:
     """A scalar > 0, or >= 0 where `low_allowed`."""
-    scalar = number(name, value)
-    check_values(name, scalar, low=0.0, open_low=not low_allowed)
-    return scalar
+    return as_numbers(name, value, (), "one number", low=0.0, open_low=not low_allowed)
 
 
 def number(name: str, value: Any) -> jax.Array:
     """A finite scalar."""
-    scalar = as_float_array(name, value)
-    check_shape(name, scalar, (), "one number")
-    check_values(name, scalar)
-    return scalar
+    return as_numbers(name, value, (), "one number")
 
 
 def positives(
@@ -359,11 +354,8 @@ def positives(
     numbers = as_float_array(name, value)
     if count is not None and numbers.ndim == 0:
         numbers = jnp.full(count, numbers)
-    if numbers.ndim != 1 or (count is not None and numbers.shape[0] != count):
-        size = "n" if count is None else count
-        raise ValueError(f"Argument `{name}` must have shape ({size},), but has {numbers.shape}.")
-    check_values(name, numbers, low=0.0, open_low=not low_allowed)
-    return numbers
+    shape = (numbers.size if count is None else count,)
+    return as_numbers(name, numbers, shape, "one of each", low=0.0, open_low=not low_allowed)
 
 
 def as_planes(planes: Any, dimension: int) -> jax.Array:
@@ -374,6 +366,8 @@ def as_planes(planes: Any, dimension: int) -> jax.Array:
     d = dimension
     if planes is None:
         return jnp.eye(1, d + 1, d - 1)
+    if not np.iterable(planes):
+        raise TypeError(f"Argument `planes` must be a list, one entry a plane, not {planes!r}.")
     rows = []
     for plane in planes:
         row = as_float_array("planes", plane)
@@ -390,23 +384,6 @@ def as_planes(planes: Any, dimension: int) -> jax.Array:
     return jnp.stack(rows) if rows else jnp.zeros((0, d + 1))
 
 
-def floors_of(planes: Any) -> list[tuple[float, float]]:
-    """(angle, offset) of planes (k, 3), for pictures."""
-    return [(float(np.arctan2(-x, y)), float(c)) for x, y, c in np.asarray(planes)]
-
-
-def turned(points: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Points (k, 2) of a planar body, in its own frame, at q = (x, y, theta)."""
-    c, s = np.cos(q[2]), np.sin(q[2])
-    return q[:2] + points @ np.array([[c, s], [-s, c]])
-
-
-def wheel(radius: Any, q: np.ndarray, middle: Any = (0.0, 0.0)) -> np.ndarray:
-    """A circle about `middle`, with the radius that shows how far it has turned."""
-    spoke = np.concatenate([[[0.0, 0.0]], CIRCLE])
-    return turned(float(radius) * spoke + np.asarray(middle), q)
-
-
 def lengths(vectors: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Lengths (g,) and unit vectors of vectors (g, d); one of length 0 has no direction."""
     square = jnp.sum(vectors**2, axis=1)
@@ -417,15 +394,6 @@ def lengths(vectors: jax.Array) -> tuple[jax.Array, jax.Array]:
 def dot(a: jax.Array, b: jax.Array) -> jax.Array:
     """Scalar products (..)."""
     return jnp.sum(a * b, axis=-1)
-
-
-def inertia_of(inertia: Any, homogeneous: Any, centre: Any) -> Any:
-    """The argument `inertia`, or that of a homogeneous body, whose centre of mass is known."""
-    if inertia is not None:
-        return inertia
-    if centre is not None:
-        raise ValueError("Argument `inertia` must be given with `centre`.")
-    return homogeneous
 
 
 _AZIMUTH, _ELEVATION = np.deg2rad(30.0), np.deg2rad(20.0)  # of the view of bodies in space

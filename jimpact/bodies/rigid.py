@@ -1,25 +1,39 @@
-"""One rigid body over a plane: what bodies in the plane and in space have in common."""
+"""Rigid bodies in the plane and in space: where their points are, and how fast these move."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_shape, check_values, is_traced
-from jimpact.bodies.base import LinearPotential, inertia_of, number, positive, projected
-from jimpact.bodies.contacts import CROSS, Assembly, ContactPoints, cross, on_planes, placed
+from jimpact._checks import as_float_array, as_numbers, check_shape, is_traced
+from jimpact.bodies.base import (
+    CIRCLE,
+    PLANAR,
+    Body,
+    LinearPotential,
+    dot,
+    lengths,
+    number,
+    numbered,
+    positive,
+    projected,
+)
 from jimpact.compiling import full_precision
-from jimpact.scene import check_mass
 
 # How far a quaternion may be from length 1. Numbers written with six digits are within; ten times
 # more, and a motion could turn a body by a visible angle before it says so.
 UNIT_WITHIN = 1e-6
-_SLACK = 1e-6  # of a moment of inertia: rounding of the largest one, of a thin plate
 _SERIES = 1e-2  # squares of angles below it go through the series: there the formula is 0/0
 _UPRIGHT = (1.0, 0.0, 0.0, 0.0)  # the quaternion of no rotation
-LEVEL = (0.0, 0.0, 1.0)  # the normal of a level ground
+
+# Tangents in space begin with the direction nearest to this one. No axis: contacts with a normal
+# along it have no first tangent, and normals along axes are frequent.
+_ASIDE = (0.7, -0.6, 0.387)
+
+_CROSS = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(2, 0, 1)  # of j and k, by i
+_EDGES = [0, 1, 3, 2, 0, 4, 5, 1, 5, 7, 3, 7, 6, 2, 6, 4]  # a way along all edges of a box
 
 
 def _quaternion_product() -> np.ndarray:
@@ -27,270 +41,435 @@ def _quaternion_product() -> np.ndarray:
     table = np.zeros((4, 4, 4))
     table[0] = np.diag([1.0, -1.0, -1.0, -1.0])
     table[1:, 0, 1:] = table[1:, 1:, 0] = np.eye(3)
-    table[1:, 1:, 1:] = CROSS
+    table[1:, 1:, 1:] = _CROSS
     return table
 
 
 _QUATERNION_PRODUCT = _quaternion_product()
 
 
-class RigidBody(Assembly):
-    """One rigid body over a plane; contact i is a circle or a sphere about one of its points.
+class ContactPoints(NamedTuple):
+    """Of m contacts: gap [m], where it is [m], and the unit normal from body 2 to body 1."""
 
-    A body of this kind gives `points` (m, d) from its centre of mass and, unless it is 0, `rim`.
-    """
-
-    @property
-    def points(self) -> jax.Array:
-        """c_i (m, d) from the centre of mass [m]."""
-        raise NotImplementedError(f"{type(self).__name__} must define `points`.")
-
-    @property
-    def rim(self) -> Any:
-        """r () of the circles or spheres about them [m]."""
-        return 0.0
-
-    @property
-    def count(self) -> int:
-        """One."""
-        return 1
-
-    @property  # type: ignore[misc]
-    def between(self) -> list[tuple[int, int]]:
-        """Of all contacts: it and the plane."""
-        return [(0, -1)]
-
-    def _on_plane(self, points: jax.Array) -> ContactPoints:
-        """Contacts of its points (m, d), where they are, with the plane."""
-        rim = jnp.broadcast_to(jnp.asarray(self.rim, points.dtype), len(points))
-        return on_planes(jnp.asarray(self.planes, points.dtype), points, rim)
+    gap: jax.Array  # (m,)
+    point: jax.Array  # (m, 2 or 3)
+    normal: jax.Array  # (m, 2 or 3)
 
 
-class FewBodies(Assembly):
-    """Rigid bodies with all their contacts."""
+class Shape(NamedTuple):
+    """What is known of a body when a program is compiled."""
 
-    bodies: eqx.AbstractVar[tuple[Any, ...]]
+    order: tuple[int, ...]  # which of its points make contact with planes, in order
+    size: int  # number of its points
+    faces: bool  # a polygon or a box, which others may touch anywhere
+    centred: bool  # a disc or sphere that looks the same from all sides
 
     @property
-    def count(self) -> int:
-        """Number of bodies that move."""
-        return len(self.bodies)
-
-    @property
-    def mass(self) -> jax.Array:
-        """M (n,), its diagonal, or (n, n)."""
-        each = [body.mass for body in self.bodies]
-        if all(mass.ndim == 1 for mass in each):
-            return jnp.concatenate(each)
-        return jax.scipy.linalg.block_diag(*(jnp.diag(m) if m.ndim == 1 else m for m in each))
-
-    @property
-    def owner(self) -> np.ndarray:
-        """Bodies (p,) of all contact points with planes."""
-        counts = [body.points.shape[0] for body in self.bodies]
-        return np.repeat(np.arange(len(counts)), counts)
-
-    def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
-        """Those of all bodies."""
-        each = zip(self.bodies, np.reshape(q, (self.count, -1)))
-        return [curve for body, x in each for curve in body.outlines(x, point)]
+    def is_round(self) -> bool:
+        """A disc or a sphere."""
+        return self.size == 1
 
 
-class OnGround(RigidBody):
-    """A rigid planar body above the ground y = 0; q = (x, y, theta) of its centre of mass.
+class Placed(NamedTuple):
+    """Bodies where they are."""
 
-    Equation: contact i is a circle of radius r about the point c_i of the body,
-    `f_i = y + (R(theta) c_i)_y - r`, its lowest point slides at the rate of
-    `x + (R(theta) c_i)_x + r theta`. A body of this kind gives `points` (m, 2), `total_mass` [kg],
-    `inertia` [kg m^2] and, unless it is 0, `rim`.
-    """
-
-    total_mass: eqx.AbstractVar[jax.Array]
-    inertia: eqx.AbstractVar[jax.Array]
-
-    @property
-    def mass(self) -> jax.Array:
-        """M = diag(m, m, I)."""
-        return jnp.stack([self.total_mass, self.total_mass, self.inertia])
-
-    @property  # type: ignore[misc]
-    def planes(self) -> np.ndarray:  # type: ignore[override]
-        """The ground y = 0."""
-        return np.eye(1, 3, 1)
-
-    def contacts(self, q: jax.Array) -> ContactPoints:
-        """Those of its points, where they are, with the ground."""
-        return self._on_plane(placed(self.points, q[None]))
-
-    def touching(self, angle: Any = 0.0) -> jax.Array:
-        """q (3,) with x = 0, turned by `angle`, at which its lowest contacts touch the ground."""
-        turn = number("angle", angle)
-        zero = jnp.zeros_like(turn)
-        return jnp.stack([zero, -jnp.min(self.gap_function(jnp.stack([zero, zero, turn]))), turn])
+    turns: jax.Array  # (b, d, d) from the axes of each body to those of space
+    points: jax.Array  # (b, P, d)
 
 
-class Solid(RigidBody):
-    """A rigid body in space over a plane through the origin; q = (x, y, z, e_0, e_1, e_2, e_3).
+class RigidBodies(Body):
+    """Rigid bodies in the plane or in space: points with a rim, mass and inertia of each.
 
-    Equation: x is the centre of mass, e a unit quaternion (scalar first), R(e) turns the body's
-    axes into those of space. Velocities are v = (x', omega), omega in the body's axes:
-    `e' = e (0, omega) / 2`, `M = diag(m, m, m) + I`,
-    `M v' = F - (0, omega x I omega)`. Contact i is
-    a sphere of radius r about the point c_i of the body: `f_i = n . (x + R c_i) - r`, its lowest
-    point slides at `t . (x' + R (omega x d_i))`, `d_i = c_i - r R^T n`, along two directions t,
-    the first one that of x, both in the plane. Turning is exact: `moved` keeps the length of e.
-    A body of this kind gives `points` (m, 3), or `points_toward`, and, unless it is 0, `rim`; it
-    holds `total_mass` [kg], `inertia` (3,) or (3, 3) [kg m^2], the `middle` of its shape from the
-    centre of mass (3,) [m], and the `normal` of the plane (3,).
+    Equation: in the plane q holds (x, y, theta) of each body, x its centre of mass; in space
+    (x, y, z, e_0, e_1, e_2, e_3), e a unit quaternion, scalar first, and velocities are
+    (x', omega), omega in the body's axes: `e' = e (0, omega) / 2`,
+    `M v' = F - (0, omega x I omega)`; `moved` turns exactly and keeps the length of e.
+    At a contact of bodies i and j in the point x, along a direction t,
+    `v_t = t . (x_i' + omega_i x (x - x_i)) - t . (x_j' + omega_j x (x - x_j))`; in the plane
+    tangents are the normal turned to the right, in space two at right angles.
+    Contact points are discs or spheres of radius r, the rim, about the points c of a body; on a
+    plane `n . x >= c_w` they have `f = n . (x + R c) - r - c_w`.
 
     Source: Featherstone, Rigid Body Dynamics Algorithms (2008), ch. 2 and 4.
     """
 
-    range_in_words = "a quaternion of length 1"
+    masses: jax.Array  # (b,) [kg]
+    inertias: jax.Array  # (b, 1) in the plane, in space (b, 3), its diagonal, or (b, 3, 3)
+    # (b, P, d) from the centres of mass, of polygons counter-clockwise, the last one repeated
+    points: jax.Array
+    rims: jax.Array  # (b,) radii about the points
+    planes: jax.Array  # (w, d + 1) unit normal, distance
+    shapes: tuple[Shape, ...] = eqx.field(static=True)
 
-    total_mass: jax.Array
-    inertia: jax.Array  # (3,) its diagonal, or (3, 3)
-    middle: jax.Array  # (3,) of the body's shape, from the centre of mass
-    normal: jax.Array  # (3,)
+    def __repr__(self) -> str:
+        """What it is of, without its arrays."""
+        each = self.points.shape[1]
+        return (
+            f"{type(self).__name__}({self.count} of up to {each} points, {len(self.planes)} planes)"
+        )
 
-    def _weigh(self, mass: Any, inertia: Any, homogeneous: Any, centre: Any, normal: Any) -> None:
-        """Set what all bodies have; `homogeneous` are the moments of inertia over the mass."""
-        self.total_mass = positive("mass", mass)
-        self.middle = -_vector("centre", (0.0,) * 3 if centre is None else centre)
-        if inertia is None:
-            homogeneous = self.total_mass * homogeneous
-        self.inertia = _inertia(inertia_of(inertia, homogeneous, centre))
-        n = _vector("normal", normal)
-        if not is_traced(n) and not float(n[2]) > 0:
-            raise ValueError(
-                f"Argument `normal` must point up (its z > 0), but has value {n.tolist()}."
-            )
-        self.normal = n / jnp.sqrt(jnp.sum(n**2))
-
-    def points_toward(self, down: jax.Array) -> jax.Array:
-        """c_i (m, 3) where `-down` (3,) is the normal of the plane in the body's axes."""
-        return self.points
-
-    @property  # type: ignore[misc]
-    def planes(self) -> jax.Array:  # type: ignore[override]
-        """Its plane, through the origin."""
-        return jnp.append(self.normal, jnp.zeros((), self.normal.dtype))[None]
-
-    @full_precision
-    def contacts(self, q: jax.Array) -> ContactPoints:
-        """Those of its points, where they are, with the plane."""
-        turn = rotation(q)
-        return self._on_plane(q[None, :3] + self.points_toward(-self.normal @ turn) @ turn.T)
-
-    def ways(self, normal: jax.Array) -> jax.Array:
-        """Two directions in the plane (m, 2, 3), the first one that of x."""
-        x, y, z = normal.T
-        first = jnp.stack([z, 0 * y, 0 * y - x], axis=1) / jnp.sqrt(x**2 + z**2)[:, None]
-        return jnp.stack([first, cross(normal, first)], axis=1)
-
-    def in_axes(self, q: jax.Array, body: Any, around: jax.Array) -> jax.Array:
-        """Those of the body."""
-        return around @ rotation(q)
+    # ---- what there is
 
     @property
-    def coordinates(self) -> int:
-        """Seven, with six velocities."""
-        return 7
+    def dimension(self) -> int:
+        """d = 2 or 3."""
+        return self.planes.shape[1] - 1
+
+    @property
+    def count(self) -> int:
+        """Number of bodies that move."""
+        return self.masses.shape[0]
+
+    @property
+    def angular(self) -> int:
+        """Angular velocities of a body: 1 in the plane, 3 in space."""
+        return 2 * self.dimension - 3
+
+    @property
+    def quaternions(self) -> bool:
+        """Whether q holds quaternions."""
+        return self.dimension == 3
+
+    @property
+    def coordinates(self) -> int | None:
+        """Seven of each body in space, with six velocities."""
+        return 7 * self.count if self.quaternions else None
+
+    @property
+    def range_in_words(self) -> str:  # type: ignore[override]
+        """What `valid` asks for."""
+        return "a quaternion of length 1 each" if self.quaternions else super().range_in_words
+
+    def of_bodies(self, q: jax.Array) -> jax.Array:
+        """Coordinates or velocities (b, ..) of each body."""
+        return q.reshape(self.count, -1)
+
+    def all_bodies(self, q: jax.Array) -> jax.Array:
+        """Coordinates (b, ..) of each body, also of those that do not move."""
+        return self.of_bodies(q)
+
+    def rows(self) -> tuple[np.ndarray, np.ndarray]:
+        """Bodies (p,) of all contact points with a plane, and which points these are."""
+        orders = [shape.order for shape in self.shapes[: self.count]]
+        return np.repeat(np.arange(len(orders)), [len(x) for x in orders]), np.concatenate(orders)
+
+    def pairs_in_contact(self) -> np.ndarray:
+        """Bodies i and j (m, 2) of each contact; j of a plane is -1."""
+        body = np.tile(self.rows()[0].astype(np.int32), len(self.planes))
+        return np.stack([body, np.full_like(body, -1)], axis=1)
+
+    @property
+    def between(self) -> tuple[tuple[int, int], ...]:
+        """Bodies (i, j) of each contact; j of a plane is -1."""
+        return tuple((i, j) for i, j in self.pairs_in_contact().tolist())
+
+    # ---- mass and coordinates
 
     @property
     def mass(self) -> jax.Array:
-        """M (6,), its diagonal, or (6, 6)."""
-        still = jnp.stack([self.total_mass] * 3)
-        if self.inertia.ndim == 1:
-            return jnp.concatenate([still, self.inertia])
-        return jax.scipy.linalg.block_diag(jnp.diag(still), self.inertia)
+        """M (n,), its diagonal, or (n, n)."""
+        places = jnp.repeat(self.masses[:, None], self.dimension, axis=1)
+        if self.inertias.ndim == 2:
+            return jnp.concatenate([places, self.inertias], axis=1).reshape(-1)
+        each = zip(places, self.inertias)
+        return jax.scipy.linalg.block_diag(*(block for m, i in each for block in (jnp.diag(m), i)))
+
+    @full_precision
+    def inertial_force(self, q: jax.Array, v: jax.Array) -> jax.Array:
+        """`-(0, omega x I omega)` of each body (n,)."""
+        if not self.quaternions:
+            return jnp.zeros_like(v)
+        omega = self.of_bodies(v)[:, 3:]
+        spin = self.inertias * omega if self.inertias.ndim == 2 else times(self.inertias, omega)
+        return jnp.concatenate([jnp.zeros_like(omega), -cross(omega, spin)], axis=1).reshape(-1)
 
     def valid(self, q: jax.Array) -> jax.Array:
-        """How much farther from 1 the quaternion's length may be ()."""
-        return UNIT_WITHIN - jnp.abs(jnp.sqrt(jnp.sum(q[3:] ** 2)) - 1)
+        """How much farther from 1 the quaternions' lengths may be ()."""
+        if not self.quaternions:
+            return super().valid(q)
+        return UNIT_WITHIN - jnp.max(jnp.abs(lengths(self.of_bodies(q)[:, 3:])[0] - 1))
 
     @full_precision
     def moved(self, q: jax.Array, u: jax.Array) -> jax.Array:
-        """q displaced by u[:3] and turned by the vector u[3:] of the body's axes; |e| = 1."""
-        e = q[3:] / jnp.sqrt(jnp.sum(q[3:] ** 2))
-        half = 0.5 * u[3:]
-        cosine, ratio = _cosine_and_sine_ratio(half @ half)
-        turn = jnp.concatenate([cosine[None], ratio * half])
-        return jnp.concatenate([q[:3] + u[:3], _product(e, turn)])
+        """q displaced, each body turned by a vector of its axes; |e| = 1."""
+        if not self.quaternions:
+            return q + u
+        half = 0.5 * self.of_bodies(u)[:, 3:]
+        cosine, ratio = _cosine_and_sine_ratio(dot(half, half)[:, None])
+        return self._turned(q, u, jnp.concatenate([cosine, ratio * half], axis=1))
 
     @full_precision
     def nearby(self, q: jax.Array, u: jax.Array) -> jax.Array:
         """q after the displacement u, to second order in u: without sine and cosine."""
-        e = q[3:] / jnp.sqrt(jnp.sum(q[3:] ** 2))
-        half = 0.5 * u[3:]
-        turn = jnp.concatenate([(1 - 0.5 * (half @ half))[None], half])
-        return jnp.concatenate([q[:3] + u[:3], _product(e, turn)])
+        if not self.quaternions:
+            return q + u
+        half = 0.5 * self.of_bodies(u)[:, 3:]
+        return self._turned(
+            q, u, jnp.concatenate([1 - 0.5 * dot(half, half)[:, None], half], axis=1)
+        )
 
-    @full_precision
-    def pulled(self, q: jax.Array, gradient: jax.Array) -> jax.Array:
-        """Gradient (7,) in q as one (6,) in the displacements, by `e' = e (0, omega) / 2`."""
-        e = q[3:] / jnp.sqrt(jnp.sum(q[3:] ** 2))
-        turns = 0.5 * jnp.tensordot(e, jnp.asarray(_QUATERNION_PRODUCT, e.dtype), (0, 1))[:, 1:]
-        return jnp.concatenate([gradient[:3], gradient[3:] @ turns])
+    def _turned(self, q: jax.Array, u: jax.Array, turn: jax.Array) -> jax.Array:
+        """q displaced by u, and turned by quaternions (b, 4)."""
+        q, u, table = self.of_bodies(q), self.of_bodies(u), _QUATERNION_PRODUCT.astype(q.dtype)
+        _, e = lengths(q[:, 3:])
+        product = dot(jnp.tensordot(turn, table, (1, 2)), e[:, None])
+        return jnp.concatenate([q[:, :3] + u[:, :3], product], axis=1).reshape(-1)
 
-    @full_precision
-    def inertial_force(self, q: jax.Array, v: jax.Array) -> jax.Array:
-        """`-(0, omega x I omega)` (6,)."""
-        omega = v[3:]
-        spin = self.inertia * omega if self.inertia.ndim == 1 else self.inertia @ omega
-        return jnp.concatenate([jnp.zeros_like(omega), -cross(omega, spin)])
+    @property
+    def base_directions(self) -> jax.Array:
+        """All planes move along each axis (n, d)."""
+        d = self.dimension
+        return jnp.tile(jnp.eye(d + self.angular, d, dtype=self.masses.dtype), (self.count, 1))
 
     def gravity(self, acceleration: Any) -> LinearPotential:
-        """`V = m g z`."""
-        up = jnp.zeros(7, self.mass.dtype).at[2].set(1.0)
-        return LinearPotential(self.total_mass * up * acceleration)
+        """`V = g sum m_i h_i`, h the last place: y in the plane, z in space."""
+        d = self.dimension
+        size = 7 if self.quaternions else d + self.angular
+        up = jnp.eye(1, size, d - 1, dtype=self.masses.dtype)
+        return LinearPotential((self.masses[:, None] * up).reshape(-1) * acceleration)
+
+    # ---- where points are and how they move
+
+    def turns(self, at: jax.Array) -> jax.Array:
+        """R (b, d, d) of bodies at (b, ..)."""
+        if self.quaternions:
+            return rotation(at[:, 3:])
+        if self.dimension == 3:
+            return jnp.broadcast_to(jnp.eye(3, dtype=at.dtype), (len(at), 3, 3))
+        c, s = jnp.cos(at[:, 2]), jnp.sin(at[:, 2])
+        return jnp.stack([jnp.stack([c, -s], axis=1), jnp.stack([s, c], axis=1)], axis=1)
+
+    def placed(self, q: jax.Array) -> Placed:
+        """All bodies at q, in a `Bodies` the fixed ones last."""
+        return self.placed_at(self.all_bodies(q), self.points)
+
+    def placed_at(self, at: jax.Array, points: jax.Array) -> Placed:
+        """Bodies of these points (b, P, d) at (b, ..)."""
+        turns, centre = self.turns(at), at[:, None, : self.dimension]
+        if all(shape.centred for shape in self.shapes):
+            return Placed(turns, centre)
+        return Placed(turns, centre + times(turns[:, None], points))
+
+    def contacts(self, q: jax.Array) -> ContactPoints:
+        """Gaps, points and normals at q; `between` says of which bodies."""
+        return self.on_planes(self.placed(q).points)
+
+    def on_planes(self, points: jax.Array) -> ContactPoints:
+        """Contacts (w p,) of all contact points, of (b, P, d), with all planes."""
+        (body, which), d = self.rows(), self.dimension
+        points, rim = points[body, which], self.rims[body]
+        n = jnp.broadcast_to(self.planes[:, None, :d], (len(self.planes), *points.shape))
+        gap = jnp.sum(n * points[None], axis=2) - self.planes[:, d:] - rim[None]
+        point = points[None] - rim[None, :, None] * n
+        return ContactPoints(gap.reshape(-1), point.reshape(-1, d), n.reshape(-1, d))
 
     @full_precision
-    def at(self, position: Any, quaternion: Any = _UPRIGHT) -> jax.Array:
-        """q (7,), the middle of its shape at `position` (3,) [m], turned by `quaternion` (4,)."""
-        place, e = _vector("position", position), _unit(quaternion)
-        away = jnp.concatenate([place, e])
-        return away.at[:3].add(-rotation(away) @ self.middle)
+    def gap_function(self, q: jax.Array) -> jax.Array:
+        """Gaps f(q) (m,) [m]."""
+        return self.contacts(q).gap
 
-    def touching(self, quaternion: Any = _UPRIGHT) -> jax.Array:
-        """q (7,), turned by `quaternion` (4,), at which its lowest contacts touch the plane."""
-        return _lowered(self, _unit(quaternion))
+    @full_precision
+    def gaps_and_normals(self, q: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Gaps (m,) and N (n, m)."""
+        gap, point, normal = self.contacts(q)
+        return gap, self._of_all(q, point, normal[:, None])
+
+    @full_precision
+    def tangents(self, q: jax.Array) -> jax.Array:
+        """H_t (n, m), in space (n, 2 m): how fast body i slides along body j."""
+        _, point, normal = self.contacts(q)
+        return self._of_all(q, point, self.ways(normal))
+
+    def ways(self, normal: jax.Array) -> jax.Array:
+        """Unit tangents (m, d - 1, d) of normals (m, d)."""
+        return tangents_of(normal)
+
+    def speeds(self, q: jax.Array, point: jax.Array, ways: jax.Array, body: Any) -> jax.Array:
+        """(m, k, velocities of a body): of points (m, d) of these bodies along ways (m, k, d)."""
+        at = self.of_bodies(q)[body]
+        lever = (point - at[:, : self.dimension])[:, None]
+        if self.dimension == 2:
+            around = (lever[..., 0] * ways[..., 1] - lever[..., 1] * ways[..., 0])[..., None]
+        else:
+            around = cross(lever, ways)
+        if self.quaternions:  # omega is in the axes of the body
+            around = times(jnp.swapaxes(self.turns(at), 1, 2)[:, None], around)
+        return jnp.concatenate([ways, around], axis=2)
+
+    def _of_all(self, q: jax.Array, point: jax.Array, ways: jax.Array) -> jax.Array:
+        """(n, m k): velocities along ways (m, k, d) of all bodies."""
+        velocities = self.dimension + self.angular
+        rows = jnp.zeros((*ways.shape[:2], self.count, velocities), q.dtype)
+        moving = np.arange(self.count, dtype=np.int32)[None]
+        for sign, body in zip((1.0, -1.0), self.pairs_in_contact().T):
+            if (body >= 0).any():  # a plane does not move
+                own = jnp.asarray(body)[:, None] == moving
+                speeds = sign * self.speeds(q, point, ways, body)[:, :, None]
+                rows = rows + jnp.where(own[:, None, :, None], speeds, 0.0)
+        return rows.reshape(-1, self.count * velocities).T
+
+    @full_precision
+    def at(self, positions: Any, turns: Any = None) -> jax.Array:
+        """q (n,), the bodies at `positions` (b, d) [m], by angles (b,) or quaternions (b, 4).
+
+        In the plane these are the centres of mass, in space the middles of the shapes.
+        """
+        d, count = self.dimension, self.count
+        places = as_numbers("positions", positions, (count, d), "one for each body")
+        if not self.quaternions:
+            turning = jnp.zeros((count, self.angular)) if turns is None else turns
+            turning = as_float_array("turns", turning).reshape(-1, self.angular)
+            check_shape("turns", turning, (count, self.angular), "of each body")
+            return jnp.concatenate([places, turning.astype(places.dtype)], axis=1).reshape(-1)
+        unit = [_UPRIGHT] * count if turns is None else turns
+        e = jnp.stack([unit_quaternion(x) for x in unit])
+        check_shape("turns", e, (count, 4), "a quaternion of each body")
+        centre = places - times(rotation(e), self.middles)
+        return jnp.concatenate([centre, e.astype(centre.dtype)], axis=1).reshape(-1)
+
+    @property
+    def middles(self) -> jax.Array:
+        """Of shapes in space (b, 3), from the centres of mass: between first and last points."""
+        return 0.5 * (self.points[: self.count, 0] + self.points[: self.count, -1])
+
+    # ---- names and pictures
 
     @property
     def names(self) -> tuple[str, ...]:
-        """x, y, z and the quaternion."""
-        return ("x [m]", "y [m]", "z [m]", "e0 [1]", "e1 [1]", "e2 [1]", "e3 [1]")
+        """Place and angle, quaternion or turns of each body."""
+        if self.dimension == 2:
+            return numbered(PLANAR, self.count)
+        turns = tuple(f"turn {axis} [rad]" for axis in "xyz")
+        if self.quaternions:
+            turns = tuple(f"e{i} [1]" for i in range(4))
+        return numbered(("x [m]", "y [m]", "z [m]", *turns), self.count)
 
     @property
     def velocity_names(self) -> tuple[str, ...]:
-        """x', y', z' and the angular velocity in the body's axes."""
-        return ("x' [m/s]", "y' [m/s]", "z' [m/s]", *(f"omega{i} [rad/s]" for i in (1, 2, 3)))
+        """Rates of q, in space the angular velocities in the axes of the bodies."""
+        if not self.quaternions:
+            return super().velocity_names
+        spins = tuple(f"omega{i} [rad/s]" for i in (1, 2, 3))
+        return numbered(("x' [m/s]", "y' [m/s]", "z' [m/s]", *spins), self.count)
 
     @property
     def floors(self) -> list[tuple[float, float]]:
-        """None: outlines have a shadow on the plane instead."""
-        return []
+        """(angle, offset) of the planes; in space outlines have a shadow on the first one."""
+        if self.dimension == 3:
+            return []
+        return [(float(np.arctan2(-x, y)), float(c)) for x, y, c in np.asarray(self.planes)]
 
-    @full_precision
-    def _drawn(self, q: np.ndarray, curve: np.ndarray) -> list[np.ndarray]:
-        """A curve (k, 3) of the body in projection, and its shadow."""
-        placed = q[:3] + curve @ np.asarray(rotation(jnp.asarray(q))).T
-        n = np.asarray(self.normal)
-        return [projected(placed), projected(placed - np.outer(placed @ n, n))]
+    def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
+        """Polygons, wheels and rods; of space in projection, with a shadow on the first plane."""
+        at = self.all_bodies(jnp.asarray(q, self.points.dtype))
+        each = zip(self.shapes, self.points, self.rims, np.asarray(at), np.asarray(self.turns(at)))
+        draw = self._plane_curves if self.dimension == 2 else self._space_curves
+        return [
+            curve
+            for shape, points, rim, at, turn in each
+            for curve in draw(shape, np.asarray(points)[: shape.size], float(rim), at, turn)
+        ]
+
+    def _plane_curves(
+        self, shape: Shape, points: np.ndarray, rim: float, at: np.ndarray, turn: np.ndarray
+    ) -> list[np.ndarray]:
+        """A wheel with the radius that shows how far it turned, a polygon, or a rod with discs."""
+        if shape.is_round:
+            spoke = np.concatenate([[[0.0, 0.0]], CIRCLE])
+            return [at[:2] + (rim * spoke + points[:1]) @ turn.T]
+        ends = at[:2] + points @ turn.T
+        if shape.faces:
+            return [np.concatenate([ends, ends[:1]])]
+        return [ends, *(end + rim * CIRCLE for end in ends)]
+
+    def _space_curves(
+        self, shape: Shape, points: np.ndarray, rim: float, at: np.ndarray, turn: np.ndarray
+    ) -> list[np.ndarray]:
+        """A ball with two great circles, the edges of a box, or a rod; and their shadow."""
+        middle = 0.5 * (points[0] + points[-1])
+        curve = points
+        if shape.is_round:
+            flat = np.insert(CIRCLE, 2, 0.0, axis=1)
+            curve = middle + rim * np.concatenate([flat, np.roll(flat, 1, axis=1)])
+        elif shape.faces:
+            curve = (points + rim * np.sign(points - middle))[_EDGES]
+        drawn = self.with_shadow(at[:3] + curve @ turn.T)
+        if shape.is_round:
+            return [*drawn, projected(at[:3] + turn @ middle) + rim * CIRCLE]
+        return drawn if shape.faces else [*drawn, *(end + rim * CIRCLE for end in drawn[0])]
+
+    def with_shadow(self, curve: np.ndarray) -> list[np.ndarray]:
+        """A curve (k, 3) in projection, and its shadow on the first plane."""
+        plane = np.asarray(self.planes)[0] if len(self.planes) else np.array([0.0, 0, 1, 0])
+        height = curve @ plane[:3] - plane[3]
+        return [projected(curve), projected(curve - np.outer(height, plane[:3]))]
+
+
+class RigidBody(RigidBodies):
+    """One rigid body over the ground y = 0, or in space over a plane through the origin."""
+
+    def _set(
+        self,
+        points: jax.Array,
+        mass: Any,
+        inertia: jax.Array,
+        shape: Shape,
+        rim: Any,
+        normal: Any,
+    ) -> None:
+        """What it is: points (P, d), mass, inertia (1,), (3,) or (3, 3), rim, plane."""
+        self.masses, self.inertias = positive("mass", mass)[None], inertia[None]
+        self.points, self.shapes = points[None], (shape,)
+        self.rims = jnp.asarray(rim, points.dtype)[None]
+        self.planes = jnp.append(jnp.asarray(normal, points.dtype), 0.0)[None].astype(points.dtype)
+
+    @property
+    def corners(self) -> jax.Array:
+        """Its contact points (k, d), in order, from the centre of mass [m]."""
+        return self.points[0, np.array(self.shapes[0].order)]
+
+    @property
+    def radius(self) -> jax.Array:
+        """Radius of a disc or sphere, of the ends of a dimer, or rounding of a box () [m]."""
+        return self.rims[0]
+
+    @property
+    def inertia(self) -> jax.Array:
+        """About the centre of mass, () in the plane, (3,) or (3, 3) in space [kg m^2]."""
+        return self.inertias[0, 0] if self.dimension == 2 else self.inertias[0]
+
+    def ways(self, normal: jax.Array) -> jax.Array:
+        """In space two directions in the plane (m, 2, 3), the first one that of x."""
+        if self.dimension == 2:
+            return tangents_of(normal)
+        x, y, z = normal.T
+        first = jnp.stack([z, 0 * y, 0 * y - x], axis=1) / jnp.sqrt(x**2 + z**2)[:, None]
+        return jnp.stack([first, cross(normal, first)], axis=1)
+
+    def at(self, position: Any, turn: Any = None) -> jax.Array:
+        """q, the body at `position` (d,) [m], turned by an angle or a quaternion (4,).
+
+        In the plane this is the centre of mass, in space the middle of its shape.
+        """
+        place = as_numbers("position", position, (self.dimension,), "a point")
+        return super().at(place[None], None if turn is None else [turn])
+
+    def touching(self, turn: Any = None) -> jax.Array:
+        """q, turned by an angle or a quaternion (4,), at which its lowest contacts touch."""
+        if self.dimension == 2:
+            return _lowered(self, number("angle", 0.0 if turn is None else turn)[None])
+        return _lowered(self, unit_quaternion(_UPRIGHT if turn is None else turn))
 
 
 @full_precision
-def rotation(q: jax.Array) -> jax.Array:
-    """R (3, 3) of q (7,), from the body's axes to those of space, whatever the length of e."""
-    cross = jnp.asarray(-CROSS, q.dtype) @ q[4:]
-    turn = 2 * (q[3] * cross + cross @ cross) / jnp.sum(q[3:] ** 2)
-    return jnp.eye(3, dtype=q.dtype) + turn
-
-
-@full_precision
-def _product(e: jax.Array, other: jax.Array) -> jax.Array:
-    """Product (4,) of the quaternions e and `other`."""
-    return (jnp.asarray(_QUATERNION_PRODUCT, e.dtype) @ other) @ e
+def rotation(e: jax.Array) -> jax.Array:
+    """R (.., 3, 3) of quaternions (.., 4), whatever their length."""
+    s, a = e[..., 0, None, None], e[..., 1:]
+    square = dot(e, e)[..., None, None]
+    across = jnp.tensordot(a, -_CROSS.astype(e.dtype), (-1, 2))
+    outer = a[..., :, None] * a[..., None, :]
+    one = jnp.broadcast_to(jnp.eye(3, dtype=e.dtype), across.shape)
+    return one + 2 * (s * across + outer - dot(a, a)[..., None, None] * one) / square
 
 
 def _cosine_and_sine_ratio(square: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -303,48 +482,39 @@ def _cosine_and_sine_ratio(square: jax.Array) -> tuple[jax.Array, jax.Array]:
     return jnp.where(small, cosine, jnp.cos(a)), jnp.where(small, ratio, jnp.sin(a) / a)
 
 
-def _vector(name: str, value: Any) -> jax.Array:
-    """A finite vector (3,)."""
-    vector = as_float_array(name, value)
-    check_shape(name, vector, (3,), "a vector in space")
-    check_values(name, vector)
-    return vector
+@full_precision
+def cross(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Vector products (.., 3), in fewer operations to compile than `jnp.cross`."""
+    return jnp.sum(a[..., None, :] * jnp.tensordot(b, _CROSS.astype(b.dtype), (-1, 2)), axis=-1)
+
+
+def tangents_of(normal: jax.Array) -> jax.Array:
+    """Unit tangents (m, d - 1, d): to the right of normals (m, d), in space two."""
+    if normal.shape[1] == 2:
+        return jnp.stack([normal[:, 1], -normal[:, 0]], axis=1)[:, None]
+    aside = jnp.asarray(_ASIDE, normal.dtype)[None]
+    _, first = lengths(aside - dot(aside, normal)[:, None] * normal)
+    return jnp.stack([first, cross(normal, first)], axis=1)
+
+
+def times(matrices: jax.Array, vectors: jax.Array) -> jax.Array:
+    """Matrices (.., d, d) times vectors (.., d)."""
+    return jnp.sum(matrices * vectors[..., None, :], axis=-1)
 
 
 @jax.jit  # operation by operation JAX would compile thirty programs
-def _lowered(solid: Solid, quaternion: jax.Array) -> jax.Array:
-    """q (7,) of a solid, turned like this, at which its lowest contacts touch the plane."""
-    q = jnp.concatenate([jnp.zeros(3, solid.mass.dtype), quaternion])
-    return q.at[:3].set(-jnp.min(solid.gap_function(q)) * solid.normal)
+def _lowered(body: RigidBody, turn: jax.Array) -> jax.Array:
+    """q of a body, turned like this, at which its lowest contacts touch its plane."""
+    d = body.dimension
+    q = jnp.concatenate([jnp.zeros(d, turn.dtype), turn])
+    return q.at[:d].set(-jnp.min(body.gap_function(q)) * body.planes[0, :d].astype(q.dtype))
 
 
-def _unit(quaternion: Any) -> jax.Array:
+def unit_quaternion(quaternion: Any) -> jax.Array:
     """A quaternion (4,) of length 1."""
-    e = as_float_array("quaternion", quaternion)
-    check_shape("quaternion", e, (4,), "scalar first")
-    check_values("quaternion", e)
+    e = as_numbers("quaternion", quaternion, (4,), "scalar first")
     if not is_traced(e) and abs(float(np.linalg.norm(e)) - 1) > UNIT_WITHIN:
         raise ValueError(
             f"Argument `quaternion` must have length 1, but has length {np.linalg.norm(e):g}."
         )
     return e
-
-
-def _inertia(value: Any) -> jax.Array:
-    """Moments of inertia (3,), or their matrix (3, 3), that some body has [kg m^2]."""
-    inertia = as_float_array("inertia", value)
-    if inertia.shape not in ((3,), (3, 3)):
-        raise ValueError(f"Argument `inertia` must have shape (3,) or (3, 3), not {inertia.shape}.")
-    if is_traced(inertia):
-        return inertia
-    try:
-        check_mass(inertia)
-    except ValueError as error:
-        raise ValueError(str(error).replace("`mass`", "`inertia`").replace("M ", "I ")) from None
-    least = np.sort(inertia if inertia.ndim == 1 else np.linalg.eigvalsh(inertia))
-    if least[2] > (1 + _SLACK) * (least[0] + least[1]):
-        raise ValueError(
-            "Argument `inertia` must have principal moments none of which is more than the sum of "
-            f"the others, but has {least.tolist()}."
-        )
-    return inertia

@@ -354,7 +354,7 @@ def montecarlo(command: options.MonteCarloCommand, steps: Steps) -> CommandResul
 # ------------------------------------------------------------------------------------------ chart
 
 QUICK = "\nThis is the quick look; --full computes everything."
-QUICK_METHODS = ("dop853", "verlet", "impulse_euler")
+QUICK_METHODS = ("time", "verlet", "impulse_euler")
 QUICK_LAWS = ("moreau", "binary")
 
 

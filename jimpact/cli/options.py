@@ -261,7 +261,7 @@ class StabilityCommand(DrawingCommand):
         super().check()
         methods = study_file.names()["methods"]
         batched = [name for name, in_jax in methods.items() if in_jax]
-        check_methods(self.methods, ("default", *batched))
+        check_methods(self.methods, tuple(batched))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,8 +6,7 @@ from importlib.resources import files
 
 import numpy as np
 
-from jimpact.bodies.blocks import Block
-from jimpact.bodies.solids import Box
+from jimpact.bodies.shapes import Block, Box
 from jimpact.files.shots_file import read_shots
 from jimpact.fits.data import Experiments, read_experiments
 from jimpact.scene import Scene

@@ -217,7 +217,7 @@ def work_precision(
     repeats = as_whole("repeats", repeats, 1)
     case = _case(scene, velocity, law, as_whole("batch", batch, 1))
     chosen, left_out = _chosen(methods, settings or {}, case)
-    exact, second = _reference(reference, case), CONTENDERS["dop853"]
+    exact, second = _reference(reference, case), CONTENDERS["time"]
     if laws is None:
         built = registered_laws(shared_parameters(law))[0]
         laws = {name: built[name] for name in ALGEBRAIC}
@@ -342,7 +342,7 @@ def _supported(argument: str, contender: str | Contender, case: Case) -> Contend
 
 def _reference(name: str | None, case: Case) -> Contender:
     """The contender that errors are measured from."""
-    contender = _supported("reference", name or "dop853", case)
+    contender = _supported("reference", name or "time", case)
     if contender.setting != "rtol":
         raise ValueError(f"Argument `reference` must take an rtol, but is {name!r}.")
     return contender

@@ -102,7 +102,7 @@ _ALL = (
         friction=True,
     ),
     Contender(
-        *("dop853", schemes.aligned, "rtol", _TO_ELEVEN),
+        *("time", schemes.aligned, "rtol", _TO_ELEVEN),
         label="event-aligned Dormand-Prince 8 (default)",
         divides=False,
         friction=True,

@@ -93,8 +93,8 @@ FRICTION_RTOL, FRICTION_CONFIRMED = 1e-8, 1e-6
 QUICK_RATIO, QUICK_BALLS = 1e3, 10
 
 RECLOSING = 0.1  # below this e three balls re-close (nearly) without end
-NAMES = ("default", "rk4", "verlet", "impulse_euler")
-FRICTION_NAMES = ("default", "implicit", "verlet")  # those of them that there are
+NAMES = ("time", "rk4", "verlet", "impulse_euler")
+FRICTION_NAMES = ("time", "implicit", "verlet")  # those of them that there are
 SLICES = ("one", "pairs")
 
 
@@ -207,9 +207,9 @@ def stability_map(
     error), `does not end` (in `max_steps`), `not finite`, `unchecked` (no reference ends).
 
     Args:
-        methods: names in `jimpact.methods.contenders.CONTENDERS` that JAX can batch, and 'default',
-            what `impact` does; None: that, rk4, verlet and impulse_euler. With friction: those
-            that have it.
+        methods: names in `jimpact.methods.contenders.CONTENDERS` that JAX can batch; None: 'time'
+            (what `impact` does), 'rk4', 'verlet' and 'impulse_euler'. With friction: those that
+            have it.
         axes: values by name, of `setting` (0 coarse .. 1 fine), `stiffness_ratio` 1e-8..1e8,
             `exponent` 1..5, `restitution` 0..1, `mass_ratio` 1e-6..1e6, `balls`, `friction` 0..10;
             None: all.
@@ -342,7 +342,7 @@ def _place(scene: Scene | None, velocity: Any) -> Place:
 
 def _methods(methods: Sequence[str | Contender] | None, place: Place) -> list[Contender]:
     """Contenders, those of these names, or those to map by default."""
-    known = {"default": DEFAULT} | {name: m for name, m in CONTENDERS.items() if m.jax}
+    known = {name: m for name, m in CONTENDERS.items() if m.jax}
     defaults: tuple[str, ...] = NAMES
     if place.friction:
         known = {name: m for name, m in known.items() if m.friction}
@@ -451,9 +451,6 @@ def stiffness_of(kappa: Any, contacts: int) -> jax.Array:
     return jnp.where(jnp.arange(contacts) >= (contacts + 1) // 2, kappa, jnp.ones_like(kappa))
 
 
-DEFAULT = CONTENDERS["dop853"]._replace(name="default")
-
-
 class PointOutcomes(NamedTuple):
     """Velocities after (L, n), status of the method and of the impact, energy gained over T-."""
 
@@ -499,7 +496,7 @@ def references(
     for at, n in groups:
         unique, back = np.unique(points[at, 1:], axis=0, return_inverse=True)
         rows = np.column_stack([np.zeros(len(unique)), unique])
-        out = runners(DEFAULT, n)(rows, REFERENCE_RTOL)
+        out = runners(CONTENDERS["time"], n)(rows, REFERENCE_RTOL)
         ended = (out.code == CODE["ok"]) | (out.code == CODE["plastic_limit"])
         velocity = np.where(ended[:, None], out.velocity, np.nan)[np.ravel(back)]
         exact[at, : place.size(n)] = velocity

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from jimpact._checks import as_float_array, check_values, in_numbers
 from jimpact.bodies.base import STANDARD_GRAVITY, Body, LinearPotential, Potential
-from jimpact.bodies.given import GivenBody
+from jimpact.bodies.functions import FunctionBody
 
 Base = Callable[[jax.Array], jax.Array]  # t () -> displacement y_b (d,) [m]
 
@@ -91,7 +91,7 @@ class System(eqx.Module):
             if not (callable(function) or function is None):
                 raise TypeError(f"Argument `{name}` must be a function, but is {function!r}.")
         if not isinstance(gap_function, Body):
-            self.body = GivenBody(gap_function, mass, tangent_function)
+            self.body = FunctionBody(gap_function, mass, tangent_function)
         elif mass is None and tangent_function is None:
             self.body = gap_function
         else:

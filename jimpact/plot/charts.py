@@ -34,7 +34,7 @@ from jimpact.status import CODE, STATUS
 _MARKERS = "osD^vP"
 _LAW_MARKERS = "*phX8d"
 _LEAST = 1e-16  # smaller errors are drawn here: rounding
-_DEFAULT = "dop853"  # what `impact` does: a thick line
+_DEFAULT = "time"  # what `impact` does: a thick line
 
 # right, flagged, wrong, gains energy, stalls, does not end, not finite, unchecked: Okabe and Ito's
 # colours for returned results, greys for none

@@ -8,9 +8,9 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
-from jimpact._checks import check_kind, check_shape
-from jimpact.bodies.base import Body
-from jimpact.bodies.piles import Pile
+from jimpact._checks import check_kind, check_shape, check_values
+from jimpact.bodies.assembly import Bodies
+from jimpact.bodies.base import Body, projected
 from jimpact.motion.system import System
 from jimpact.plot.motions import draw_body
 from jimpact.plot.style import COLOURS, GREY, SMALL, colour_of, new_figure, styled
@@ -52,6 +52,9 @@ def system(drawn: Scene | Body | System, state: Any, title: str = "") -> Figure:
         _row(axes, drawn, np.asarray(as_velocity(drawn, state)))
     else:
         body = drawn.body if isinstance(drawn, System) else drawn
+        if body.names:
+            check_shape("state", state, (len(body.names),), "one per coordinate of the body")
+        check_values("state", state)
         figure, axes = new_figure(3.6, title)
         draw_body(axes, body, np.asarray(state, float))
         axes.set(xlabel="x [m]", ylabel="height [m]")
@@ -59,15 +62,15 @@ def system(drawn: Scene | Body | System, state: Any, title: str = "") -> Figure:
 
 
 @styled()
-def force_chains(pile: Pile, q: Any, scene: Scene, impulse: Any, title: str = "") -> Figure:
+def force_chains(pile: Bodies, q: Any, scene: Scene, impulse: Any, title: str = "") -> Figure:
     """The impulses in a packing as lines between the centres, as thick as they are large.
 
-    Spheres are seen from the side, along y; lines in front cover those behind.
+    Spheres are seen in projection; large impulses cover small ones.
 
     Args:
         pile: its bodies.
-        q: where they are (n,), as for `pile.touching(q)`.
-        scene: `pile.touching(q)`, or the scene of `TimeStepping.contacts`.
+        q: where they are (n,), as for `pile.closed_scene(q)`.
+        scene: `pile.closed_scene(q)`, or the scene of `TimeStepping.contacts`.
         impulse: p (m,) [N s] of an impact on this scene, or of a step.
         title: above the picture.
 
@@ -75,25 +78,24 @@ def force_chains(pile: Pile, q: Any, scene: Scene, impulse: Any, title: str = ""
         A matplotlib figure: `.savefig(path)` writes it.
 
     Raises:
-        TypeError: another body, or a scene that `touching` did not make. ValueError: not one
+        TypeError: another body, or a scene that `closed_scene` did not make. ValueError: not one
             impulse per contact.
 
     >>> import jimpact as ji
     >>> balls = ji.Bodies([ji.Sphere(0.1)] * 2, (), room=8)
     >>> q = balls.at([[0.0, 0.0, 0.1], [0.0, 0.0, 0.3]])
-    >>> figure = ji.plot.force_chains(balls, q, balls.touching(q), [1.0])
+    >>> figure = ji.plot.force_chains(balls, q, balls.closed_scene(q), [1.0])
     >>> len(figure.axes[0].collections)
     1
     """
-    if not isinstance(pile, Pile):
-        raise TypeError(f"Argument `pile` must be many `Bodies`, but is a {type(pile).__name__}.")
+    if not (isinstance(pile, Bodies) and pile.room):
+        raise TypeError(f"Argument `pile` must be `Bodies` with `room` (many), but is {pile!r}.")
     check_kind("scene", scene, Scene)
     if scene.pairs is None or scene.size != pile.mass.shape[0]:
-        raise TypeError("Argument `scene` must be `pile.touching(q)`.")
+        raise TypeError("Argument `scene` must be `pile.closed_scene(q)`.")
     p = np.asarray(impulse, float)
     check_shape("impulse", p, (scene.contacts,), "one per contact")
     d = pile.dimension
-    axis = [0, d - 1]  # seen from the side
     centres = np.asarray(q, float).reshape(pile.count, -1)[:, :d]
     first, second = scene.pairs.neighbours.bodies.T
     ends = np.where((second < 0)[:, None], _on_walls(pile, scene.pairs, centres), centres[second])
@@ -103,7 +105,8 @@ def force_chains(pile: Pile, q: Any, scene: Scene, impulse: Any, title: str = ""
     figure, axes = new_figure(5.0, title)
     for outline in pile.outlines(np.asarray(q, float), 0.0):
         axes.plot(*outline.T, color=GREY, lw=0.4, alpha=0.5)
-    lines = np.stack([centres[first], ends], axis=1)[drawn][:, :, axis]
+    lines = np.stack([centres[first], ends], axis=1)[drawn]
+    lines = lines if d == 2 else projected(lines)
     widths = _THICKEST * size[drawn]
     axes.add_collection(
         LineCollection(list(lines), linewidths=widths, colors=COLOURS[0], alpha=0.8)
@@ -113,7 +116,7 @@ def force_chains(pile: Pile, q: Any, scene: Scene, impulse: Any, title: str = ""
     return figure
 
 
-def _on_walls(pile: Pile, pairs: PairNormals, centres: np.ndarray) -> np.ndarray:
+def _on_walls(pile: Bodies, pairs: PairNormals, centres: np.ndarray) -> np.ndarray:
     """Where contacts (m, d) of bodies with walls are."""
     d, walls = pile.dimension, np.asarray(pile.planes)
     first, normal = pairs.neighbours.bodies[:, 0], np.asarray(pairs.directions)[:, 0]

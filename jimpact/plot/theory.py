@@ -143,7 +143,7 @@ class _Plane:
 
     def __call__(self, velocity: np.ndarray) -> np.ndarray:
         """(..., n) -> (..., 2)."""
-        return (velocity - self._found.center) @ self._metric.T @ self._turn.T
+        return (velocity - self._found.centre) @ self._metric.T @ self._turn.T
 
 
 def _line(

@@ -28,15 +28,15 @@ _ZERO = 1e-12  # printed as 0 below this multiple of the largest velocity
 class AdmissibleSet:
     """The outcomes v+ of `admissible_set`; `print(result)` describes them.
 
-    Every outcome is v = `center` + `axes` u, u (d,) in a convex set `coordinates`, and has the
-    energy `T(center) + |u|^2 / 2`: u are kinetic coordinates [sqrt(J)]. `dimension` d is 0 where
+    Every outcome is v = `centre` + `axes` u, u (d,) in a convex set `coordinates`, and has the
+    energy `T(centre) + |u|^2 / 2`: u are kinetic coordinates [sqrt(J)]. `dimension` d is 0 where
     only one outcome is possible. `plastic` v+ (n,) has the `least_energy` [J]; `energy` is T-.
     `scene` and `velocity` v- (n,) [m/s] are the arguments, `tolerance` that of `contains`.
     """
 
     scene: Scene
     velocity: np.ndarray
-    center: np.ndarray
+    centre: np.ndarray
     axes: np.ndarray
     coordinates: CappedPolyhedron = field(repr=False)
     energy: float
@@ -72,7 +72,7 @@ class AdmissibleSet:
     def contains(self, velocity: Any, tolerance: float | None = None) -> Any:
         """Whether a velocity v+ (n,), or each of (k, n), is admissible up to `tolerance` impacts.
 
-        None: the tolerance of `audit`. The size of an impact: `sqrt(2 (T- - T(center)))`, the
+        None: the tolerance of `audit`. The size of an impact: `sqrt(2 (T- - T(centre)))`, the
         largest |u|.
         """
         v = np.asarray(as_float_array("velocity", velocity), float)
@@ -84,7 +84,7 @@ class AdmissibleSet:
         check_values("velocity", v)
         check_values("tolerance", tolerance, low=0.0)
         allowed = self.tolerance if tolerance is None else tolerance
-        offset = v - self.center
+        offset = v - self.centre
         mass = dense_mass(self.scene)
         u = offset @ mass @ self.axes
         outside = offset - u @ self.axes.T  # violates the momentum balance
@@ -100,7 +100,7 @@ class AdmissibleSet:
         """
         as_whole("count", count, 1)
         if self.dimension == 0:
-            return np.repeat(self.center[None], count, axis=0)
+            return np.repeat(self.centre[None], count, axis=0)
         return self._velocity(self.coordinates.sample(np.random.default_rng(seed), count))
 
     def conserving_arc(self, points: int = 100) -> np.ndarray:
@@ -146,7 +146,7 @@ class AdmissibleSet:
 
     def _velocity(self, u: np.ndarray) -> np.ndarray:
         """v+ (..., n) of kinetic coordinates u."""
-        return self.center + u @ self.axes.T
+        return self.centre + u @ self.axes.T
 
     def _check_plane(self) -> None:
         """Raise a ValueError unless the set is two-dimensional."""
@@ -213,8 +213,8 @@ def admissible_set(scene: Scene, velocity: Any) -> AdmissibleSet:
     rows = np.vstack([normal.T, facets])
     offset = np.append(np.zeros(normal.shape[1]), facets @ before)
     redundant = basis.shape[1] < unit.shape[1]
-    part, center, axes = capped_polyhedron(rows, offset, float(np.linalg.norm(before)), redundant)
-    rest = y - basis @ before + basis @ center
+    part, centre, axes = capped_polyhedron(rows, offset, float(np.linalg.norm(before)), redundant)
+    rest = y - basis @ before + basis @ centre
     return AdmissibleSet(
         scene,
         start,
@@ -251,7 +251,7 @@ def _in_words(outcomes: AdmissibleSet) -> str:
         return f"{x if abs(x) > smallest else 0.0:{width}.6g}"
 
     if outcomes.dimension == 0:
-        return f"{head} one admissible outcome, v+ = ({', '.join(map(show, outcomes.center))})"
+        return f"{head} one admissible outcome, v+ = ({', '.join(map(show, outcomes.centre))})"
     lines = [
         f"{head} admissible outcomes of dimension {outcomes.dimension}",
         f"energy       from {outcomes.least_energy:.6g} J (plastic) "

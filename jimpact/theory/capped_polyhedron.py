@@ -146,9 +146,9 @@ class CappedPolyhedron(NamedTuple):
 def capped_polyhedron(
     rows: np.ndarray, offset: np.ndarray, radius: float, may_be_flat: bool
 ) -> tuple[CappedPolyhedron, np.ndarray, np.ndarray]:
-    """The set in coordinates u of its own dimension: `w = center + axes u`, axes orthonormal.
+    """The set in coordinates u of its own dimension: `w = centre + axes u`, axes orthonormal.
 
-    Rows that can only be equalities become part of the affine hull; `|w|^2 = |center|^2 + |u|^2`.
+    Rows that can only be equalities become part of the affine hull; `|w|^2 = |centre|^2 + |u|^2`.
     """
     from scipy.optimize import linprog  # late: slow to import
 
@@ -161,21 +161,21 @@ def capped_polyhedron(
         if may_be_flat:
             highest = -linprog(-row, -rows, -offset, bounds=box).fun
             flat[i] = highest - low <= _FLAT * radius
-    center = np.zeros(rows.shape[1])
+    centre = np.zeros(rows.shape[1])
     axes = np.eye(rows.shape[1])
     if flat.any():
         _, singular, basis = np.linalg.svd(rows[flat])
         rank = int((singular > _INDEPENDENT).sum())
-        center = np.linalg.lstsq(rows[flat], offset[flat], rcond=_INDEPENDENT)[0]
+        centre = np.linalg.lstsq(rows[flat], offset[flat], rcond=_INDEPENDENT)[0]
         axes = basis[rank:].T
-        rows, offset = rows[~flat], offset[~flat] - rows[~flat] @ center
+        rows, offset = rows[~flat], offset[~flat] - rows[~flat] @ centre
     within = rows @ axes
     length = np.linalg.norm(within, axis=1)
     independent = length > _INDEPENDENT
-    inner = float(np.sqrt(max(radius**2 - float(center @ center), 0.0)))
+    inner = float(np.sqrt(max(radius**2 - float(centre @ centre), 0.0)))
     within = within[independent] / length[independent, None]
     offset = offset[independent] / length[independent]
-    return CappedPolyhedron(within, offset, inner), center, axes
+    return CappedPolyhedron(within, offset, inner), centre, axes
 
 
 def least_squares(matrix: np.ndarray, target: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_axis, as_numbers, check_values
-from jimpact.bodies.blocks import Block
+from jimpact.bodies.shapes import Block
 from jimpact.compiling import precise_jit
 from jimpact.impacts import impact
 from jimpact.laws.lzb import LZB

@@ -118,7 +118,7 @@ def impact_of(name, count):
     }[name]
     at, radii = packing(count)
     spheres = ji.Bodies([ji.Sphere(r) for r in radii], ())
-    scene = spheres.touching(spheres.at(at))
+    scene = spheres.closed_scene(spheres.at(at))
     v = np.zeros(6 * count)
     v[-4] = -1.0
     first, later, out = timed(lambda: jax.block_until_ready(ji.impact(law, scene, v)))

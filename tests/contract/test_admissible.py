@@ -63,13 +63,13 @@ def test_boundary_of_three_equal_balls():
     corners = [[1 / 3, 1 / 3, 1 / 3], [0, 0, 1], [-1 / 3, 2 / 3, 2 / 3]]
     for corner in corners:
         close(np.abs(boundary - corner).sum(axis=1).min(), 0.0)
-    u = (boundary - THREE.center) @ THREE.axes  # unit masses
+    u = (boundary - THREE.centre) @ THREE.axes  # unit masses
     following = np.roll(u, -1, axis=0)
     area = 0.5 * np.sum(u[:, 0] * following[:, 1] - u[:, 1] * following[:, 0])
     close(area, 0.5 * (2 / 3) * np.pi / 3, 1e-4)  # a sector of 60 degrees, counter-clockwise
-    beyond = THREE.center + 1.001 * (boundary - THREE.sample(0, 500).mean(axis=0))
+    beyond = THREE.centre + 1.001 * (boundary - THREE.sample(0, 500).mean(axis=0))
     assert THREE.contains(boundary).all()
-    assert not THREE.contains(beyond + THREE.sample(0, 500).mean(axis=0) - THREE.center).any()
+    assert not THREE.contains(beyond + THREE.sample(0, 500).mean(axis=0) - THREE.centre).any()
 
 
 def test_arc_of_unequal_balls_ends_where_a_contact_stays_closed():

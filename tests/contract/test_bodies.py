@@ -136,15 +136,15 @@ def heap():
         slopes = jax.jacobian(body.gap_function)(q)
         return body.contacts(q), slopes, body.tangents(q), body.valid(q)
 
-    return body, q, jax.tree.map(np.asarray, jax.jit(jax.vmap(look))(q))
+    return body, triangle, q, jax.tree.map(np.asarray, jax.jit(jax.vmap(look))(q))
 
 
 @pytest.mark.slow
 def test_gaps_are_distances(heap):
-    body, q, (found, _, _, valid) = heap
+    body, shape, q, (found, _, _, valid) = heap
     kinds = [k for k, (_, second) in enumerate(body.between) if second >= 0]
     assert [body.between[k] for k in kinds] == [(3, 4), (3, 2), (4, 0), (1, 0), (1, 0)]
-    triangle, seen = np.asarray(body.bodies[2].corners), 0
+    triangle, seen = np.asarray(shape.corners), 0
     for i, x in enumerate(q.reshape(-1, 5, 3)):
         at = turned(triangle, x[2, 2], x[2, :2])
         middle = x[4, :2] - turned([[0.05, 0.02]], x[4, 2])[0]
@@ -172,7 +172,7 @@ def test_gaps_are_distances(heap):
 
 def test_forces_act_at_the_contacts(heap):
     """Gradients by differentiation are the wrenches of unit normals; tangents are across them."""
-    body, q, (found, slopes, tangents, _) = heap
+    body, _, q, (found, slopes, tangents, _) = heap
     for i in range(0, len(q), 20):
         middle, n = q[i].reshape(-1, 3)[:, :2], found.normal[i]
         np.testing.assert_allclose(np.linalg.norm(n, axis=1), 1, atol=1e-14)
@@ -250,13 +250,13 @@ def polygons():
     def seen(q):
         return bodies.gap_function(q), bodies.valid(q)
 
-    return bodies, jax.jit(jax.vmap(seen))
+    return bodies, shapes, jax.jit(jax.vmap(seen))
 
 
 @pytest.mark.slow
 def test_polygons_choose_their_sides(polygons):
     """Anywhere the least gap is the distance; where they overlap it is negative."""
-    bodies, seen = polygons
+    bodies, _, seen = polygons
     rng = np.random.default_rng(0)
     low, high = [-0.5, -0.5, 0], [0.5, 0.5, 6.3]
     q = rng.uniform(4 * low, 4 * high, (300, 12))
@@ -274,18 +274,17 @@ def test_polygons_choose_their_sides(polygons):
     assert 50 < apart < 850
 
 
-def corner_on_side(bodies, below, above, path):
+def corner_on_side(shapes, below, above, path):
     """q (k, 12) with a corner of one polygon in the middle of a side of another.
 
     `path`: the direction of the side's normal, and the angle of the polygon `above`. How often the
     corner has changed.
     """
-    ring = bodies.bodies[below].ring
-    begin, end = np.asarray(bodies.bodies[below].corners)[list(ring[:2])]
+    begin, end = np.asarray(shapes[below].points)[0, :2]
     slope = np.arctan2(*(end - begin)[::-1]) - np.pi / 2  # of its normal, in its own axes
     rows, corners = [], []
     for way, angle in path:
-        own = turned(np.asarray(bodies.bodies[above].corners), angle)
+        own = turned(np.asarray(shapes[above].corners), angle)
         corners.append(int(np.argmin(own @ [np.cos(way), np.sin(way)])))
         q = 100.0 + 10 * np.arange(12.0)  # the others are far away
         q[3 * above : 3 * above + 3] = *-own[corners[-1]], angle
@@ -298,7 +297,7 @@ def corner_on_side(bodies, below, above, path):
 @pytest.mark.slow
 def test_contacts_of_odd_polygons_keep_their_places(polygons):
     """Rolling through full turns: contacts change places only where the next corner touches."""
-    bodies, seen = polygons
+    _, shapes, seen = polygons
     s = np.linspace(0.0, 1.0, 300)[:, None]
     for below, above, column, begin, end in (
         (2, 3, 2, [0.1, 0.2], [14.0, -9.0]),  # both odd: any way around each other
@@ -306,7 +305,7 @@ def test_contacts_of_odd_polygons_keep_their_places(polygons):
         (2, 0, 4, [2.1, 0.2], [2 * np.pi + 1.9, -15.0]),  # at most once around the triangle
         (0, 2, 4, [2.1 - np.pi, 0.2], [np.pi + 1.9, -14.0]),
     ):
-        q, count = corner_on_side(bodies, below, above, begin + s * (np.array(end) - begin))
+        q, count = corner_on_side(shapes, below, above, begin + s * (np.array(end) - begin))
         gaps, margin = (np.asarray(x) for x in seen(jnp.asarray(q)))
         pair = np.abs(gaps[:, column : column + 2])
         np.testing.assert_allclose(pair.min(axis=1), 0.0, atol=1e-14)
@@ -315,17 +314,16 @@ def test_contacts_of_odd_polygons_keep_their_places(polygons):
         assert len(set(((np.argmin(pair, axis=1) + count) % 2)[clear])) == 1
         assert count[-1] > 6
         assert (margin > 0).all()
-    at_cut, _ = corner_on_side(bodies, 2, 0, [[2.0, 0.2]])
+    at_cut, _ = corner_on_side(shapes, 2, 0, [[2.0, 0.2]])
     assert seen(jnp.asarray(np.repeat(at_cut, 300, axis=0)))[1][0] < 0
 
 
 @pytest.mark.slow
 def test_a_contact_keeps_its_place_where_sides_change():
     """A block turns about the edge of a table; beyond 45 degrees its base faces the table's side."""
-    table = ji.Bodies([ji.Block(0.4, 0.2), ji.Block(2.0, 1.0)], planes=())
+    shapes = ji.Block(0.4, 0.2), ji.Block(2.0, 1.0)
     for first in ((0, 1), (1, 0)):
-        bodies = [table.bodies[i] for i in first]
-        pair = ji.Bodies(bodies, planes=())
+        pair = ji.Bodies([shapes[i] for i in first], planes=())
         places = []
         for turn in (-0.1, -0.7, -0.9, -1.5):  # its base, 0.05 m left of the middle, is at the edge
             c, s = np.cos(turn), np.sin(turn)
@@ -482,7 +480,7 @@ def test_every_body_can_be_drawn():
 
 
 def test_bodies_without_contacts_and_gaps_of_another_shape_are_refused():
-    with pytest.raises(ValueError, match=r"m >= 1 contacts of Pile, but it returns \(0,\)"):
+    with pytest.raises(ValueError, match=r"m >= 1 contacts of Bodies, but it returns \(0,\)"):
         piles.discs(1.0, [0.1]).scene([0.0, 0.0, 0.0])
     with pytest.raises(ValueError, match=r"`gap_function` must return shape \(m,\).*\(1, 1\)"):
         ji.scene_from_gaps(lambda q: q[None], [1.0], [0.5])

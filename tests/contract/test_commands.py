@@ -252,7 +252,7 @@ def test_motions_of_several_bodies_and_a_base_in_space(tmp_path):
     bodies = MOTION.replace("width_m = 0.2\nheight_m = 0.6\n", f"{BODIES['Bodies']}\n")
     bodies = bodies.replace('kind = "block"', 'kind = "Bodies"').replace("horizontal", "vertical")
     system = ji.read_study(written(tmp_path, bodies)).system
-    assert system.body.bodies[0].radius == 0.1
+    assert system.body.rims[0] == 0.1
     np.testing.assert_array_equal(system.base_directions, [[0.0], [1.0], [0.0]])
     floating = MOTION.replace("block", "sphere").replace(
         "width_m = 0.2\nheight_m = 0.6", "radius_m = 1"
@@ -334,7 +334,7 @@ def test_simulate_in_space(tmp_path, capsys):
         (
             'kind = "block"',
             'kind = "car"',
-            "must be one of Block, Box, Coin, Column, Corner, Dimer, Disc, Pend",
+            "must be one of Block, Bodies, Box, Coin, Column, Corner, Dimer, Disc, Pend",
         ),
         ('kind = "block"', 'kind = "bodies"', "[system] must have the key `bodies`"),
         ('kind = "block"', 'kind = "pendulumcradle"', "must have the key `masses_kg`"),

@@ -207,7 +207,7 @@ def test_a_body_under_loads_is_a_system():
     assert float(system.potential(q)) == pytest.approx(2.0 * G * 0.7)
     with pytest.raises(ValueError, match="must not be given with a body"):
         ji.System(block, block.mass)
-    with pytest.raises(TypeError, match="GivenBody has no vertical"):
+    with pytest.raises(TypeError, match="FunctionBody has no vertical"):
         ji.System(block.gap_function, block.mass, gravity=True)
     with pytest.raises(ValueError, match="`potential`"):
         ji.System(block, potential=ji.gravity(block), gravity=True)

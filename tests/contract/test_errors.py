@@ -102,6 +102,19 @@ SCENES = [
     (lambda: ji.Polygon(TRIANGLE, inertia=1.0, centre=[1, 1]), r"`centre` must lie inside"),
     (lambda: ji.Disc(0.0), r"`radius`"),
     (lambda: ji.Disc(1.0, inertia=1.0, centre=[1.0, 0.1]), r"`centre`"),
+    (lambda: ji.Disc(0.1, inertia=1.0, centre=[0.2, 0.0]), r"`centre` must be at most 0\.1 m"),
+    (lambda: ji.Bodies(ji.Disc(1.0)), r"`bodies` must be a list of bodies"),
+    (lambda: ji.Bodies([ji.Disc(1.0)], planes=0.3), r"`planes` must be a list"),
+    (lambda: ji.Bodies([ji.Disc(1.0)] * 2, pairs=[(0, 0.5)]), r"bodies 0 to 1"),
+    (lambda: ji.Bodies([ji.Disc(1.0)]).touching(plane=3), r"`plane` must be one of 0"),
+    (lambda: ji.Bodies([ji.Disc(1.0)]).at([0.0, 1.0]), r"`positions` must have shape \(1, 2\)"),
+    (
+        lambda: ji.Bodies([ji.Sphere(1.0)], fixed=[ji.Sphere(1.0)], places=[np.full(7, 2.0)]),
+        r"`quaternion` must have length 1",
+    ),
+    (lambda: ji.Bodies([ji.Coin(0.1, 0.02)]), r"a Coin with round rims: give it `corners`"),
+    (lambda: ji.Block(1.0, 1.0).at([0.0, 1.0, 0.0]), r"`position` must have shape \(2,\)"),
+    (lambda: ji.plot.system(ji.Block(1.0, 1.0), [np.nan] * 3), r"`state` must be finite"),
     (lambda: ji.Bodies([ji.Column([1.0])]), r"`bodies` must hold planar bodies"),
     (lambda: ji.Bodies([ji.Disc(1.0)], []), r"must give a contact"),
     (lambda: ji.Bodies([ji.Disc(1.0)], [np.nan]), r"`planes`"),
@@ -268,7 +281,7 @@ SYSTEMS = [
     ),
     (lambda: ji.System(lambda q: q, [1.0], base=lambda t: t), "`base_directions` must be given"),
     (lambda: ji.System(lambda q: q, [[1.0, 2.0], [2.0, 1.0]]), "`mass` must be positive definite"),
-    (lambda: ji.System(None, [1.0]), "`gap_function` must be a function"),
+    (lambda: ji.System(None, [1.0]), "`gap_function` must be a body or a function"),
     (
         lambda: ji.simulate(
             ji.System(ji.Block(1.0, 1.0), gravity=True, friction=[0.1, 0.2]),

@@ -89,25 +89,25 @@ def run(name, mass, normals, tangents, v, e, mu, e_t=0.0, k=1.0):
 # ---------------------------------------------------------------------------- one contact
 
 MASS, RADIUS, INERTIA = 2.0, 0.5, 0.2
-DISK = (
+DISC = (
     np.array([MASS, MASS, INERTIA]),
     np.array([[0.0], [1.0], [0.0]]),
     np.array([[1.0], [0.0], [RADIUS]]),
-)  # (x, y, turn) of a disk on the ground
+)  # (x, y, turn) of a disc on the ground
 
 
 @pytest.mark.parametrize(
     "name",
     [pytest.param(x, marks=[] if x == "moreau" else [pytest.mark.release]) for x in LAWS],
 )
-def test_disk_in_closed_form(name):
+def test_disc_in_closed_form(name):
     """It sticks for `-(1 + e_t) v_t / W_tt`; friction gives at most mu p of that."""
     e_ts = (-0.3, 0.0, 1.0) if name in KINEMATIC or name == "poisson" else (0.0,)
     grid = np.array(list(itertools.product((0.0, 0.1, 0.4, 50.0), e_ts, (-2.0, 0.3), (0.0, 1.5))))
     mu, e_t, x_rate, turn = grid.T
     e, y_rate, count = 0.6, -1.3, len(grid)
     v = np.stack([x_rate, np.full(count, y_rate), turn], axis=1)
-    scenes = (np.tile(x, (count, *(1,) * np.ndim(x))) for x in DISK)
+    scenes = (np.tile(x, (count, *(1,) * np.ndim(x))) for x in DISC)
     out, _ = run(name, *scenes, v, np.full(count, e), mu, e_t)
     slip = x_rate + RADIUS * turn
     p = MASS * (1 + e) * 1.3
@@ -127,7 +127,7 @@ def test_disk_in_closed_form(name):
     if name == "poisson":
         return
     stuck = np.abs(side) < mu * p  # v_t+ = -e_t v_t-
-    close((out.velocity @ DISK[2][:, 0])[stuck], (-e_t * slip)[stuck], atol=off)
+    close((out.velocity @ DISC[2][:, 0])[stuck], (-e_t * slip)[stuck], atol=off)
     assert 0 < stuck.sum() < len(stuck)
 
 
@@ -283,7 +283,7 @@ def test_particle_of_example_6_2():
     bound = 2 * 0.3 / (1 - 0.5 - 0.3**2 * (1 + 0.5))
     close(bound, 1.64383561643835616, rtol=1e-14)
     v = np.stack([np.ones(7), -ratio, np.zeros(7)], axis=1)
-    particle = (DISK[0], DISK[1], np.array([[1.0], [0.0], [0.0]]))
+    particle = (DISC[0], DISC[1], np.array([[1.0], [0.0], [0.0]]))
     scenes = (np.tile(x, (7, *(1,) * np.ndim(x))) for x in particle)
     out, found = run("moreau", *scenes, v, 0.5 * np.ones(7), 0.3 * np.ones(7))
     after = out.velocity
@@ -545,7 +545,7 @@ def test_lzb_in_space():
     again, _ = run("lzb", scenes[0], scenes[1], turned, scenes[3], e, mu, k=k)
     both = good & ~failed(again.status)
     close(again.velocity[both], out.velocity[both], atol=5e-7)
-    # x, y, z and the spins of a rolling ball: along (.6, .8) it is the disk
+    # x, y, z and the spins of a rolling ball: along (.6, .8) it is the disc
     ball = np.diag([1.0, 1.0, 1.0, 0.4, 0.4, 1.0])
     up = np.array([0, 0, 1.0, 0, 0, 0])[:, None]
     both = np.zeros((6, 2))

@@ -32,7 +32,7 @@ ORDERS = {
     "impulse_euler": (np.logspace(-2, -3.5, 4), 0.8, 1.3, 3e-4),
     "verlet": (np.logspace(-0.7, -2.5, 5), 1.7, 2.5, 5e-6),
     "rk4": (np.logspace(-0.7, -2.5, 5), 1.7, 3.2, 5e-7),
-    "dop853": ([1e-4, 1e-6, 1e-8], 0.5, 1.8, 1e-7),
+    "time": ([1e-4, 1e-6, 1e-8], 0.5, 1.8, 1e-7),
     "scipy_dop853": ([1e-4, 1e-6, 1e-8], 0.5, 1.8, 1e-6),
 }
 
@@ -98,8 +98,8 @@ def test_gradients_and_the_other_methods():
     assert all("gradient" not in axes.get_xlabel() for axes in bare.axes)
 
 
-# of a disk on the ground that slides as it falls: mass 2, inertia 0.2, radius 0.5
-DISK = ji.Scene([2.0, 2.0, 0.2], [[0.0], [1.0], [0.0]], tangents=[[1.0], [0.0], [0.5]])
+# of a disc on the ground that slides as it falls: mass 2, inertia 0.2, radius 0.5
+DISC = ji.Scene([2.0, 2.0, 0.2], [[0.0], [1.0], [0.0]], tangents=[[1.0], [0.0], [0.5]])
 
 
 SLIDES, SLIP = [2.0, -1.0, 0.0], 2.0
@@ -121,13 +121,13 @@ def on_the_ground(name):
 def test_chart_of_a_box_on_a_corner():
     """In space: the exact method at two tolerances, order 1 of Verlet, scipy; slopes in mu."""
     scene, velocity, law = on_the_ground("corner")
-    ladder = {"dop853": [1e-4, 1e-7], "verlet": [0.03, 0.003], "scipy_radau": [1e-6]}
+    ladder = {"time": [1e-4, 1e-7], "verlet": [0.03, 0.003], "scipy_radau": [1e-6]}
     laws = {"moreau": ji.Moreau(0.3, friction=0.3)}
     sizes = {"batch": 4, "repeats": 1}
     chart = ji.work_precision(scene, velocity, law, list(ladder), ladder, laws, **sizes)
     error = {n: [x.error["velocity"] for x in row] for n, row in chart.points.items()}
-    assert error["dop853"][0] < 1e-3
-    assert error["dop853"][1] < 1e-6
+    assert error["time"][0] < 1e-3
+    assert error["time"][1] < 1e-6
     assert error["verlet"][1] < 0.2 * error["verlet"][0] < 0.01
     assert error["scipy_radau"][0] < 1e-5
     assert 1e-3 < error["moreau"][0] < 1
@@ -142,7 +142,7 @@ def test_chart_of_a_box_on_a_corner():
         ({"law": ji.LZB(0.5, friction=0.1)}, ValueError, "`scene` must have tangents"),
         (
             {
-                "scene": DISK,
+                "scene": DISC,
                 "velocity": SLIDES,
                 "law": ji.LZB(0.5, friction=0.1),
                 "methods": ["rk4"],
@@ -332,9 +332,9 @@ def test_stability_map_of_a_scene_with_friction():
     axes = {"setting": [0.35, 0.8], "friction": [0.05, 2.0]}
     base = {"exponent": 1.5, "restitution": 0.6, "friction": 2.0, "setting": 0.6}
     result = ji.stability_map(
-        ["default", "verlet"], axes, base, scene=rod(1.2), velocity=[0.5, -1, 0], max_steps=2000
+        ["time", "verlet"], axes, base, scene=rod(1.2), velocity=[0.5, -1, 0], max_steps=2000
     )
-    assert result.counts("default")["right"] == 4
+    assert result.counts("time")["right"] == 4
     setting, friction = result.slices["verlet"]
     assert setting.error[1] < 0.2 * setting.error[0]
     assert friction.error.max() < 5e-3
@@ -355,18 +355,18 @@ def test_stability_map_of_a_scene_with_friction():
         (lambda: ji.stability_map(samples=-1), "`samples`"),
         (lambda: ji.stability_map(resolution=1), "`resolution`"),
         (lambda: ji.stability_map(axes={"friction": [0.1]}), "`axes` must be one of"),
-        (lambda: ji.stability_map(scene=DISK), "`velocity` must be given"),
+        (lambda: ji.stability_map(scene=DISC), "`velocity` must be given"),
         (lambda: ji.stability_map(velocity=SLIDES), "`velocity` must be None"),
         (
-            lambda: ji.stability_map(scene=DISK, velocity=[0.0, 1.0, 0.0]),
+            lambda: ji.stability_map(scene=DISC, velocity=[0.0, 1.0, 0.0]),
             "`velocity` must let a closed",
         ),
         (
-            lambda: ji.stability_map(["rk4"], scene=DISK, velocity=SLIDES),
+            lambda: ji.stability_map(["rk4"], scene=DISC, velocity=SLIDES),
             "`methods` must be one of",
         ),
         (
-            lambda: ji.stability_map(axes={"balls": [2]}, scene=DISK, velocity=SLIDES),
+            lambda: ji.stability_map(axes={"balls": [2]}, scene=DISC, velocity=SLIDES),
             "`axes` must be one of",
         ),
     ],

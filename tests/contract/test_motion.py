@@ -540,7 +540,7 @@ def test_discs_are_a_body_like_others():
             pile.tangents(q),
         )
     )(q)
-    order = [(0, 1), (0, 2), (1, 2)] + [(i, 3 + w) for i in range(3) for w in range(2)]
+    order = [(i, 3 + w) for w in range(2) for i in range(3)] + [(0, 1), (0, 2), (1, 2)]
     names = [i * 5 + j for i, j in order]
     closed = np.asarray(near.closed)
     assert sorted(np.asarray(near.number)[closed]) == [1, 2, 3, 8, 13]

@@ -127,7 +127,7 @@ def built(make, *given, at=(), **options):
     return jax.jit(scene)()
 
 
-def around_a_disk(phi, masses, m0, radius=1.0, radii=(1.0,) * 3, gaps=(0.0,) * 3):
+def around_a_disc(phi, masses, m0, radius=1.0, radii=(1.0,) * 3, gaps=(0.0,) * 3):
     """Balls around a disc, contact i with ball i."""
     balls = [ji.Disc(r, m, 0.4 * m * r**2) for r, m in zip(radii, masses)]
     pairs = [(i + 1, 0) for i in range(len(phi))]
@@ -177,10 +177,10 @@ def test_kinetic_angles_of_bodies():
     corner = jax.jit(jax.vmap(lambda a: ji.kinetic_angles(ji.Corner(a, 2.0).scene())[0, 1]))
     np.testing.assert_allclose(corner(np.array([0.1, 1.2, 3.0])), [0.1, 1.2, 3.0], atol=1e-14)
     phi, masses, m0 = np.array([0.3, 1.9, -2.0]), np.array([0.5, 0.7, 2.0]), 1.5
-    disk = built(around_a_disk, phi, masses, m0, 0.3, [0.1, 0.2, 0.1])
+    disc = built(around_a_disc, phi, masses, m0, 0.3, [0.1, 0.2, 0.1])
     g = np.cos(phi[:, None] - phi) / np.sqrt((1 + m0 / masses)[:, None] * (1 + m0 / masses))
     away = ~np.eye(3, dtype=bool)
-    found = dense(jax.jit(ji.theory.normalized_delassus)(disk))
+    found = dense(jax.jit(ji.theory.normalized_delassus)(disc))
     np.testing.assert_allclose(found[away], g[away], atol=1e-14)
 
 
@@ -266,12 +266,12 @@ def test_dimer_in_space():
 
 
 def test_bodies_that_are_chains():
-    """Balls around a disk, pendulums at rest."""
-    scene = built(around_a_disk, [np.pi, 0.0], [1.0, 3.0], 2.0)
+    """Balls around a disc, pendulums at rest."""
+    scene = built(around_a_disc, [np.pi, 0.0], [1.0, 3.0], 2.0)
     chain = ji.chain([1.0, 2.0, 3.0])
     w = dense(ji.delassus_matrix(chain))
     np.testing.assert_allclose(dense(ji.delassus_matrix(scene)), w, atol=1e-14)
-    off = built(around_a_disk, [np.pi, 0.0], [1.0, 1.0], 1.0, gaps=[0.0, 0.25])
+    off = built(around_a_disc, [np.pi, 0.0], [1.0, 1.0], 1.0, gaps=[0.0, 0.25])
     np.testing.assert_allclose(off.gaps, [0.0, 0.25], atol=1e-12)
     assert np.asarray(off.closed).tolist() == [True, False]
     scene = built(ji.PendulumCradle, [1.0, 2.0, 3.0], 0.3, 0.02)
@@ -279,15 +279,15 @@ def test_bodies_that_are_chains():
     np.testing.assert_allclose(dense(ji.delassus_matrix(scene)), w, atol=1e-13)
 
 
-def test_balls_roll_around_a_disk():
+def test_balls_roll_around_a_disc():
     """Sliding is the difference of the two bodies' velocities where they touch."""
-    phi, disk, ball = np.array([0.3, 1.9]), 0.3, np.array([0.1, 0.2])
-    scene = built(around_a_disk, phi, [1.0, 1.0], 1.0, disk, ball)
+    phi, disc, ball = np.array([0.3, 1.9]), 0.3, np.array([0.1, 0.2])
+    scene = built(around_a_disc, phi, [1.0, 1.0], 1.0, disc, ball)
     v = np.array([0.2, -0.5, 3.0, 0.7, 0.1, -2.0, -0.3, 0.4, 5.0])
     for contact, angle in enumerate(phi):
         along = np.array([-np.sin(angle), np.cos(angle)])
         rolling = v[3 * contact + 3 : 3 * contact + 6]
-        slip = (rolling[:2] - v[:2]) @ along - ball[contact] * rolling[2] - disk * v[2]
+        slip = (rolling[:2] - v[:2]) @ along - ball[contact] * rolling[2] - disc * v[2]
         np.testing.assert_allclose(scene.tangents[:, contact] @ v, -slip, atol=1e-14)
 
 

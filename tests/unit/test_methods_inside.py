@@ -20,21 +20,21 @@ BALLS, STRIKE = ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0]
 HERTZ = ji.LZB([0.9, 0.9], [1.0, 1.0], 1.5)
 
 
-# of a disk on the ground that slides as it falls: mass 2, inertia 0.2, radius 0.5
-DISK = ji.Scene([2.0, 2.0, 0.2], [[0.0], [1.0], [0.0]], tangents=[[1.0], [0.0], [0.5]])
+# of a disc on the ground that slides as it falls: mass 2, inertia 0.2, radius 0.5
+DISC = ji.Scene([2.0, 2.0, 0.2], [[0.0], [1.0], [0.0]], tangents=[[1.0], [0.0], [0.5]])
 
 
 SLIDES, SLIP = [2.0, -1.0, 0.0], 2.0
 
 
 def test_verlet_with_friction():
-    """A disk in closed form: slip is a step of order 2, what sticks creeps by O(step)."""
+    """A disc in closed form: slip is a step of order 2, what sticks creeps by O(step)."""
 
     @jax.jit
     @jax.vmap
     def run(mu, step):
         law = ji.LZB(0.6, friction=mu)
-        return outcome(law, DISK, SLIDES, CONTENDERS["verlet"].solve(law, DISK, SLIDES, step))
+        return outcome(law, DISC, SLIDES, CONTENDERS["verlet"].solve(law, DISC, SLIDES, step))
 
     steps, mu = np.array([0.03, 0.003]), np.array([0.1, 2.0])
     out = run(np.repeat(mu, 2), np.tile(steps, 2))

@@ -87,7 +87,7 @@ def energy_plane():
 def chart(gradients):
     time, far = Timing(1.2e-5, 1e-5, 2e-5), Timing(3.4e-5, 3e-5, 6e-5)
     points = {}
-    for k, name in enumerate(("dop853", "rk4", "verlet", "impulse_euler", "scipy_lsoda")):
+    for k, name in enumerate(("time", "rk4", "verlet", "impulse_euler", "scipy_lsoda")):
         points[name] = tuple(
             Point(
                 f"method number {k} with a long name (default)",
@@ -131,7 +131,7 @@ AXES = {
 
 def stability():
     base = {name: float(values[1]) for name, values in AXES.items()}
-    methods = ("default", "rk4", "impulse_euler")
+    methods = ("time", "rk4", "impulse_euler")
 
     def piece(names):
         shape = tuple(len(AXES[name]) for name in names)

@@ -12,7 +12,7 @@ from jimpact.compiling import full_precision
 from jimpact.scene import Scene, check_mass
 
 
-class GivenBody(Body):
+class FunctionBody(Body):
     """A body given by functions, see `System` and `scene_from_gaps`."""
 
     gaps: Callable[[jax.Array], jax.Array]
@@ -25,7 +25,8 @@ class GivenBody(Body):
             ("tangent_function", tangent_function),
         ):
             if not (callable(function) or (function is None and name != "gap_function")):
-                raise TypeError(f"Argument `{name}` must be a function, but is {function!r}.")
+                kinds = "a body or a function" if name == "gap_function" else "a function"
+                raise TypeError(f"Argument `{name}` must be {kinds}, but is {function!r}.")
         self.gaps, self.sliding = gap_function, tangent_function
         if callable(mass):
             self.mass_argument = mass
@@ -85,4 +86,4 @@ def scene_from_gaps(
     >>> bouncing.normals.tolist()
     [[0.0], [1.0]]
     """
-    return GivenBody(gap_function, mass).scene(q, closed_below)
+    return FunctionBody(gap_function, mass).scene(q, closed_below)

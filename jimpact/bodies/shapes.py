@@ -1,0 +1,606 @@
+"""Rigid bodies by their shapes: in the plane over the ground, in space over a plane."""
+
+import itertools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact._checks import (
+    as_float_array,
+    as_numbers,
+    as_whole,
+    check_choice,
+    check_values,
+    is_traced,
+)
+from jimpact.bodies.base import CIRCLE, lengths, number, positive, positives
+from jimpact.bodies.rigid import ContactPoints, RigidBody, Shape, rotation
+from jimpact.compiling import full_precision
+from jimpact.scene import check_mass
+
+# [rad] of a round coin over its plane: below it the lowest points of its rims turn about the axis
+# within a few steps. Ten times more ends motions of coins that fall flat earlier.
+FLAT = 1e-3
+LEVEL = (0.0, 0.0, 1.0)  # the normal of a level ground
+_FULL_TURN = 1e-6  # [rad] rounding of the angles of a polygon; ten times more would do as well
+_SLACK = 1e-6  # of a moment of inertia: rounding of the largest one, of a thin plate
+_CONVEX = "must be those of a convex polygon, in order around it"
+_SIGNS = np.array([*itertools.product((-1.0, 1.0), repeat=3)])  # corners of a box
+
+
+class _PlanarBody(RigidBody):
+    """A body over the ground y = 0; q = (x, y, theta) of its centre of mass."""
+
+    def _make(
+        self, points: jax.Array, mass: Any, inertia: Any, shape: Shape, rim: Any = 0.0
+    ) -> None:
+        """Set what all bodies have."""
+        self._set(points, mass, positive("inertia", inertia)[None], shape, rim, (0.0, 1.0))
+
+
+class Block(_PlanarBody):
+    """A rigid rectangle over the ground; q = (x, y, theta) of its centre, counter-clockwise.
+
+    Equation: `f_{1,2} = y - (l/2) cos(theta) +/- (L/2) sin(theta)`, width L, height l; contact 1
+    is the right lower corner B, contact 2 the left one A. Tangents are the corners' positions
+    along the ground, `x + (l/2) sin(theta) +/- (L/2) cos(theta)`. Contacts 3 and 4 are the left
+    and the right upper corner: overturned, the block lies on another side.
+
+    Args:
+        width: L > 0 [m].
+        height: l > 0 [m].
+        mass: m > 0 [kg].
+        inertia: I about the centre [kg m^2]; None: homogeneous, `m (l^2 + L^2) / 12`.
+        corners: 'all' four; or 'base', the lower two of the literature on rocking: then the gap
+            function holds while no upper corner is below the ground, see `valid`.
+
+    Raises:
+        ValueError: sizes, mass or inertia not positive, another word for `corners`.
+
+    Source: Brogliato, Nonsmooth Mechanics (2016), (6.74).
+
+    >>> import jimpact as ji
+    >>> block = ji.Block(width=1.0, height=2.0, mass=3.0)
+    >>> block.scene([0.0, 1.5, 0.0]).gaps.tolist()
+    [0.5, 0.5, 2.5, 2.5]
+    >>> ji.Block(1.0, 2.0, corners="base").gap_function(block.touching()).tolist()
+    [0.0, 0.0]
+    """
+
+    def __init__(
+        self,
+        width: Any,
+        height: Any,
+        mass: Any = 1.0,
+        inertia: Any = None,
+        corners: str = "all",
+    ):
+        width, height = positive("width", width), positive("height", height)
+        if inertia is None:
+            inertia = positive("mass", mass) * (height**2 + width**2) / 12
+        check_choice("corners", corners, ("all", "base"))
+        w, h = 0.5 * width, 0.5 * height
+        points = jnp.stack([jnp.stack([-w, w, w, -w]), jnp.stack([-h, -h, h, h])], axis=1)
+        order = (1, 0, 3, 2) if corners == "all" else (1, 0)
+        self._make(points, mass, inertia, Shape(order, 4, True, False))
+
+    @property
+    def range_in_words(self) -> str:  # type: ignore[override]
+        """What `valid` asks for."""
+        return "no upper corner below the ground: or give corners='all'"
+
+    def valid(self, q: jax.Array) -> jax.Array:
+        """With the lower corners only: height () of the lower one of the upper corners [m]."""
+        if len(self.shapes[0].order) == 4:
+            return super().valid(q)
+        return jnp.min(self.placed(q).points[0, 2:, 1])
+
+
+class Polygon(_PlanarBody):
+    """A convex polygon over the ground; q = (x, y, theta) of its centre of mass.
+
+    Equation: `f_i = y + (R(theta) c_i)_y`, c_i corner i from the centre of mass; tangents are the
+    corners' positions along the ground, `x + (R(theta) c_i)_x`. One contact a corner, in the order
+    given: a polygon may land on any side, and its gap function holds everywhere.
+
+    Args:
+        corners: (k, 2) around the polygon, k >= 3, in a frame of its own [m]. Traced ones must
+            be in counter-clockwise order.
+        mass: m > 0 [kg].
+        inertia: I about the centre of mass [kg m^2]; None: homogeneous.
+        centre: (2,) of mass, inside, in the frame of the corners [m]; None: homogeneous. With it
+            goes an `inertia`.
+
+    Raises:
+        ValueError: corners that are not those of a convex polygon, a mass or an inertia that is not
+            positive, a centre of mass that is outside or has no inertia.
+
+    Source: areas and moments by Green's theorem.
+
+    >>> import jimpact as ji
+    >>> wedge = ji.Polygon([[0.0, 0.0], [3.0, 0.0], [0.0, 3.0]], mass=2.0)
+    >>> wedge.scene(wedge.touching(0.0)).closed.tolist()
+    [True, True, False]
+    >>> wedge.corners[0].tolist()
+    [-1.0, -1.0]
+    """
+
+    def __init__(self, corners: Any, mass: Any = 1.0, inertia: Any = None, centre: Any = None):
+        c = as_float_array("corners", corners)
+        if c.ndim != 2 or c.shape[1] != 2 or c.shape[0] < 3:
+            raise ValueError(f"Argument `corners` must have shape (k, 2), k >= 3, not {c.shape}.")
+        check_values("corners", c)
+        order = _around(c)
+        c = c[np.array(order)]
+        middle, about_middle = _moments(c)
+        inertia = _given_inertia(inertia, positive("mass", mass) * about_middle, centre)
+        if centre is not None:
+            middle = as_numbers("centre", centre, (2,), "a vector")
+        points = c - middle[None]
+        if not is_traced(points) and not float(inner_radii(points[None])[0]) > 0:
+            raise ValueError(
+                f"Argument `centre` must lie inside the polygon, but has value {middle.tolist()}."
+            )
+        self._make(points, mass, inertia, Shape(order, len(order), True, False))
+
+
+class Disc(_PlanarBody):
+    """A disc over the ground; q = (x, y, theta) of its centre of mass.
+
+    Equation: `f = y + (R(theta) c)_y - r`, c the middle of the disc from the centre of mass; its
+    lowest point slides at `x' + r theta'` where c = 0.
+
+    Args:
+        radius: r > 0 [m].
+        mass: m > 0 [kg].
+        inertia: I about the centre of mass [kg m^2]; None: homogeneous, `m r^2 / 2`.
+        centre: (2,) of mass, from the middle of the disc and within it [m]; with it goes an
+            `inertia`. None: the middle.
+
+    Raises:
+        ValueError: sizes, mass or inertia not positive, a centre of mass that is outside or has no
+            inertia.
+
+    >>> import jimpact as ji
+    >>> ji.Disc(0.5, mass=2.0).scene([0.0, 0.75, 0.0]).gaps.tolist()
+    [0.25]
+    """
+
+    def __init__(self, radius: Any, mass: Any = 1.0, inertia: Any = None, centre: Any = None):
+        radius = positive("radius", radius)
+        inertia = _given_inertia(inertia, 0.5 * positive("mass", mass) * radius**2, centre)
+        shape, middle = _round_shape(radius, centre, 2, True)
+        self._make(middle[None], mass, inertia, shape, radius)
+
+
+class Dimer(_PlanarBody):
+    """Two equal spheres on the ends of a rod, in a vertical plane; q = (x, y, theta).
+
+    Equation: `f_{1,2} = y +/- (L/2 + R) sin(theta) - R`, contact 1 the right sphere. The lowest
+    point of a sphere slides at `v_t = x' -/+ (L/2 + R) sin(theta) theta' + R theta'`.
+
+    Args:
+        radius: R >= 0 of the spheres [m].
+        length: L >= 0 of the rod between their surfaces [m]; 0: the spheres touch (R > 0).
+        sphere_mass: of one sphere, > 0 [kg].
+        rod_mass: of the thin rod, >= 0 [kg].
+
+    Raises:
+        ValueError: a size or mass that is negative, no mass of the spheres, no size at all.
+
+    Source: Brogliato, Nonsmooth Mechanics (2016), Remark 6.11.
+
+    >>> import jimpact as ji
+    >>> dimer = ji.Dimer(radius=1.0, length=2.0)
+    >>> dimer.scene(dimer.touching(0.1)).closed.tolist()
+    [False, True]
+    >>> dimer = ji.Dimer(radius=5 / 24, length=1.0)  # where the kinetic angle is least
+    >>> round(float(ji.kinetic_angles(dimer.scene())[0, 1]), 6)
+    1.424204
+    """
+
+    def __init__(self, radius: Any, length: Any, sphere_mass: Any = 1.0, rod_mass: Any = 1.0):
+        radius = positive("radius", radius, low_allowed=True)
+        ends, mass, inertia = _dimer(radius, length, sphere_mass, rod_mass)
+        self._make(ends, mass, inertia, Shape((0, 1), 2, False, False), radius)
+
+
+# --------------------------------------------------------------------------------- in space
+
+
+class _SpatialBody(RigidBody):
+    """A body over a plane through the origin, q = (x, y, z, e_0, e_1, e_2, e_3); see `RigidBodies`.
+
+    Contact i slides along two directions in the plane, the first one that of x.
+    """
+
+    def _make(
+        self,
+        points: jax.Array,
+        mass: Any,
+        inertia: Any,
+        homogeneous: jax.Array,
+        centre: Any,
+        normal: Any,
+        shape: Shape,
+        rim: Any = 0.0,
+    ) -> None:
+        """Set what all bodies have; `homogeneous` are the moments of inertia over the mass."""
+        inertia = _given_inertia(inertia, positive("mass", mass) * homogeneous, centre)
+        n = as_numbers("normal", normal, (3,), "a vector")
+        if not is_traced(n) and not float(n[2]) > 0:
+            raise ValueError(
+                f"Argument `normal` must point up (its z > 0), but has value {n.tolist()}."
+            )
+        n = n / jnp.sqrt(jnp.sum(n**2))
+        self._set(points, mass, _moments_in_space(inertia), shape, rim, n)
+
+
+class Box(_SpatialBody):
+    """A box in space over a plane; one contact per corner, eight contacts.
+
+    Equation: c_i = middle + (+/- a/2, +/- b/2, +/- c/2), contacts in the order (-,-,-), (-,-,+),
+    (-,+,-), ... (+,+,+) of the body's axes; with `rounding` r, spheres that touch the sides.
+    `f_i = n . (x + R(e) c_i) - r`; q = (x, y, z, e_0, e_1, e_2, e_3), x the centre of mass, e a
+    unit quaternion, scalar first; velocities (x', omega), omega in the body's axes.
+
+    Args:
+        sizes: (a, b, c) > 0 [m].
+        mass: m > 0 [kg].
+        inertia: about the centre of mass, (3,) along the body's axes or (3, 3) [kg m^2]; None:
+            homogeneous, `m (b^2 + c^2) / 12`, ...
+        centre: (3,) of mass, from the middle of the box and inside it [m]; with it goes an
+            `inertia`. None: the middle.
+        rounding: r >= 0 of the corners, at most half the shortest size [m].
+        normal: of the plane (3,), z > 0: (0, 0, 1) is level.
+
+    Raises:
+        ValueError: sizes, mass or inertia not positive, moments of inertia that no body has, a
+            centre of mass outside or without inertia, a rounding that does not fit.
+
+    Source: Featherstone, Rigid Body Dynamics Algorithms (2008), ch. 2 and 4.
+
+    >>> import jimpact as ji
+    >>> box = ji.Box([0.2, 0.1, 0.3], mass=2.0)
+    >>> scene = box.scene(box.touching())
+    >>> scene.closed.tolist()[:4], scene.tangents.shape
+    ([True, False, True, False], (6, 16))
+    """
+
+    def __init__(
+        self,
+        sizes: Any,
+        mass: Any = 1.0,
+        inertia: Any = None,
+        centre: Any = None,
+        rounding: Any = 0.0,
+        normal: Any = LEVEL,
+    ):
+        sizes = positives("sizes", as_float_array("sizes", sizes), 3)
+        rounding = positive("rounding", rounding, low_allowed=True)
+        middle = -as_numbers("centre", np.zeros(3) if centre is None else centre, (3,), "a vector")
+        if not is_traced((sizes, rounding, middle)):
+            half = 0.5 * np.asarray(sizes)
+            check_values("rounding", rounding, high=float(half.min()))
+            if not (np.abs(middle) < half).all():
+                raise ValueError(
+                    "Argument `centre` must lie inside the box, but has value "
+                    f"{(-np.asarray(middle)).tolist()}."
+                )
+        points = middle[None] + jnp.asarray(_SIGNS, sizes.dtype) * (0.5 * sizes - rounding)[None]
+        homogeneous = (jnp.sum(sizes**2) - sizes**2) / 12
+        shape = Shape(tuple(range(8)), 8, True, False)
+        self._make(points, mass, inertia, homogeneous, centre, normal, shape, rounding)
+
+    @property
+    def sizes(self) -> jax.Array:
+        """(a, b, c) [m]."""
+        return self.points[0, -1] - self.points[0, 0] + 2 * self.rims[0]
+
+
+class Sphere(_SpatialBody):
+    """A sphere in space over a plane; one contact; q and velocities as of `Box`.
+
+    Equation: `f = n . (x + R(e) c) - r`, c its middle from the centre of mass.
+
+    Args:
+        radius: r > 0 [m].
+        mass: m > 0 [kg].
+        inertia: about the centre of mass, scalar, (3,) along the body's axes or (3, 3) [kg m^2];
+            None: homogeneous, `2 m r^2 / 5`.
+        centre: (3,) of mass, from the middle and inside [m]; with it goes an `inertia`.
+        normal: of the plane (3,), z > 0: (0, 0, 1) is level.
+
+    Raises:
+        ValueError: as for `Box`.
+
+    >>> import jimpact as ji
+    >>> ball = ji.Sphere(0.1, mass=2.0)
+    >>> [round(float(x), 6) for x in ball.scene(ball.touching()).tangents[:, 0]]
+    [1.0, 0.0, 0.0, 0.0, -0.1, 0.0]
+    """
+
+    def __init__(
+        self,
+        radius: Any,
+        mass: Any = 1.0,
+        inertia: Any = None,
+        centre: Any = None,
+        normal: Any = LEVEL,
+    ):
+        radius = positive("radius", radius)
+        isotropic = inertia is None or np.ndim(inertia) == 0
+        if inertia is not None and isotropic:
+            inertia = jnp.stack([number("inertia", inertia)] * 3)
+        shape, middle = _round_shape(radius, centre, 3, isotropic)
+        homogeneous = jnp.stack([0.4 * radius**2] * 3)
+        self._make(middle[None], mass, inertia, homogeneous, centre, normal, shape, radius)
+
+
+class SpatialDimer(_SpatialBody):
+    """Two equal spheres on the ends of a rod in space over a plane; q and velocities as of `Box`.
+
+    Equation: the rod lies along the first axis of the body, `c_{1,2} = (+/- (L/2 + R), 0, 0)`;
+    `I = diag(I_a, I_t, I_t)`, `I_a = (4/5) m_s R^2`, I_t that of the planar `Dimer`.
+
+    Args:
+        radius: R > 0 of the spheres [m].
+        length: L >= 0 of the rod between their surfaces [m]; 0: the spheres touch.
+        sphere_mass: of one sphere, > 0 [kg].
+        rod_mass: of the thin rod, >= 0 [kg].
+        normal: of the plane (3,), z > 0: (0, 0, 1) is level.
+
+    Raises:
+        ValueError: a radius or mass that is not positive, a length that is negative.
+
+    Source: own derivation; the planar case is Brogliato, Nonsmooth Mechanics (2016), Remark 6.11.
+
+    >>> import jimpact as ji
+    >>> dimer = ji.SpatialDimer(radius=5 / 24, length=1.0)
+    >>> round(float(ji.kinetic_angles(dimer.scene())[0, 1]), 6)
+    1.424204
+    """
+
+    def __init__(
+        self,
+        radius: Any,
+        length: Any,
+        sphere_mass: Any = 1.0,
+        rod_mass: Any = 1.0,
+        normal: Any = LEVEL,
+    ):
+        radius = positive("radius", radius)  # without radius no inertia about the axis
+        ends, mass, across = _dimer(radius, length, sphere_mass, rod_mass)
+        along = 0.8 * positive("sphere_mass", sphere_mass) * radius**2
+        inertia = jnp.stack([along, across, across])
+        shape = Shape((0, 1), 2, False, False)
+        points = jnp.pad(ends, ((0, 0), (0, 1)))
+        self._make(points, mass, inertia, jnp.ones(3), None, normal, shape, radius)
+
+
+class Coin(_SpatialBody):
+    """A coin, or wheel, in space over a plane; its axis is the third one of the body.
+
+    Equation: with `u = R^T n` and `s = |(u_1, u_2)|` each of its two rims, at -h/2 and h/2 on the
+    axis, touches with its lowest point `c = (-a u_1 / s, -a u_2 / s, -/+ h/2)`: the coin rolls. A
+    coin that lies flat has no such point: with `corners=N` the rims are regular polygons, with a
+    contact a corner. So it lands flat and comes to rest, and clatters where the other one rolls.
+    q and velocities as of `Box`.
+
+    Args:
+        radius: a > 0 [m].
+        thickness: h > 0 [m].
+        mass: m > 0 [kg].
+        inertia: about the centre of mass, (3,) along the body's axes or (3, 3) [kg m^2]; None:
+            homogeneous, `m (3 a^2 + h^2) / 12` about a diameter, `m a^2 / 2` about the axis.
+        corners: N >= 3 of each rim, 2 N contacts, those of the rim at -h/2 first; 0: round rims,
+            2 contacts, `valid` down to an angle of 1e-3 rad between coin and plane.
+        normal: of the plane (3,), z > 0: (0, 0, 1) is level.
+
+    Raises:
+        ValueError: sizes, mass or inertia not positive, 1 or 2 corners.
+
+    Source: own derivation.
+
+    >>> import math, jimpact as ji
+    >>> coin, upright = ji.Coin(0.1, 0.02), [math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0]
+    >>> coin.scene(coin.touching(upright)).closed.tolist()
+    [True, True]
+    >>> ji.Coin(0.1, 0.02, corners=8).corners.shape
+    (16, 3)
+    """
+
+    disc: jax.Array  # radius and thickness (2,)
+
+    def __init__(
+        self,
+        radius: Any,
+        thickness: Any,
+        mass: Any = 1.0,
+        inertia: Any = None,
+        corners: int = 0,
+        normal: Any = LEVEL,
+    ):
+        radius, thickness = positive("radius", radius), positive("thickness", thickness)
+        self.disc = jnp.stack([radius, thickness])
+        corners = as_whole("corners", corners, 0)
+        if corners in (1, 2):
+            raise ValueError(
+                f"Argument `corners` must be 0 or at least 3, but has value {corners}."
+            )
+        angle = 2 * np.pi / max(corners, 1) * np.arange(corners)
+        points = self._rims(jnp.asarray(np.stack([np.cos(angle), np.sin(angle)], axis=1)))
+        across = (3 * radius**2 + thickness**2) / 12
+        homogeneous = jnp.stack([across, across, 0.5 * radius**2])
+        shape = Shape(tuple(range(len(points))), len(points), False, False)
+        self._make(points, mass, inertia, homogeneous, None, normal, shape)
+
+    def _rims(self, outward: jax.Array) -> jax.Array:
+        """Points (2 k, 3) of both rims in the directions `outward` (k, 2) from the axis."""
+        radius, thickness = self.disc
+        outward = outward.astype(self.disc.dtype)
+        levels = 0.5 * thickness * jnp.array([-1.0, 1.0], outward.dtype)
+        each = jnp.repeat(levels, len(outward))[:, None]
+        return jnp.concatenate([jnp.tile(radius * outward, (2, 1)), each], axis=1)
+
+    @property
+    def range_in_words(self) -> str:  # type: ignore[override]
+        """What `valid` asks for."""
+        return "a quaternion of length 1, and a round coin that does not lie flat"
+
+    @property
+    def middles(self) -> jax.Array:
+        """Its centre of mass."""
+        return jnp.zeros((1, 3), self.points.dtype)
+
+    @full_precision
+    def _toward(self, q: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """R (3, 3), and what the plane's normal is in the axes of the body (3,)."""
+        turn = rotation(q[3:])
+        return turn, self.planes[0, :3] @ turn
+
+    @full_precision
+    def contacts(self, q: jax.Array) -> ContactPoints:
+        """Those of its corners, or of the lowest points (2, 3) of round rims."""
+        if self.points.size:
+            return super().contacts(q)
+        turn, up = self._toward(q)
+        points = q[None, :3] + self._rims(-lengths(up[None, :2])[1]) @ turn.T
+        n = jnp.broadcast_to(self.planes[:, :3], points.shape)
+        return ContactPoints(jnp.sum(n * points, axis=1), points, n)
+
+    def pairs_in_contact(self) -> np.ndarray:
+        """It and the plane (m, 2)."""
+        return np.array([[0, -1]] * (self.points.shape[1] or 2), np.int32)
+
+    def valid(self, q: jax.Array) -> jax.Array:
+        """Of the quaternion; of round coins also the tilt beyond `FLAT`."""
+        length = super().valid(q)
+        if self.points.size:
+            return length
+        return jnp.minimum(length, lengths(self._toward(q)[1][None, :2])[0][0] - FLAT)
+
+    def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
+        """Its rims, or their corners, a diameter, and their shadow, in projection."""
+        corners = self.points.shape[1] // 2
+        around = np.linspace(0, 2 * np.pi, corners + 1)
+        ring = np.stack([np.cos(around), np.sin(around)], axis=1) if corners else CIRCLE
+        rims = np.asarray(self._rims(jnp.asarray(ring))).reshape(2, -1, 3)
+        across = np.asarray(self._rims(jnp.asarray([[-1.0, 0.0], [1.0, 0.0]])))
+        turn = np.asarray(rotation(jnp.asarray(q)[3:]))
+        curves = [q[:3] + curve @ turn.T for curve in (*rims, across[2:])]
+        return [line for curve in curves for line in self.with_shadow(curve)]
+
+
+# ------------------------------------------------------------------------------- construction
+
+
+def _given_inertia(inertia: Any, homogeneous: jax.Array, centre: Any) -> Any:
+    """The argument `inertia`, or that of a homogeneous body, whose centre of mass is known."""
+    if inertia is None and centre is not None:
+        raise ValueError("Argument `inertia` must be given with `centre`.")
+    return homogeneous if inertia is None else inertia
+
+
+def _round_shape(
+    radius: jax.Array, centre: Any, d: int, isotropic: bool
+) -> tuple[Shape, jax.Array]:
+    """Of a disc or sphere; and its middle (d,) from the centre of mass."""
+    middle = jnp.zeros(d, radius.dtype)
+    if centre is not None:
+        middle = -as_numbers("centre", centre, (d,), "a vector")
+        if not is_traced((middle, radius)) and not np.linalg.norm(middle) <= float(radius):
+            raise ValueError(
+                f"Argument `centre` must be at most {float(radius):g} m from the middle, but has "
+                f"value {(-middle).tolist()}."
+            )
+    return Shape((0,), 1, False, isotropic and centre is None), middle
+
+
+def _dimer(
+    radius: jax.Array, length: Any, sphere_mass: Any, rod_mass: Any
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Ends (2, 2), mass and inertia across the rod of a dimer."""
+    length = positive("length", length, low_allowed=True)
+    arm = 0.5 * length + radius  # of a sphere's centre from the middle
+    if not is_traced(arm) and arm <= 0:
+        raise ValueError("Argument `length` must be > 0 where `radius` is 0, but has value 0.")
+    sphere = positive("sphere_mass", sphere_mass)
+    rod = positive("rod_mass", rod_mass, low_allowed=True)
+    ends = arm * jnp.array([[1.0, 0.0], [-1.0, 0.0]], arm.dtype)
+    inertia = 2 * sphere * (0.4 * radius**2 + arm**2) + rod * length**2 / 12
+    return ends, 2 * sphere + rod, inertia
+
+
+def _moments_in_space(value: Any) -> jax.Array:
+    """Moments of inertia (3,), or their matrix (3, 3), that some body has [kg m^2]."""
+    inertia = as_float_array("inertia", value)
+    if inertia.shape not in ((3,), (3, 3)):
+        raise ValueError(f"Argument `inertia` must have shape (3,) or (3, 3), not {inertia.shape}.")
+    if is_traced(inertia):
+        return inertia
+    try:
+        check_mass(inertia)
+    except ValueError as error:
+        raise ValueError(str(error).replace("`mass`", "`inertia`").replace("M ", "I ")) from None
+    least = np.sort(inertia if inertia.ndim == 1 else np.linalg.eigvalsh(inertia))
+    if least[2] > (1 + _SLACK) * (least[0] + least[1]):
+        raise ValueError(
+            "Argument `inertia` must have principal moments none of which is more than the sum of "
+            f"the others, but has {least.tolist()}."
+        )
+    return inertia
+
+
+def _around(corners: jax.Array) -> tuple[int, ...]:
+    """Corners of a convex polygon in counter-clockwise order: as they are, or in reverse."""
+    k = corners.shape[0]
+    if is_traced(corners):
+        return tuple(range(k))
+    c = np.asarray(corners, float)
+    side = np.roll(c, -1, axis=0) - c
+    after = np.roll(side, -1, axis=0)
+    turn = np.arctan2(_cross(side, after), np.sum(side * after, axis=1))
+    around = np.sign(turn.sum())
+    bad = np.flatnonzero(~((turn * around > 0) & (turn * around < np.pi)))
+    if bad.size:
+        worst = int(bad[0] + 1) % k
+        raise ValueError(
+            f"Argument `corners` {_CONVEX}, but it does not turn the same way at corner {worst}, "
+            f"{c[worst].tolist()}."
+        )
+    if abs(abs(turn.sum()) - 2 * np.pi) > _FULL_TURN:
+        raise ValueError(f"Argument `corners` {_CONVEX}, but they go around it more than once.")
+    return tuple(range(k)) if around > 0 else tuple(reversed(range(k)))
+
+
+def _cross(a: Any, b: Any) -> Any:
+    """Cross products (..) of vectors (.., 2) in the plane."""
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
+@jax.jit  # operation by operation JAX would compile thirty programs
+def inner_radii(corners: jax.Array) -> jax.Array:
+    """Distances (b,) of the origin from the nearest sides of counter-clockwise polygons (b, K, 2).
+
+    Sides without length do not count: of a single point it is infinite.
+    """
+    side = jnp.roll(corners, -1, axis=1) - corners
+    length = jnp.sqrt(jnp.sum(side**2, axis=2))
+    away = _cross(corners, side) / jnp.where(length > 0, length, 1.0)
+    return jnp.min(jnp.where(length > 0, away, jnp.inf), axis=1)
+
+
+@jax.jit
+def _moments(ring: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Centroid (2,), and moment of inertia about it over the mass, of a homogeneous polygon."""
+    start = ring - ring[:1]  # about a corner: far from the origin, areas would cancel
+    end = jnp.roll(start, -1, axis=0)
+    twice = _cross(start, end)
+    area = jnp.sum(twice)
+    middle = jnp.sum((start + end) * twice[:, None], axis=0) / (3 * area)
+    squares = jnp.sum(start**2 + start * end + end**2, axis=1)
+    about_corner = jnp.sum(twice * squares) / (6 * area)
+    return ring[0] + middle, about_corner - jnp.sum(middle**2)
