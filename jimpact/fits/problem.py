@@ -59,7 +59,7 @@ PENALTY = 1e3  # times the largest measured value
 FEWEST, FEW = 4, 64
 # Problems that a program solves side by side: starts of one, and many problems. With ten times
 # more of them, all wait for the one whose impacts take longest.
-LANES, LANES_OF_MANY = 4, 64
+LANES, LANES_OF_MANY = 2, 64
 
 # Error of computed gap velocities, as a part of their noise. Ten times more: as large as the noise
 # itself, and the same in all shots.
@@ -510,6 +510,13 @@ class FitProblem:
         if passed:
             aux.append(slopes[..., count:])
         return residual, jacobian[:, :count], tuple(aux)
+
+    def squares(self, y: jax.Array) -> jax.Array:
+        """The sum of squares of the residual of `evaluate`, without derivatives."""
+        x = self._values(y)
+        data, _ = self._errors(self.law_in_scene(x))
+        of_priors = (x - self.prior_mean) * self.prior_weight
+        return (jnp.sum(data**2) + jnp.sum(of_priors**2)) / self.size**2
 
     def blank(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, Any]:
         """Zeros shaped like what `evaluate` gives of S such problems at y (S, Q), on the host."""

@@ -60,9 +60,8 @@ _ADAM_RATE, _SGD_RATE, _SGD_MOMENTUM = 0.1, 0.3, 0.9  # in y, where ranges are o
 PASSES = 4  # of a program, between two looks at the clock
 # A solve that lowers its sum of squares by less than this share in PASSES passes, although its
 # derivatives promise more, creeps along a kink of the law, where the sequence of contacts changes,
-# and is given up; one of several starts sooner, and the more if it is BEHIND times above the best.
-CREEPS, START_CREEPS, BEHIND, FALLS = 1e-3, 0.01, 10.0, 0.5
-
+# and is given up.
+CREEPS = 1e-3
 
 # Random starts: a stiffness within this factor of the user's, a parameter without two bounds
 # within this many natural scales of the user's.
@@ -79,14 +78,19 @@ SAME_COST, SAME_ERRORS, SAME_VALUE = 1e-2, 0.2, 1e-3
 # an impact are good to about 1e-7 (float64; 1e-4 in float32), so smaller ones may be errors.
 RANK_TOLERANCE = {"float64": 1e-6, "float32": 1e-3}
 # Starts up to so many variances above the best are solved to their ends, the others only to
-# where minima can be told apart: intervals of all levels end before.
-HARDLY_WORSE = 100.0
-STARTS, ROUNDS = 12, 6  # by default, and how often others around the best follow
-# Several stiffness ratios often reproduce the same shots. Where one or two are free, a search of
-# its own choice also starts from SCANNED values of each, up to this factor from the user's; ten
-# times more values take ten times as long, ten times fewer step over minima.
-SCANNED, SCAN_FACTOR, SCANS = 24, 100.0, 2
-NEAR_SPREAD = 2.0  # of starts around the best, in standard errors
+# where minima can be told apart, in so many steps: intervals of all levels end before.
+HARDLY_WORSE, ROUGH_STEPS = 30.0, 16
+STARTS, ROUNDS = 12, 8  # by default, and how often others around the best follow
+IDLE_PARAMETERS = 4  # a round without a gain is the last one, or the second of more parameters
+# A search of its own choice starts at the lowest of so many points: values alone cost a tenth of
+# derivatives. With ten times fewer the lowest minimum of six stiffness ratios is missed.
+SCANNED = 128
+SCAN_LANES = 8  # of them side by side
+SCAN_RTOL = 1e-4  # of these values, which need only be told apart; finer ones take twice as long
+# Several ratios often reproduce the same shots: one or two are scanned up to this factor.
+SCAN_FACTOR, SCANS = 100.0, 2
+# Starts around the best, in standard errors: nearer ones end in it, farther ones anywhere.
+NEAR_SPREAD, FAR_SPREAD = 2.0, 40.0
 SETTLED, SETTLING = 1e-5, 10  # change (natural scales) and rounds, where errors of v- are passed on
 
 
@@ -314,17 +318,17 @@ def minimize(
     points: np.ndarray,
     search: Search,
     stop: float = 0.0,
-    rivals: bool = False,
+    noise: float | None = None,
     what: str = "fits",
     fixed: np.ndarray | None = None,
 ) -> Ends:
     """Minima of S problems (`stacked`) from y (S, Q).
 
     As many as `problems.lanes(S)` are solved side by side; those that are done make room for
-    others. `stop`: see `FINE`, which it is at least. `rivals`: all are starts of one problem, and
-    those that creep or will not become the best are given up. Progress counts `what`. `fixed`
-    (S, Q): which entries of y stay as they are. A matrix that must be admissible is sought without
-    that, and then the best admissible one.
+    others. `stop`: see `FINE`, which it is at least. `noise`: all are starts of one problem, whose
+    residuals have this noise at least, and every few passes the worse half of them is given up
+    (successive halving). Progress counts `what`. `fixed` (S, Q): which entries of y stay as they
+    are. A matrix that must be admissible is sought without that, and then the best admissible one.
     """
     points = points.astype(problems.low.dtype)
     dtype, matrix = str(points.dtype), problems.matrix
@@ -332,7 +336,7 @@ def minimize(
         low, high = (np.where(fixed, points, end) for end in (problems.low, problems.high))
         problems, matrix = replace(problems, low=low, high=high), None
     problems = replace(problems, matrix=None)
-    rule = (max(FINE[dtype], stop), rivals, what)
+    rule = (max(FINE[dtype], stop), noise, what)
     states, converged = _descended(problems, points, search, *rule)
     y, steps, stuck = np.asarray(states.y), states.steps, states.stuck
     once, moved = search._replace(max_steps=1), np.full(len(y), matrix is not None)
@@ -385,7 +389,12 @@ def best_inside(matrix: Any, states: SolverState) -> jax.Array:
 
 
 def _descended(
-    problems: Any, points: np.ndarray, search: Search, stop: float, rivals: bool, what: str
+    problems: Any,
+    points: np.ndarray,
+    search: Search,
+    stop: float,
+    noise: float | None,
+    what: str,
 ) -> tuple[SolverState, np.ndarray]:
     """States where searches from y (S, Q) ended, and which have converged; see `minimize`."""
     dtype, count = points.dtype, len(points)
@@ -410,16 +419,24 @@ def _descended(
         converged = _converged(states, DESCENDED if descends else CONVERGED)
         ended = states.done | (states.steps >= search.max_steps)
         if not descends:
-            far = rivals & (states.cost > BEHIND * np.nanmin(states.cost))
-            least = np.where(far, FALLS, 1 - (START_CREEPS if rivals else CREEPS))
-            slow = (states.cost > least * before) & (states.memory.value < _SHORT)
-            ended |= slow & ~converged
+            creeps = (states.cost > (1 - CREEPS) * before) & (states.memory.value < _SHORT)
+            ended |= creeps & ~converged
         active = active[~ended[active]]
+        if noise is not None and not descends:
+            active = _better_half(states, active, noise / problems.size[0])
         done, steps = count - len(active), int(states.steps.max())
         search.show(f"fit: {done} of {count} {what} done, step {steps}", done, count)
         if time.monotonic() > search.deadline:
             break
     return states, converged
+
+
+def _better_half(states: SolverState, active: np.ndarray, noise: float) -> np.ndarray:
+    """Of the active starts the better half, and all that are hardly worse than the best of all."""
+    order, least = active[np.argsort(states.cost[active])], np.nanmin(states.cost)
+    variance = max(least / states.residual.shape[-1], 0.5 * noise**2)
+    hardly_worse = states.cost[order] <= least + HARDLY_WORSE * variance
+    return order[hardly_worse | (np.arange(len(order)) < len(order) // 2)]
 
 
 def _converged(states: SolverState, enough: float) -> np.ndarray:
@@ -529,33 +546,47 @@ def solution(
 def find_minima(problem: "FitProblem", starts: int | None, seed: int, search: Search) -> Solution:
     """All starts to where their minima can be told apart, and the best of these to their ends.
 
-    Two thirds of the starts are those of `start_points`. The law is only piecewise smooth, so
-    that the sum of squares has side minima close to a minimum: the others begin around the best.
-    None: STARTS, others along the ratios of stiffness, and further ones around the best as long as
-    they lower it.
+    Two thirds of the starts are those of `start_points`; where their number is left open, the
+    lowest of many such points, and further ones follow as long as they lower the sum of squares.
+    The law is only piecewise smooth, so that the sum of squares has side minima close to a minimum:
+    the others begin around the best.
     """
-    rounds, starts = (ROUNDS, STARTS) if starts is None else (1, starts)
-    rng, far = np.random.default_rng(seed), starts - starts // 3
-    points = start_points(problem, far, rng)
+    rng, count = np.random.default_rng(seed), STARTS if starts is None else starts
+    far = count - count // 3
+    log, noise = problem.parameters.log, 0.0 if problem.sigma is None else 1.0
+    if starts is None and (len(log) > 1 or log.any()):
+        points = _first_points(problem, far, rng)
+    else:
+        points = start_points(problem, far, rng)
+
+    first = search
+    if search.method == "levenberg-marquardt":
+        first = search._replace(max_steps=min(ROUGH_STEPS, search.max_steps))
 
     def rough(points: np.ndarray) -> Ends:
         """To where minima can be told apart."""
         many = stacked([problem], len(points))
-        return minimize(many, points, search, COARSE, rivals=True, what="starts")
+        return minimize(many, points, first, COARSE, noise, "starts")
 
-    if starts == 1:
+    if count == 1:
         return solution(problem, minimize(stacked([problem]), points, search, what="starts"))
-    if rounds > 1:
-        points = np.concatenate([points, _scanned(problem)])
     ends = rough(points)
-    for _ in range(rounds if starts > far else 0):
+    scanned = starts is None and len(log) > 1
+    idle = 0  # rounds without a gain, one after the other
+    for _ in range((ROUNDS if starts is None else 1) if count > far else 0):
         least = np.nanmin(ends.squares)
-        more = rough(_near(problem, ends, starts - far, rng))
+        points = _near(problem, ends, SCANNED if scanned else count - far, noise, rng)
+        if scanned:
+            points = _lowest(problem, points, count - far)
+        more = rough(points)
         ends = jax.tree.map(lambda a, b: np.concatenate([a, b]), ends, more)
-        if not np.nanmin(more.squares) < least * (1 - 1 / ends.jacobian.shape[1]):
+        gains = np.nanmin(more.squares) < least * (1 - 1 / ends.jacobian.shape[1])
+        idle = 0 if gains else idle + 1
+        if idle * IDLE_PARAMETERS >= len(log):
             break
     firsts = np.array([group[0] for group in _groups(problem, ends)])
-    best, variance = firsts[0], ends.squares[firsts[0]] / ends.jacobian.shape[1]
+    best = firsts[0]
+    variance = max(ends.squares[best] / ends.jacobian.shape[1], noise**2)
     near = ends.squares[firsts] <= ends.squares[best] + HARDLY_WORSE * variance
     near = firsts[near & (ends.converged[firsts] | (firsts == best))]
     fine = minimize(stacked([problem], len(near)), ends.y[near], search, what="minima")
@@ -567,46 +598,76 @@ def find_minima(problem: "FitProblem", starts: int | None, seed: int, search: Se
     return solution(problem, ends)
 
 
-def start_points(problem: "FitProblem", starts: int, rng: np.random.Generator) -> np.ndarray:
-    """Starts y (S, Q): the law's own values, then random ones inside the bounds."""
-    log, own = problem.parameters.log, problem.point(problem.start)
-    count = len(log)
+def _box(problem: "FitProblem") -> np.ndarray:
+    """Ends (2, P) of y between which starts lie."""
+    log, count = problem.parameters.log, len(problem.names)
+    own = problem.point(problem.start)[:count]
     low, high = (np.array(end, float)[:count] for end in (problem.low, problem.high))
     reach = np.where(log, np.log(START_FACTOR), START_SCALES)
-    low = np.where(log | np.isinf(low), np.maximum(low, own[:count] - reach), low)
-    high = np.where(log | np.isinf(high), np.minimum(high, own[:count] + reach), high)
+    low = np.where(log | np.isinf(low), np.maximum(low, own - reach), low)
+    high = np.where(log | np.isinf(high), np.minimum(high, own + reach), high)
     elastic = np.array([field == "restitution" for field in problem.parameters.of_fields])
     low = np.where(elastic & (high > START_RESTITUTION), np.maximum(low, START_RESTITUTION), low)
-    points = np.zeros((starts, len(own)))
-    points[:, :count] = low + (high - low) * rng.random((starts, count))
-    points[0] = own
+    return np.stack([low, high])
+
+
+def start_points(problem: "FitProblem", starts: int, rng: np.random.Generator) -> np.ndarray:
+    """Starts y (S, Q): the law's own values, then a Latin hypercube inside the bounds."""
+    low, high = _box(problem)
+    slices = rng.permuted(np.tile(np.arange(starts), (len(low), 1)), axis=1).T
+    points = np.tile(problem.point(problem.start), (starts, 1))
+    points[1:, : len(low)] = (low + (high - low) * (slices + rng.random(slices.shape)) / starts)[1:]
     return points
 
 
-def _scanned(problem: "FitProblem") -> np.ndarray:
-    """Points (S, Q) with other ratios of stiffness, if few are free: each one in turn."""
-    fields, log = problem.parameters.of_fields, problem.parameters.log
-    ratios = [i for i, field in enumerate(fields) if field == "stiffness" and log[i]]
-    own = problem.point(problem.start)
-    if len(ratios) > SCANS:
-        return np.zeros((0, len(own)))
-    points = np.tile(own, (len(ratios), SCANNED, 1))
-    for row, i in zip(points, ratios, strict=True):
-        row[:, i] += np.linspace(-np.log(SCAN_FACTOR), np.log(SCAN_FACTOR), SCANNED)
-    return np.clip(points.reshape(-1, len(own)), problem.low, problem.high)
+def _first_points(problem: "FitProblem", count: int, rng: np.random.Generator) -> np.ndarray:
+    """The law's own y, the lowest of many points, and those of each ratio where few are free."""
+    ratios = np.flatnonzero(problem.parameters.log)
+    points = start_points(problem, SCANNED, rng)
+    chosen = [points[:1], _lowest(problem, points[1:], count - 1)]
+    for i in ratios if len(ratios) <= SCANS else ():
+        line = np.tile(points[0], (SCANNED // 2, 1))
+        line[:, i] += np.linspace(-np.log(SCAN_FACTOR), np.log(SCAN_FACTOR), len(line))
+        chosen.append(_lowest(problem, np.clip(line, problem.low, problem.high), count // 2))
+    return np.concatenate(chosen)
 
 
-def _near(problem: "FitProblem", ends: Ends, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Points (count, Q) around the best, as far off as its standard errors, inside the bounds."""
+def _lowest(problem: "FitProblem", points: np.ndarray, count: int) -> np.ndarray:
+    """Of points (S, Q) the lowest that are lower than their nearest neighbours, at most so many."""
+    law, parameters = problem.law, len(problem.names)
+    if getattr(law, "rtol", SCAN_RTOL) is None:
+        law = replace(law, rtol=SCAN_RTOL)  # type: ignore[call-arg]
+    squares, many = np.empty(len(points)), stacked([replace(problem, law=law)], len(points))
+    every = np.arange(len(points))
+    for rows, some in _in_lanes(_squares, every, SCAN_LANES, many, points):
+        squares[rows] = np.nan_to_num(some, nan=np.inf)
+    width = np.ptp(points[:, :parameters], axis=0)
+    apart = (points[:, None] - points)[..., :parameters] / np.where(width > 0, width, 1.0)
+    nearest = np.argsort(np.sum(apart**2, axis=-1), axis=1)[:, 1 : parameters + 2]
+    lowest = np.flatnonzero(squares < squares[nearest].min(axis=1))
+    return points[lowest[np.argsort(squares[lowest])][:count]]
+
+
+@quick_jit
+def _squares(problems: Any, points: jax.Array) -> jax.Array:
+    """Compiled `|r|^2` (S,) over `size` of problems at y (S, Q)."""
+    return eqx.filter_vmap(lambda problem, y: problem.squares(y))(problems, points)
+
+
+def _near(
+    problem: "FitProblem", ends: Ends, count: int, noise: float, rng: np.random.Generator
+) -> np.ndarray:
+    """Points (count, Q) around the best, as far off as its standard errors and more, in bounds."""
     best = int(np.nanargmin(ends.squares))
     jacobian, measured = np.nan_to_num(ends.jacobian[best]), int(np.sum(problem.weight > 0))
     # directions that the data do not determine are not searched
     least = RANK_TOLERANCE[problem.precision] ** 2
     inverse = np.linalg.pinv(jacobian.T @ jacobian, rcond=least, hermitian=True)
-    spread = NEAR_SPREAD * np.sqrt(ends.squares[best] / measured * np.diag(inverse))
-    y = ends.y[best]
-    points = y + np.minimum(spread, START_SCALES) * rng.normal(size=(count, len(y)))
-    return np.clip(points, problem.low, problem.high)
+    variance = max(ends.squares[best] / measured, noise**2)
+    error, y = np.sqrt(variance * np.diag(inverse)), ends.y[best]
+    spread = np.exp(rng.uniform(np.log(NEAR_SPREAD), np.log(FAR_SPREAD), (count, 1)))
+    move = np.minimum(spread * error, START_SCALES) * rng.normal(size=(count, len(y)))
+    return np.clip(y + move, problem.low, problem.high)
 
 
 def _groups(problem: "FitProblem", ends: Ends) -> list[list[int]]:
