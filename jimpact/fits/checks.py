@@ -17,7 +17,8 @@ from jimpact.files.records import listed
 from jimpact.fits.data import ROUNDING, Experiments, closed_normals, kept_by_corrections
 from jimpact.fits.matrices import boundary, encloses
 from jimpact.fits.problem import UNUSABLE, FitProblem, Shots
-from jimpact.fits.solve import RANK_TOLERANCE, Solution
+from jimpact.fits.search import Solution
+from jimpact.fits.solve import RANK_TOLERANCE
 from jimpact.fits.uncertainty import Uncertainty
 from jimpact.laws.kinematic import RestitutionMatrix
 from jimpact.scene import Scene, dense_mass

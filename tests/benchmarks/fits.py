@@ -17,7 +17,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 import jimpact as ji
-from jimpact.fits.solve import Search, minimize, stacked
+from jimpact.fits.solve import Solver, minimize, stacked
 
 PROBLEMS, SIGMA = 40, 0.01
 LAWS = ("lzb", "lzb", "lzb", "compliant", "moreau", "matrix")
@@ -85,7 +85,7 @@ def by_scipy(start, scene, data, free, truth):
             point = np.zeros((1, len(fitted.low)))
             point[0, : len(y)] = y
             everything = np.ones(point.shape, bool)
-            ends = minimize(many, point, Search(max_steps=1), fixed=everything)
+            ends = minimize(many, point, Solver(max_steps=1), fixed=everything)
             known[y.tobytes()] = ends.residual[0], ends.jacobian[0, :, : len(y)]
         return known[y.tobytes()]
 
@@ -93,9 +93,8 @@ def by_scipy(start, scene, data, free, truth):
     first = np.clip(fitted.point(own.start)[: len(low)], low, high)
     at(first)
     began = time.process_time()
-    found = least_squares(
-        lambda y: at(y)[0], first, lambda y: at(y)[1], (low, high), xtol=1e-12, ftol=1e-12
-    )
+    scale = "jac" if fitted.matrix is None else 1.0
+    found = least_squares(lambda y: at(y)[0], first, lambda y: at(y)[1], (low, high), x_scale=scale)
     return 2 * found.cost, found.nfev, time.process_time() - began
 
 
@@ -103,7 +102,7 @@ def row(k):
     """The k-th problem by both."""
     kind, scene, start, truth, free, data = problem(k)
     began = time.process_time()
-    ji.fit(start, scene, data, free, profiles=False, max_steps=1)
+    ji.fit(start, scene, data, free, profiles=False, search=ji.Search(max_steps=1))
     first = time.process_time() - began
     began = time.process_time()
     found = ji.fit(start, scene, data, free, profiles=False)
