@@ -276,7 +276,7 @@ def _section(title: str, lines: tuple[str, ...]) -> list[str]:
 def _minima(fit: "Fit") -> list[str]:
     """Where the starts ended."""
     total, lost = fit.start_count, fit.lost_starts
-    unfinished = f"{lost} of {total} starts did not converge." if lost else ""
+    unfinished = f"{lost} of {total} starts were given up." if lost else ""
     if len(fit.starts) == 1:
         one = f"{total - lost} of {total} starts ended in this minimum. {unfinished}"
         return [one.rstrip()] if total > 1 else []

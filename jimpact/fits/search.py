@@ -10,7 +10,6 @@ import numpy as np
 from jimpact.compiling import quick_jit
 from jimpact.fits.solve import (
     COARSE,
-    HARDLY_WORSE,
     RANK_TOLERANCE,
     SETTLED,
     SETTLING,
@@ -111,7 +110,7 @@ class Solution(NamedTuple):
     stuck: bool  # no step lowers the sum of squares, although derivatives promise it
     at_bound: np.ndarray
     steps: int
-    lost: int  # starts that did not converge
+    lost: int  # starts that were given up, or did not converge
 
     @property
     def value(self) -> np.ndarray:
@@ -165,7 +164,7 @@ def solution(
 
 
 def find_minima(problem: "FitProblem", starts: int | None, seed: int, solver: Solver) -> Solution:
-    """All starts to where their minima can be told apart, and the best of these to their ends.
+    """All starts to where their minima can be told apart, and the best of these to its end.
 
     Two thirds of the starts are those of `start_points`; where their number is left open, the
     lowest of many such points, and further ones follow as long as they lower the sum of squares.
@@ -179,7 +178,8 @@ def find_minima(problem: "FitProblem", starts: int | None, seed: int, solver: So
         points = _first_points(problem, far, rng)
     else:
         points = start_points(problem, far, rng)
-
+    if count == 1:
+        return solution(problem, minimize(stacked([problem]), points, solver, what="starts"))
     first = solver
     if solver.method == "levenberg-marquardt":
         first = solver._replace(max_steps=min(ROUGH_STEPS, solver.max_steps))
@@ -189,8 +189,6 @@ def find_minima(problem: "FitProblem", starts: int | None, seed: int, solver: So
         many = stacked([problem], len(points))
         return minimize(many, points, first, COARSE, noise, "starts")
 
-    if count == 1:
-        return solution(problem, minimize(stacked([problem]), points, solver, what="starts"))
     ends = rough(points)
     scanned = starts is None and len(log) > 1
     idle = 0  # rounds without a gain, one after the other
@@ -199,21 +197,19 @@ def find_minima(problem: "FitProblem", starts: int | None, seed: int, solver: So
         points = _near(problem, ends, SCANNED if scanned else count - far, noise, rng)
         if scanned:
             points = _lowest(problem, points, count - far)
+        if not len(points):  # the data see none of the parameters
+            break
         more = rough(points)
         ends = jax.tree.map(lambda a, b: np.concatenate([a, b]), ends, more)
         gains = np.nanmin(more.squares) < least * (1 - 1 / ends.jacobian.shape[1])
         idle = 0 if gains else idle + 1
         if idle * IDLE_PARAMETERS >= len(log):
             break
-    firsts = np.array([group[0] for group in _groups(problem, ends)])
-    best = firsts[0]
-    variance = max(ends.squares[best] / ends.jacobian.shape[1], noise**2)
-    near = ends.squares[firsts] <= ends.squares[best] + HARDLY_WORSE * variance
-    near = firsts[near & (ends.converged[firsts] | (firsts == best))]
-    fine = minimize(stacked([problem], len(near)), ends.y[near], solver, what="minima")
-    fine = fine._replace(steps=fine.steps + ends.steps[near])
+    best = _groups(problem, ends)[0][:1]
+    fine = minimize(stacked([problem]), ends.y[best], solver, what="minima")
+    fine = fine._replace(steps=fine.steps + ends.steps[best])
     for leaf, value in zip(jax.tree.leaves(ends), jax.tree.leaves(fine)):
-        leaf[near] = value
+        leaf[best] = value
     total = len(ends.y)
     solver.show(f"fit: {total} of {total} starts done", total, total)
     return solution(problem, ends)

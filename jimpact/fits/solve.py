@@ -62,8 +62,7 @@ PASSES = 4  # of a program, between two looks at the clock
 # derivatives promise more, creeps along a kink of the law, where the sequence of contacts changes,
 # and is given up.
 CREEPS = 1e-3
-# Starts up to so many variances above the best go on, and are solved to their ends: intervals of
-# all levels end before.
+# Starts up to so many variances above the best go on: intervals of all levels end before.
 HARDLY_WORSE = 30.0
 # Singular values of the scaled Jacobian below this share of the largest are zero: derivatives of
 # an impact are good to about 1e-7 (float64; 1e-4 in float32), so smaller ones may be errors.

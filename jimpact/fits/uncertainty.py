@@ -249,7 +249,7 @@ class Fit(Tabular, Generic[AnyLaw]):
         status: (K,) codes of `jimpact.STATUS` at the minimum.
         converged: whether the best start did.
         steps: iterations of the best start.
-        lost_starts: how many did not converge.
+        lost_starts: how many were given up far above the best, or did not converge.
         warnings: what is wrong with data or fit, in words.
         problem: what was solved.
         jacobian: derivatives of what was measured in the parameters (K, n, P), NaN where no
@@ -476,7 +476,7 @@ class Fit(Tabular, Generic[AnyLaw]):
 
     @property
     def start_count(self) -> int:
-        """Starts, those that did not converge included."""
+        """Starts, those that were given up included."""
         return sum(minimum.count for minimum in self.starts) + self.lost_starts
 
     def __getitem__(self, name: str) -> FittedParameter:
