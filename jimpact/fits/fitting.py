@@ -12,8 +12,9 @@ from jimpact._checks import as_whole, check_choice, check_kind
 from jimpact.files.records import listed
 from jimpact.fits.checks import MEDIAN, fit_warnings, stretch, unusable, weighted
 from jimpact.fits.data import Experiments
+from jimpact.fits.observables import filled_count
 from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw
-from jimpact.fits.problem import FitProblem, filled_count, of_shots
+from jimpact.fits.problem import FitProblem, of_shots
 from jimpact.fits.profiles import LEVEL, PROFILE_STARTS, needs_profiles, profiles_of
 from jimpact.fits.search import (
     DEFAULT_SEARCH,

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jimpact._checks import as_whole, check_choice, check_kind
-from jimpact.fits.problem import scaled, unscaled
+from jimpact.fits.parameters import scaled, unscaled
 from jimpact.fits.search import SAME_VALUE, START_SCALES, FitMinimum, find_minima, solution
 from jimpact.fits.solve import RANK_TOLERANCE, Ends, Solver, minimize, stacked
 from jimpact.fits.uncertainty import Fit, Profile, check_level

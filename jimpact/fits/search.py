@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import equinox as eqx
 import jax
 import numpy as np
+from scipy.special import chdtrc
 
 from jimpact.compiling import quick_jit
 from jimpact.fits.solve import (
@@ -36,6 +37,8 @@ START_RESTITUTION = 0.5
 # where the data do not determine them. What starts leave is a tenth of that.
 SAME_COST, SAME_ERRORS, SAME_VALUE = 1e-2, 0.2, 1e-3
 STARTS, ROUNDS = 12, 8  # by default, and how often others around the best follow
+# What chi^2 rejects at this level is searched for again, so often at most.
+REJECTED, TURNS = 0.01, 4
 IDLE_PARAMETERS = 4  # a round without a gain is the last one, or the second of more parameters
 # A search of its own choice starts at the lowest of so many points: values alone cost a tenth of
 # derivatives. With ten times fewer the lowest minimum of six stiffness ratios is missed.
@@ -166,44 +169,25 @@ def solution(
 def find_minima(problem: "FitProblem", starts: int | None, seed: int, solver: Solver) -> Solution:
     """All starts to where their minima can be told apart, and the best of these to its end.
 
-    Two thirds of the starts are those of `start_points`; where their number is left open, the
-    lowest of many such points, and further ones follow as long as they lower the sum of squares.
-    The law is only piecewise smooth, so that the sum of squares has side minima close to a minimum:
-    the others begin around the best.
+    Two thirds of the starts are those of `start_points`. The law is only piecewise smooth, so that
+    the sum of squares has side minima close to a minimum: the others begin around the best. Where
+    their number is left open, they are the lowest of many such points, further ones around the
+    best follow as long as they lower the sum of squares, and all is done again with other points
+    if sigma contradicts what was found, as long as that helps.
     """
-    rng, count = np.random.default_rng(seed), STARTS if starts is None else starts
-    far = count - count // 3
-    log, noise = problem.parameters.log, 0.0 if problem.sigma is None else 1.0
-    if starts is None and (len(log) > 1 or log.any()):
-        points = _first_points(problem, far, rng)
-    else:
-        points = start_points(problem, far, rng)
-    if count == 1:
+    rng, turns = np.random.default_rng(seed), 1 if starts else TURNS
+    if starts == 1:
+        points = start_points(problem, 1, rng)
         return solution(problem, minimize(stacked([problem]), points, solver, what="starts"))
-    first = solver
-    if solver.method == "levenberg-marquardt":
-        first = solver._replace(max_steps=min(ROUGH_STEPS, solver.max_steps))
-
-    def rough(points: np.ndarray) -> Ends:
-        """To where minima can be told apart."""
-        many = stacked([problem], len(points))
-        return minimize(many, points, first, COARSE, noise, "starts")
-
-    ends = rough(points)
-    scanned = starts is None and len(log) > 1
-    idle = 0  # rounds without a gain, one after the other
-    for _ in range((ROUNDS if starts is None else 1) if count > far else 0):
+    ends = _rough_ends(problem, starts, rng, solver)
+    for _ in range(1, turns):
         least = np.nanmin(ends.squares)
-        points = _near(problem, ends, SCANNED if scanned else count - far, noise, rng)
-        if scanned:
-            points = _lowest(problem, points, count - far)
-        if not len(points):  # the data see none of the parameters
+        freedom = problem.values - len(problem.names)
+        if problem.sigma is None or freedom < 1 or chdtrc(freedom, least) > REJECTED:
             break
-        more = rough(points)
-        ends = jax.tree.map(lambda a, b: np.concatenate([a, b]), ends, more)
-        gains = np.nanmin(more.squares) < least * (1 - 1 / ends.jacobian.shape[1])
-        idle = 0 if gains else idle + 1
-        if idle * IDLE_PARAMETERS >= len(log):
+        more = _rough_ends(problem, starts, rng, solver)
+        ends = _both(ends, more)
+        if not _gains(more, least):
             break
     best = _groups(problem, ends)[0][:1]
     fine = minimize(stacked([problem]), ends.y[best], solver, what="minima")
@@ -213,6 +197,47 @@ def find_minima(problem: "FitProblem", starts: int | None, seed: int, solver: So
     total = len(ends.y)
     solver.show(f"fit: {total} of {total} starts done", total, total)
     return solution(problem, ends)
+
+
+def _rough_ends(
+    problem: "FitProblem", starts: int | None, rng: np.random.Generator, solver: Solver
+) -> Ends:
+    """Where starts end, and others around the best, so far that minima can be told apart."""
+    count, noise = starts or STARTS, 0.0 if problem.sigma is None else 1.0
+    far, log = count - count // 3, problem.parameters.log
+    scanned = starts is None and bool(len(log) > 1 or log.any())
+    if solver.method == "levenberg-marquardt":
+        solver = solver._replace(max_steps=min(ROUGH_STEPS, solver.max_steps))
+
+    def rough(points: np.ndarray) -> Ends:
+        """To where minima can be told apart."""
+        many = stacked([problem], len(points))
+        return minimize(many, points, solver, COARSE, noise, "starts")
+
+    ends = rough((_first_points if scanned else start_points)(problem, far, rng))
+    idle = 0  # rounds without a gain, one after the other
+    for _ in range((1 if starts else ROUNDS) if count > far else 0):
+        points = _near(problem, ends, SCANNED if scanned else count - far, noise, rng)
+        if scanned:
+            points = _lowest(problem, points, count - far)
+        if not len(points):  # the data see none of the parameters
+            break
+        least, more = np.nanmin(ends.squares), rough(points)
+        ends = _both(ends, more)
+        idle = 0 if _gains(more, least) else idle + 1
+        if idle * IDLE_PARAMETERS >= len(log):
+            break
+    return ends
+
+
+def _both(first: Ends, second: Ends) -> Ends:
+    """All ends of two searches."""
+    return jax.tree.map(lambda a, b: np.concatenate([a, b]), first, second)
+
+
+def _gains(more: Ends, least: float) -> bool:
+    """Whether ends are lower than the least sum of squares by more than the noise of a value."""
+    return bool(np.nanmin(more.squares) < least * (1 - 1 / more.jacobian.shape[1]))
 
 
 def _box(problem: "FitProblem") -> np.ndarray:

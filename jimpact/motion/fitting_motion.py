@@ -10,7 +10,8 @@ import numpy as np
 
 from jimpact._checks import as_float_array
 from jimpact.fits.fitting import Fit, fit
-from jimpact.fits.problem import FitProblem, Prediction
+from jimpact.fits.observables import Prediction
+from jimpact.fits.problem import FitProblem
 from jimpact.fits.search import Search
 from jimpact.law import Law
 from jimpact.motion.record import Motion
