@@ -38,7 +38,7 @@ START_RESTITUTION = 0.5
 SAME_COST, SAME_ERRORS, SAME_VALUE = 1e-2, 0.2, 1e-3
 STARTS, ROUNDS = 12, 8  # by default, and how often others around the best follow
 # What chi^2 rejects at this level is searched for again, so often at most.
-REJECTED, TURNS = 0.01, 4
+REJECTED, TURNS = 0.1, 4
 IDLE_PARAMETERS = 4  # a round without a gain is the last one, or the second of more parameters
 # A search of its own choice starts at the lowest of so many points: values alone cost a tenth of
 # derivatives. With ten times fewer the lowest minimum of six stiffness ratios is missed.

@@ -61,7 +61,7 @@ PASSES = 4  # of a program, between two looks at the clock
 # A solve that lowers its sum of squares by less than this share in PASSES passes, although its
 # derivatives promise more, creeps along a kink of the law, where the sequence of contacts changes,
 # and is given up.
-CREEPS = 1e-3
+CREEPS = 1e-4
 # Starts up to so many variances above the best go on: intervals of all levels end before.
 HARDLY_WORSE = 30.0
 # Singular values of the scaled Jacobian below this share of the largest are zero: derivatives of
