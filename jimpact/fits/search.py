@@ -41,7 +41,7 @@ STARTS, ROUNDS = 12, 8  # by default, and how often others around the best follo
 REJECTED, TURNS = 0.1, 4
 IDLE_PARAMETERS = 4  # a round without a gain is the last one, or the second of more parameters
 # A search of its own choice starts at the lowest of so many points: values alone cost a tenth of
-# derivatives. With ten times fewer the lowest minimum of six stiffness ratios is missed.
+# derivatives. Ten times more take longer than all that descends from them.
 SCANNED = 128
 SCAN_LANES = 8  # of them side by side
 SCAN_RTOL = 1e-4  # of these values, which need only be told apart; finer ones take twice as long
