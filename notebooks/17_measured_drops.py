@@ -90,7 +90,7 @@ sets = {"ellipse": ellipse.only(slice(0, 1300, 10)), "square": corner.only(slice
 fits = {}
 for name, shots in sets.items():
     plain = ji.Experiments(shots.pre, shots.post, scenes=shots.scenes, units=shots.units)
-    fits[name] = ji.fit(law, None, plain, both, starts=1, loss="huber")
+    fits[name] = ji.fit(law, None, plain, both, starts=1, search=ji.Search(loss="huber"))
     print(f"{name}: {fits[name].value.round(3)}, rms {fits[name].rms:.2f} m/s")
 print(str(fits["ellipse"]).split("\n\n")[0])
 print(*fits["ellipse"].warnings, sep="\n")

@@ -24,6 +24,7 @@ from jimpact.fits.fitting import Fit, fit
 from jimpact.fits.matrices import admissible_start
 from jimpact.fits.parameters import OF_SPEED, default_free
 from jimpact.fits.problem import FitProblem, of_shots
+from jimpact.fits.search import Search
 from jimpact.law import Law, free_parameters_of
 from jimpact.laws import REGISTRY
 from jimpact.laws.kinematic import RestitutionMatrix
@@ -65,7 +66,9 @@ class Study:
     def run(self, **options: Any) -> Fit:
         """`fit` with the study's options, or with those that are passed and not None."""
         problem = self._problem(of_shots)  # `fit` passes on errors of v-
-        return fit(problem, **(self.options | without_none(options)))
+        chosen = self.options | without_none(options)
+        direct = {name: chosen.pop(name) for name in ("starts", "profiles") if name in chosen}
+        return fit(problem, **direct, search=Search(**chosen))
 
     @property
     def problem(self) -> FitProblem:

@@ -12,25 +12,30 @@ from jimpact._checks import as_whole, check_choice, check_kind
 from jimpact.files.records import listed
 from jimpact.fits.checks import MEDIAN, fit_warnings, stretch, unusable, weighted
 from jimpact.fits.data import Experiments
+from jimpact.fits.observables import filled_count
 from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw
-from jimpact.fits.problem import FitProblem, filled_count, of_shots
+from jimpact.fits.problem import FitProblem, of_shots
 from jimpact.fits.profiles import LEVEL, PROFILE_STARTS, needs_profiles, profiles_of
+from jimpact.fits.search import (
+    DEFAULT_SEARCH,
+    FitMinimum,
+    Search,
+    Solution,
+    find_minima,
+    settled,
+    solution,
+    start_points,
+)
 from jimpact.fits.solve import (
     DEFAULT_STEPS,
     HARDLY_WORSE,
     SETTLED,
     Ends,
-    FitMinimum,
     Method,
-    Search,
-    Solution,
+    Solver,
     default_steps,
-    find_minima,
     minimize,
-    settled,
-    solution,
     stacked,
-    start_points,
 )
 from jimpact.fits.uncertainty import (
     Fit,
@@ -58,14 +63,9 @@ def fit(
     bounds: Mapping[str, Any] | None = None,
     priors: Mapping[str, Any] | None = None,
     ties: Mapping[str, Any] | None = None,
-    method: Method = "levenberg-marquardt",
-    loss: str = "squares",
     starts: int | None = None,
-    seed: int = 0,
-    max_steps: int | None = None,
     profiles: bool | None = None,
-    progress: float | None = None,
-    limit: float | None = None,
+    search: Search = DEFAULT_SEARCH,
 ) -> Fit[AnyLaw]:
     """Fit parameters of a law to measured velocities by weighted least squares.
 
@@ -97,22 +97,15 @@ def fit(
             {"stiffness[2]": lambda p: 2 * p["restitution"]}; `p` has all fields and entries of the
             law by name. `Fit.tied` has the values with their errors. Functions must be
             differentiable by JAX; each compiles a program of its own.
-        method: 'levenberg-marquardt'; or gradient descent: 'adam', 'sgd', 'lbfgs' or an optax
-            transformation.
-        loss: 'squares'; or one that outliers move little: 'huber' (beyond 1.345 sigma the absolute
-            value), 'student' (the density of Student's t, 4 degrees of freedom). Where sigma is
-            not known, it is taken from the median of the residuals.
         starts: number of starts: the first from the law's values, then random ones, the last third
-            around the best of these. None: 12, and further ones around the best as long as they
-            lower the sum of squares by more than the noise of a value.
-        seed: of the random starts.
-        max_steps: iterations per start.
+            around the best of these. None: the lowest of some 128 points, of which only the values
+            are computed, and further ones around the best as long as they lower the sum of squares
+            by more than the noise of a value. Starts that stay behind others are given up.
         profiles: whether intervals are those of `profile`; None: where standard errors cannot be
             trusted (at a bound, in a valley, with several minima, or for weakly determined
             parameters) and the law fits, of up to 3 parameters and 256 shots (64 with one start);
             else the report says how to get them.
-        progress: bar on stderr; None: on a terminal, for fits longer than two seconds.
-        limit: seconds after which no further step of the search is begun; None: no limit.
+        search: method, loss, limits and progress, see `Search`.
 
     Returns:
         `Fit`; `print` gives its report, `ji.plot.fit` a picture.
@@ -134,13 +127,13 @@ def fit(
     >>> round(float(result.law.restitution), 4)
     0.4
     """
-    default = default_steps(method)
-    steps = default if max_steps is None else max_steps
+    method, seed = search.method, search.seed
+    steps = default_steps(method) if search.max_steps is None else search.max_steps
     if starts is not None:
         as_whole("starts", starts, 1)
     for name, count, least in (("max_steps", steps, 1), ("seed", seed, 0)):
         as_whole(name, count, least)
-    check_choice("loss", loss, ("squares", *LOSSES))
+    check_choice("loss", search.loss, ("squares", *LOSSES))
     if isinstance(law, FitProblem):
         if not (scene is experiments is bounds is priors is ties is None and free is DEFAULT_FREE):
             raise ValueError(
@@ -150,28 +143,28 @@ def fit(
         problem = law
     else:
         problem = of_shots(law, scene, experiments, free, bounds, priors, ties)  # type: ignore[arg-type]
-    deadline = np.inf if limit is None else time.monotonic() + limit
-    with progress_bar(progress) as show:
-        search = Search(method, steps, show, deadline)
-        found = find_minima(problem, starts, seed, search)
+    deadline = np.inf if search.limit is None else time.monotonic() + search.limit
+    with progress_bar(search.progress) as show:
+        solver = Solver(method, steps, show, deadline)
+        found = find_minima(problem, starts, seed, solver)
         while (lost := unusable(problem, found)).any() and not lost.all():
             problem = _without(problem, lost)
-            found = find_minima(problem, starts, seed, search)
+            found = find_minima(problem, starts, seed, solver)
         _check_derivatives(problem, found)
         if found.slopes is not None:
             points = problem.point(np.array([minimum.value for minimum in found.minima]))
             problem = problem.with_errors_before(found.slopes)
-            (problem,), ends = settled([problem], points, search)
+            (problem,), ends = settled([problem], points, solver)
             counts = np.array([minimum.count for minimum in found.minima])
             found = solution(problem, ends, counts, found.lost)
         robust = None
-        if loss != "squares":
-            problem, found, robust = _robust(problem, found, loss, search)
-    result = replace(as_fit(problem, found, method, robust), loss=loss, seed=seed)
+        if search.loss != "squares":
+            problem, found, robust = _robust(problem, found, search.loss, solver)
+    result = replace(as_fit(problem, found, method, robust), loss=search.loss, seed=seed)
     if profiles or (profiles is None and needs_profiles(result)):
         more = PROFILE_STARTS if profiles else 0
         every = range(len(result.names))
-        return _with_profiles(result, profiles_of(result, every, LEVEL, more, progress))
+        return _with_profiles(result, profiles_of(result, every, LEVEL, more, search.progress))
     return result
 
 
@@ -298,7 +291,7 @@ LOSSES = {"huber": _huber, "student": _student}
 
 
 def _robust(
-    problem: FitProblem, found: Solution, loss: str, search: Search
+    problem: FitProblem, found: Solution, loss: str, solver: Solver
 ) -> tuple[FitProblem, Solution, float]:
     """Least squares again and again, with weights `psi(u) / u` of the last residuals u.
 
@@ -314,7 +307,7 @@ def _robust(
         share, slope = LOSSES[loss](error / scale)
         factor, before = np.sqrt(share), problem.point(found.value)
         weighed = problem.weighed(factor)
-        found = solution(weighed, minimize(stacked([weighed]), before[None], search))
+        found = solution(weighed, minimize(stacked([weighed]), before[None], solver))
         if np.abs(problem.point(found.value) - before).max() <= SETTLED:
             break
     else:
@@ -382,13 +375,6 @@ def fit_many(
     as_whole("starts", starts, 1)
     check_kind("many", many, Sequence)
     choice = (free, bounds, priors, ties)
-    options: dict[str, Any] = {
-        "starts": starts,
-        "seed": seed,
-        "max_steps": max_steps,
-        "profiles": False,
-    }
-
     for k, data in enumerate(many):
         check_kind(f"many[{k}]", data, Experiments)
     first = of_shots(law, scene, many[0], *choice)
@@ -397,10 +383,10 @@ def fit_many(
     each: list[Ends] = [None] * len(many)  # type: ignore[list-item]  # where its starts ended
     with progress_bar(progress) as show:
         for members in _alike(many):
-            first, search = problems[members[0]], Search(max_steps=max_steps, show=show)
+            first, solver = problems[members[0]], Solver(max_steps=max_steps, show=show)
             points = start_points(first, starts, np.random.default_rng(seed))
             points = np.tile(points, (len(members), 1))
-            found, ends = settled([problems[k] for k in members], points, search)
+            found, ends = settled([problems[k] for k in members], points, solver)
             for i, (k, problem) in enumerate(zip(members, found)):
                 each[k] = ends.rows(slice(i * starts, (i + 1) * starts))
                 problems[k] = problem
@@ -410,7 +396,8 @@ def fit_many(
         """The fit of one; shots that cannot be used are left out in a new one."""
         found = solution(problems[k], each[k])
         if unusable(problems[k], found).any():
-            return fit(problems[k], progress=False, **options)
+            search = Search(seed=seed, max_steps=max_steps, progress=False)
+            return fit(problems[k], starts=starts, profiles=False, search=search)
         return as_fit(problems[k], found, "levenberg-marquardt")
 
     best = [ends.rows(np.nanargmin(ends.squares)) for ends in each]
@@ -552,6 +539,6 @@ def _refits(fit: Fit, problems: list[FitProblem], progress: float | None) -> Ref
     """Minima of these problems next to a fit."""
     points = np.tile(fit.problem.point(fit.value), (len(problems), 1))
     with progress_bar(progress) as show:
-        _, ends = settled(problems, points, Search(show=show))
+        _, ends = settled(problems, points, Solver(show=show))
     predicted = ends.predicted[:, : len(fit.predicted)] if fit.predicted.ndim else ends.predicted
     return Refits(fit.names, fit.problem.values_at(ends.y), predicted, ends.converged)

@@ -6,7 +6,7 @@ and then to the admissible matrix of the least sum of squares.
 """
 
 from itertools import product
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -21,6 +21,9 @@ from jimpact.scene import Scene
 from jimpact.solvers.lcp import solve_lcp
 from jimpact.solvers.tridiagonal import as_matrix, scaled
 from jimpact.status import CODE
+
+if TYPE_CHECKING:
+    from jimpact.fits.problem import FitProblem
 
 # A point drawn back stops short of the boundary by this share of the way, times eps.
 _SHORT = 16.0
@@ -211,35 +214,24 @@ def _square(a: jax.Array, x: jax.Array) -> jax.Array:
     return jnp.einsum("sfi,sij,sfj->sf", x, a, x)
 
 
-def matrix_region(
-    law: Law,
-    scenes: list[Scene],
-    origin: np.ndarray,
-    mix: np.ndarray,
-    bounds: np.ndarray,
-    start: np.ndarray,
-) -> AdmissibleMatrices | None:
-    """The region of a fit of an (m, m) `RestitutionMatrix`; None for other laws and forms.
-
-    Args:
-        law: whose matrix it is.
-        scenes: of the shots; E must be admissible in each.
-        origin: (Q,) entries of E where y = 0.
-        mix: (Q, Q) derivatives of the entries with respect to y.
-        bounds: (2, Q) of y.
-        start: y (Q,) of the law itself.
+def matrix_region(problem: "FitProblem", scenes: list[Scene]) -> AdmissibleMatrices | None:
+    """The y whose (m, m) `RestitutionMatrix` is admissible in each scene; None for other laws.
 
     Raises:
         ValueError: redundant contacts, too many contacts, a start that is not admissible, fixed
-            entries that leave no admissible choice.
+            entries that leave no admissible choice, a tied matrix.
     """
+    law, owner = problem.law, problem.owner
     if not encloses(law, scenes[0].contacts):
         return None
-    assert isinstance(law, RestitutionMatrix)
-    dtype = law.matrix.dtype
-    used = np.any(mix != 0, axis=0)
-    ends = bounds if np.isfinite(bounds[:, used]).any() else None
-    region = _region(scenes, dtype, origin, mix, ends, start)
+    if any(name.split("[")[0] == "matrix" for name, _ in problem.ties):
+        raise ValueError("Argument `ties` must not tie a `matrix` that has to stay admissible.")
+    moves = np.where(owner[:, None] == np.arange(len(owner)), problem.scale, 0.0)
+    origin, start = np.where(owner < 0, problem.fixed, 0.0), problem.point(problem.start)
+    bounds = np.stack([problem.low, problem.high])
+    is_bounded = np.isfinite(bounds[:, np.any(moves != 0, axis=0)]).any()
+    dtype = problem.low.dtype
+    region = _region(scenes, dtype, origin, moves, bounds if is_bounded else None, start)
     _check_start(region, _host_conditions(region, start)[0])
     center = _inner_point(region, start)
     if center is None:

@@ -101,6 +101,17 @@ def with_entries(law: AnyLaw, fields: tuple[str, ...], values: Any) -> AnyLaw:
     return law
 
 
+def scaled(x: Any, scale: Any, log: Any, xp: Any = np) -> Any:
+    """y of values x, by NumPy or JAX."""
+    with np.errstate(divide="ignore"):
+        return xp.where(log, xp.log(xp.where(log, x, 1.0)), x / scale)
+
+
+def unscaled(y: Any, scale: Any, log: Any, xp: Any = np) -> Any:
+    """Values x of y."""
+    return xp.where(log, xp.exp(xp.where(log, y, 0.0)), y * scale)
+
+
 @dataclasses.dataclass(frozen=True)
 class Parameters:
     """P free parameters. Each moves one or several of the Q entries of the named fields.

@@ -5,12 +5,11 @@ parameters, or y (Q,), the same in the solver's scale: of the Q entries of the f
 first P count, so that a compiled program does not depend on which entries are free.
 """
 
-import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -18,11 +17,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_concrete, check_kind, check_values
-from jimpact.compiling import full_precision, quick_jit
-from jimpact.contact import contact_of
+from jimpact.compiling import full_precision
 from jimpact.files.study_file import OF_A_SCENE
 from jimpact.fits.data import Experiments, kept_by_corrections
 from jimpact.fits.matrices import AdmissibleMatrices, matrix_region
+from jimpact.fits.observables import (
+    COARSE_RTOL,
+    Observed,
+    Prediction,
+    Shots,
+    filled_count,
+    slopes_before,
+    tolerated,
+)
 from jimpact.fits.parameters import (
     DEFAULT_FREE,
     LawInScene,
@@ -33,80 +40,29 @@ from jimpact.fits.parameters import (
     bounds_of,
     checked_ties,
     entries,
-    entry_of,
     free_parameters,
     limits_with_scene,
-    placed,
     plain_law,
     priors_of,
+    scaled,
     tied,
+    unscaled,
     with_entries,
     with_parts_of_scene,
 )
 from jimpact.fits.solve import EXACT
-from jimpact.impacts import impact
-from jimpact.law import AnyLaw, Law, forward_only
+from jimpact.law import Law, forward_only
 from jimpact.scene import Scene, dense_mass, stackable
-from jimpact.status import CODE, sign_tolerance
 
-# Outcomes whose velocities are meaningless. A trial with one of them gets a residual far above any
-# honest one, so that a solver turns back; inadmissible or energetic outcomes are only reported.
-UNUSABLE = ("infeasible", "max_steps", "not_finite")
+# A trial whose outcome is meaningless gets a residual far above any honest one, so that a solver
+# turns back; inadmissible or energetic outcomes are only reported.
 PENALTY = 1e3  # times the largest measured value
 
-# Shots are filled up to 4, 8, 16, ... of them: a program serves all numbers in between, and the
-# copies that fill up cost far less than compiling another one.
-FEWEST, FEW = 4, 64
+# Programs of up to so many shots (or values in a row) are shared by all numbers of starts.
+FEW = 64
 # Problems that a program solves side by side: starts of one, and many problems. With ten times
 # more of them, all wait for the one whose impacts take longest.
-LANES, LANES_OF_MANY = 4, 64
-
-# Error of computed gap velocities, as a part of their noise. Ten times more: as large as the noise
-# itself, and the same in all shots.
-PART_OF_NOISE = 0.1
-# Tolerance for such data: one, since each compiles a program. Standard errors move by .1 %; at one
-# ten times more derivatives lose another digit.
-COARSE_RTOL = 1e-4
-_CONTACT = jax.jit(contact_of)  # remembers the shapes that it has seen; only these are asked for
-
-
-class Prediction(NamedTuple):
-    """What a law predicts: values, where they are meaningless, and status codes (S,)."""
-
-    value: jax.Array
-    bad: jax.Array
-    status: jax.Array
-
-
-class Shots(eqx.Module):
-    """The observable of impacts: v+ (K, n)."""
-
-    scenes: Scene  # stacked, one for each shot
-    pre: jax.Array  # (K, n), further columns where scenes were made alike
-    bodies: int = eqx.field(static=True)
-
-    def __call__(self, law: Law) -> Prediction:
-        """Velocities after every shot, and the status of its impact."""
-        law, scenes = placed(law, self.scenes)
-        out = jax.vmap(impact, in_axes=(None, 0, 0))(law, scenes, self.pre)
-        unusable = jnp.asarray([CODE[name] for name in UNUSABLE], out.status.dtype)
-        bad = jnp.any(out.status[:, None] == unusable[None, :], axis=1)
-        return Prediction(out.velocity[:, : self.bodies], bad[:, None], out.status)
-
-
-class Observed(eqx.Module):
-    """The observable of a user's own function of a law.
-
-    `absolute`: it may see absolute stiffnesses (a force, a time), not only their ratios.
-    """
-
-    function: Callable[[Law], Any] = eqx.field(static=True)
-    absolute: bool = eqx.field(static=True, default=False)
-
-    def __call__(self, law: Law) -> Prediction:
-        """The value of the function; NaN counts as meaningless."""
-        value = jnp.asarray(self.function(law))
-        return Prediction(value, ~jnp.isfinite(value), jnp.zeros(1, jnp.int32))
+LANES, LANES_OF_MANY = 2, 64
 
 
 _ARRAYS = (
@@ -370,7 +326,7 @@ class FitProblem:
             return self
         shots: Any = self.program().observe
         law = _in(self.low.dtype, self.law_in_scene(x))
-        slopes = np.asarray(_slopes_before(law, shots), float)
+        slopes = np.asarray(slopes_before(law, shots), float)
         return self.with_errors_before(slopes[:, : shots.bodies, : shots.bodies])
 
     def program(self) -> "FitProblem":
@@ -511,6 +467,13 @@ class FitProblem:
             aux.append(slopes[..., count:])
         return residual, jacobian[:, :count], tuple(aux)
 
+    def squares(self, y: jax.Array) -> jax.Array:
+        """The sum of squares of the residual of `evaluate`, without derivatives."""
+        x = self._values(y)
+        data, _ = self._errors(self.law_in_scene(x))
+        of_priors = (x - self.prior_mean) * self.prior_weight
+        return (jnp.sum(data**2) + jnp.sum(of_priors**2)) / self.size**2
+
     def blank(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, Any]:
         """Zeros shaped like what `evaluate` gives of S such problems at y (S, Q), on the host."""
         (count, q), shape, dtype = y.shape, self.measured.shape[1:], y.dtype
@@ -564,12 +527,6 @@ class FitProblem:
         used = here.any(axis=1) if data is not None else ()
         lost = sum(np.array(data.lost)[used]) if data is not None else 0
         return int(here.sum() - lost) + len(self.priors)
-
-    @property
-    def shot_of_value(self) -> np.ndarray:
-        """(R,) the shot (or row, from 0) of every measured value."""
-        here = ~np.isnan(self.measured)
-        return np.nonzero(here)[0] if here.ndim else np.zeros(1, int)
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -648,21 +605,9 @@ def of_shots(
         notes=(*problem.notes, *of_tolerance),
         experiments=experiments,
         scene=scene,
-        matrix=_admissible(problem, alike),
+        matrix=matrix_region(problem, alike),
     )
     return problem.with_errors_before(np.tile(np.eye(n), (count, 1, 1)))
-
-
-def _admissible(problem: FitProblem, scenes: list[Scene]) -> AdmissibleMatrices | None:
-    """The region of y in which a restitution matrix stays admissible, or None."""
-    owner = problem.owner
-    moves = np.where(owner[:, None] == np.arange(len(owner)), problem.scale, 0.0)
-    origin = np.where(owner < 0, problem.fixed, 0.0)
-    ends, start = np.stack([problem.low, problem.high]), problem.point(problem.start)
-    matrix = matrix_region(problem.law, scenes, origin, moves, ends, start)
-    if matrix is not None and any(entry_of(name)[0] == "matrix" for name, _ in problem.ties):
-        raise ValueError("Argument `ties` must not tie a `matrix` that has to stay admissible.")
-    return matrix
 
 
 def _in(dtype: Any, tree: Any) -> Any:
@@ -756,62 +701,7 @@ def _of_parameters(
     return {"owner": owner, "fixed": fixed, "scale": scale} | padded
 
 
-def scaled(x: Any, scale: Any, log: Any, xp: Any = np) -> Any:
-    """y of values x, by NumPy or JAX."""
-    with np.errstate(divide="ignore"):
-        return xp.where(log, xp.log(xp.where(log, x, 1.0)), x / scale)
-
-
-def unscaled(y: Any, scale: Any, log: Any, xp: Any = np) -> Any:
-    """Values x of y."""
-    return xp.where(log, xp.exp(xp.where(log, y, 0.0)), y * scale)
-
-
 @full_precision
 def _mixed(errors: Any, mixing: Any, xp: Any = np) -> Any:
     """Weighted errors (K, n, ...) mixed within each shot."""
     return errors if mixing is None else xp.einsum("kij,kj...->ki...", mixing, errors)
-
-
-def filled_count(count: int) -> int:
-    """How many shots a program has that serves so many."""
-    return FEWEST if count <= FEWEST else 2 ** math.ceil(math.log2(count))
-
-
-@quick_jit
-def _slopes_before(law: Law, shots: Shots) -> jax.Array:
-    """Compiled `dv+/dv-` of every shot."""
-    law, scenes = placed(forward_only(law), shots.scenes)
-
-    def after(v: jax.Array, scene: Scene) -> jax.Array:
-        """v+ of v-."""
-        return impact(law, scene, v).velocity
-
-    return jax.vmap(jax.jacfwd(after))(shots.pre, scenes)
-
-
-def tolerated(
-    law: AnyLaw, scene: Scene | None, data: Experiments
-) -> tuple[AnyLaw, tuple[str, ...]]:
-    """The law at a tolerance that the noise of the data allows, and a sentence that says so.
-
-    Of a law without `rtol` that errs by more than signs do (`Law.accuracy`), where `sigma` is
-    known.
-    """
-    if data.sigma is None or getattr(law, "rtol", COARSE_RTOL) is not None:
-        return law, ()
-    pre, sigma = np.asarray(data.pre), np.asarray(data.sigma)
-    shapes = _CONTACT.eval_shape(data.largest_scene(scene), pre[0])
-    if not sign_tolerance(pre.dtype) < law.accuracy(shapes) < COARSE_RTOL:
-        return law, ()
-    normals = data.each(scene, lambda each: np.asarray(each.normals))
-    fastest = [np.abs(n.T @ v).max() for n, v in zip(normals, pre)]
-    noise = [np.sqrt(np.square(n.T) @ s**2).min() for n, s in zip(normals, sigma)]
-    # a noise of NaN, where a value was not measured, allows nothing
-    if not all(PART_OF_NOISE * s >= COARSE_RTOL * v for s, v in zip(noise, fastest)):
-        return law, ()
-    line = (
-        f"Velocities finer than {COARSE_RTOL:g} of the fastest approach: the law is computed with "
-        f"`rtol` = {COARSE_RTOL:g}, a tenth of the noise or less; give it an `rtol` to change that."
-    )
-    return dataclasses.replace(law, **{"rtol": COARSE_RTOL}), (line,)

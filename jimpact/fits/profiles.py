@@ -14,19 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jimpact._checks import as_whole, check_choice, check_kind
-from jimpact.fits.problem import scaled, unscaled
-from jimpact.fits.solve import (
-    RANK_TOLERANCE,
-    SAME_VALUE,
-    START_SCALES,
-    Ends,
-    FitMinimum,
-    Search,
-    find_minima,
-    minimize,
-    solution,
-    stacked,
-)
+from jimpact.fits.parameters import scaled, unscaled
+from jimpact.fits.search import SAME_VALUE, START_SCALES, FitMinimum, find_minima, solution
+from jimpact.fits.solve import RANK_TOLERANCE, Ends, Solver, minimize, stacked
 from jimpact.fits.uncertainty import Fit, Profile, check_level
 from jimpact.progress import Show, progress_bar
 
@@ -121,9 +111,9 @@ class Deviances:
         for k, (which, values, _) in enumerate(trials):
             points[k, list(which)] = values
             fixed[k, list(which)] = True
-        search = Search(max_steps=PASSES, show=self.show, damping=NEAR)
+        solver = Solver(max_steps=PASSES, show=self.show, damping=NEAR)
         many = stacked([self.problem], len(points))
-        ends = minimize(many, points, search, _STOP, what="fixed values", fixed=fixed)
+        ends = minimize(many, points, solver, _STOP, what="fixed values", fixed=fixed)
         least = int(np.argmin(ends.squares))
         if self._is_below(ends.squares[least], self.lowest.squares):
             self.lowest = Lowest(float(ends.squares[least]), ends.y[least])
@@ -246,7 +236,7 @@ def profiles_of(
     with progress_bar(progress) as show:
         lines = _Lines(fit, fit.quantile(level) ** 2, show)
         if points and fit.start_count == 1:
-            lines.add_starts(find_minima(fit.problem, points, fit.seed, Search(show=show)).minima)
+            lines.add_starts(find_minima(fit.problem, points, fit.seed, Solver(show=show)).minima)
         for _ in range(ROUNDS):
             profiles = lines.profiles(which, level)
             if lines.lowest is lines.best:

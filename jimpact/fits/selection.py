@@ -17,6 +17,7 @@ from jimpact.fits.parameters import OF_SPEED, default_free
 from jimpact.fits.problem import FEW
 from jimpact.fits.profiles import needs_profiles, profile
 from jimpact.fits.report import named_values
+from jimpact.fits.search import Search
 from jimpact.fits.uncertainty import check_squares
 from jimpact.law import Law, free_parameters_of, with_parameter
 from jimpact.laws.velocity_dependent import VelocityDependent
@@ -277,8 +278,8 @@ def fit_laws(
     scenes = data.each(scene, lambda s: s)
     candidates, left_out = _candidates(scenes, laws, dict(values), tuple(free))
     fits: dict[str, Fit] = {}
-    options: dict[str, Any] = {"starts": starts, "seed": seed, "progress": False}
-    options["profiles"] = False
+    search = Search(seed=seed, progress=False)
+    options: dict[str, Any] = {"starts": starts, "profiles": False, "search": search}
     with progress_bar(progress) as show:
         for i, (name, (law, chosen)) in enumerate(candidates.items()):
             show(f"fit_laws: {name}, law {i + 1} of {len(candidates)}", i, len(candidates))

@@ -1,4 +1,4 @@
-"""Nonlinear least squares in a box, from many starts or of many problems at once, and minima.
+"""Nonlinear least squares in a box, from many starts or of many problems at once.
 
 Minimize `|r(y)|^2 / 2` for `low <= y <= high`, by
 Levenberg-Marquardt or by gradient descent with optax. Steps are cut at the box, and a variable on a
@@ -8,7 +8,7 @@ One pass evaluates residual and Jacobian together, so that an impact is compiled
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
@@ -60,33 +60,13 @@ _ADAM_RATE, _SGD_RATE, _SGD_MOMENTUM = 0.1, 0.3, 0.9  # in y, where ranges are o
 PASSES = 4  # of a program, between two looks at the clock
 # A solve that lowers its sum of squares by less than this share in PASSES passes, although its
 # derivatives promise more, creeps along a kink of the law, where the sequence of contacts changes,
-# and is given up; one of several starts sooner, and the more if it is BEHIND times above the best.
-CREEPS, START_CREEPS, BEHIND, FALLS = 1e-3, 0.01, 10.0, 0.5
-
-
-# Random starts: a stiffness within this factor of the user's, a parameter without two bounds
-# within this many natural scales of the user's.
-START_FACTOR = 5.0
-START_SCALES = 2.0
-# Random coefficients of restitution start above this: below, contacts of a chain re-close many
-# times, which takes ten times as long and hardly occurs in hard bodies. (Fits do go there.)
-START_RESTITUTION = 0.5
-# Ends are one minimum if their sums of squares differ by less than this many variances of a
-# residual, and their values by less than this share of a standard error, or of a natural scale
-# where the data do not determine them. What starts leave is a tenth of that.
-SAME_COST, SAME_ERRORS, SAME_VALUE = 1e-2, 0.2, 1e-3
+# and is given up.
+CREEPS = 1e-4
+# Starts up to so many variances above the best go on: intervals of all levels end before.
+HARDLY_WORSE = 30.0
 # Singular values of the scaled Jacobian below this share of the largest are zero: derivatives of
 # an impact are good to about 1e-7 (float64; 1e-4 in float32), so smaller ones may be errors.
 RANK_TOLERANCE = {"float64": 1e-6, "float32": 1e-3}
-# Starts up to so many variances above the best are solved to their ends, the others only to
-# where minima can be told apart: intervals of all levels end before.
-HARDLY_WORSE = 100.0
-STARTS, ROUNDS = 12, 6  # by default, and how often others around the best follow
-# Several stiffness ratios often reproduce the same shots. Where one or two are free, a search of
-# its own choice also starts from SCANNED values of each, up to this factor from the user's; ten
-# times more values take ten times as long, ten times fewer step over minima.
-SCANNED, SCAN_FACTOR, SCANS = 24, 100.0, 2
-NEAR_SPREAD = 2.0  # of starts around the best, in standard errors
 SETTLED, SETTLING = 1e-5, 10  # change (natural scales) and rounds, where errors of v- are passed on
 
 
@@ -160,7 +140,7 @@ def default_steps(method: Any) -> int:
     return DEFAULT_STEPS["adam"]
 
 
-def begin(problems: Any, y: Any, search: "Search") -> SolverState:
+def begin(problems: Any, y: Any, solver: "Solver") -> SolverState:
     """States before the first pass of S problems from y (S, Q), on the host."""
     count, dtype = len(y), y.dtype
 
@@ -168,10 +148,10 @@ def begin(problems: Any, y: Any, search: "Search") -> SolverState:
         """The value of every state."""
         return np.full(count, value, dtype)
 
-    if search.method == "levenberg-marquardt":
-        memory: Any = Damping(*map(all_are, (search.damping, _FIRST_GROWTH, np.inf)))
+    if solver.method == "levenberg-marquardt":
+        memory: Any = Damping(*map(all_are, (solver.damping, _FIRST_GROWTH, np.inf)))
     else:
-        init = _transformation(search.method, search.max_steps).init
+        init = _transformation(solver.method, solver.max_steps).init
         memory = jax.device_get(jax.vmap(init)(y))
     costs = all_are(np.inf), all_are(np.inf)
     ends = all_are(0, int), all_are(False, bool), all_are(False, bool)
@@ -279,7 +259,7 @@ def _transformation(method: Method, max_steps: int) -> "optax.GradientTransforma
 # ---------------------------------------------------------------------------- many at once
 
 
-class Search(NamedTuple):
+class Solver(NamedTuple):
     """How minima are searched for: the method, its steps, and how it is watched."""
 
     method: Method = "levenberg-marquardt"
@@ -312,19 +292,19 @@ class Ends(NamedTuple):
 def minimize(
     problems: Any,
     points: np.ndarray,
-    search: Search,
+    solver: Solver,
     stop: float = 0.0,
-    rivals: bool = False,
+    noise: float | None = None,
     what: str = "fits",
     fixed: np.ndarray | None = None,
 ) -> Ends:
     """Minima of S problems (`stacked`) from y (S, Q).
 
     As many as `problems.lanes(S)` are solved side by side; those that are done make room for
-    others. `stop`: see `FINE`, which it is at least. `rivals`: all are starts of one problem, and
-    those that creep or will not become the best are given up. Progress counts `what`. `fixed`
-    (S, Q): which entries of y stay as they are. A matrix that must be admissible is sought without
-    that, and then the best admissible one.
+    others. `stop`: see `FINE`, which it is at least. `noise`: all are starts of one problem, whose
+    residuals have this noise at least, and every few passes the worse half of them is given up
+    (successive halving). Progress counts `what`. `fixed` (S, Q): which entries of y stay as they
+    are. A matrix that must be admissible is sought without that, and then the best admissible one.
     """
     points = points.astype(problems.low.dtype)
     dtype, matrix = str(points.dtype), problems.matrix
@@ -332,16 +312,16 @@ def minimize(
         low, high = (np.where(fixed, points, end) for end in (problems.low, problems.high))
         problems, matrix = replace(problems, low=low, high=high), None
     problems = replace(problems, matrix=None)
-    rule = (max(FINE[dtype], stop), rivals, what)
-    states, converged = _descended(problems, points, search, *rule)
+    rule = (max(FINE[dtype], stop), noise, what)
+    states, converged = _descended(problems, points, solver, *rule)
     y, steps, stuck = np.asarray(states.y), states.steps, states.stuck
-    once, moved = search._replace(max_steps=1), np.full(len(y), matrix is not None)
+    once, moved = solver._replace(max_steps=1), np.full(len(y), matrix is not None)
     for _ in range(SETTLING):
         if not moved.any():
             break
         inside = np.empty_like(y)
         every = np.arange(len(y)), problems.lanes(len(y))
-        for rows, nearest in _in_lanes(best_inside, *every, matrix, states):
+        for rows, nearest in in_lanes(best_inside, *every, matrix, states):
             inside[rows] = nearest
         states, _ = _descended(problems, inside, once, *rule)
         moved, y = np.abs(inside - y).max(axis=1) > SETTLED, inside
@@ -361,7 +341,7 @@ def minimize(
     )
 
 
-def _in_lanes(
+def in_lanes(
     compiled: Callable[..., Any], which: np.ndarray, lanes: int, *trees: Any
 ) -> Iterator[tuple[np.ndarray, Any]]:
     """Which rows of the trees, so many side by side, and what a compiled function makes of them."""
@@ -385,16 +365,21 @@ def best_inside(matrix: Any, states: SolverState) -> jax.Array:
 
 
 def _descended(
-    problems: Any, points: np.ndarray, search: Search, stop: float, rivals: bool, what: str
+    problems: Any,
+    points: np.ndarray,
+    solver: Solver,
+    stop: float,
+    noise: float | None,
+    what: str,
 ) -> tuple[SolverState, np.ndarray]:
     """States where searches from y (S, Q) ended, and which have converged; see `minimize`."""
     dtype, count = points.dtype, len(points)
-    limit: Any = search.max_steps
-    descends = search.method != "levenberg-marquardt"
+    limit: Any = solver.max_steps
+    descends = solver.method != "levenberg-marquardt"
     if not descends:
         limit = np.asarray(limit)  # one program serves all limits
-    rule: Any = (search.method, limit, np.asarray(stop, dtype))
-    states = begin(problems, points, search)
+    rule: Any = (solver.method, limit, np.asarray(stop, dtype))
+    states = begin(problems, points, solver)
 
     def advance(problems: Any, states: SolverState) -> SolverState:
         """Some of them."""
@@ -404,22 +389,30 @@ def _descended(
     active, lanes = np.arange(count), problems.lanes(count)
     while len(active):
         before = states.cost.copy()
-        for rows, some in _in_lanes(advance, active, lanes, problems, states):
+        for rows, some in in_lanes(advance, active, lanes, problems, states):
             for leaf, value in zip(jax.tree.leaves(states), jax.tree.leaves(some)):
                 leaf[rows] = value
         converged = _converged(states, DESCENDED if descends else CONVERGED)
-        ended = states.done | (states.steps >= search.max_steps)
+        ended = states.done | (states.steps >= solver.max_steps)
         if not descends:
-            far = rivals & (states.cost > BEHIND * np.nanmin(states.cost))
-            least = np.where(far, FALLS, 1 - (START_CREEPS if rivals else CREEPS))
-            slow = (states.cost > least * before) & (states.memory.value < _SHORT)
-            ended |= slow & ~converged
+            creeps = (states.cost > (1 - CREEPS) * before) & (states.memory.value < _SHORT)
+            ended |= creeps & ~converged
         active = active[~ended[active]]
+        if noise is not None and not descends:
+            active = _better_half(states, active, noise / problems.size[0])
         done, steps = count - len(active), int(states.steps.max())
-        search.show(f"fit: {done} of {count} {what} done, step {steps}", done, count)
-        if time.monotonic() > search.deadline:
+        solver.show(f"fit: {done} of {count} {what} done, step {steps}", done, count)
+        if time.monotonic() > solver.deadline:
             break
     return states, converged
+
+
+def _better_half(states: SolverState, active: np.ndarray, noise: float) -> np.ndarray:
+    """Of the active starts the better half, and all that are hardly worse than the best of all."""
+    order, least = active[np.argsort(states.cost[active])], np.nanmin(states.cost)
+    variance = max(least / states.residual.shape[-1], 0.5 * noise**2)
+    hardly_worse = states.cost[order] <= least + HARDLY_WORSE * variance
+    return order[hardly_worse | (np.arange(len(order)) < len(order) // 2)]
 
 
 def _converged(states: SolverState, enough: float) -> np.ndarray:
@@ -440,231 +433,3 @@ def stacked(problems: "Sequence[FitProblem]", each: int = 1) -> Any:
         return np.repeat(np.stack([np.asarray(leaf) for leaf in leaves]), each, axis=0)
 
     return jax.tree.map(side_by_side, *filled)
-
-
-# ---------------------------------------------------------------------------- distinct minima
-
-
-@dataclass(frozen=True, eq=False)
-class FitMinimum:
-    """A minimum that starts ended in: sum of squared (weighted) residuals, values, how many.
-
-    `standard_error` is None where it fits so much worse that it does not matter. A search knows the
-    `residual` (R,) of what was measured, then that of the priors, and its `jacobian` (R, P) in the
-    scaled parameters.
-    """
-
-    sum_of_squares: float
-    value: np.ndarray
-    count: int
-    standard_error: np.ndarray | None = None
-    jacobian: np.ndarray = None  # type: ignore[assignment]  # of a result: what a search knows
-    residual: np.ndarray = None  # type: ignore[assignment]
-
-
-class Solution(NamedTuple):
-    """All distinct minima, best first, and what the law of the best predicts."""
-
-    minima: list[FitMinimum]
-    predicted: np.ndarray  # shaped like what was measured
-    status: np.ndarray
-    slopes: np.ndarray | None  # `dv+/dv-` of the shots, where errors of v- are passed on
-    converged: bool
-    stuck: bool  # no step lowers the sum of squares, although derivatives promise it
-    at_bound: np.ndarray
-    steps: int
-    lost: int  # starts that did not converge
-
-    @property
-    def value(self) -> np.ndarray:
-        """The parameters (P,) of the best."""
-        return self.minima[0].value
-
-    @property
-    def jacobian(self) -> np.ndarray:
-        """(R, P), of the scaled parameters at the best."""
-        return self.minima[0].jacobian
-
-
-def solution(
-    problem: "FitProblem", ends: Ends, counts: np.ndarray | None = None, lost: int = 0
-) -> Solution:
-    """The distinct minima among ends; counts: of the starts that an end is for."""
-    counts = np.ones(len(ends.y), int) if counts is None else counts
-    count, measured = len(problem.names), problem.measured
-    groups = _groups(problem, ends)
-    # without what filled up, and parameters that have no prior
-    first_prior = ends.residual.shape[1] - len(problem.low)
-    own = [*range(measured.size), *(first_prior + prior.parameter for prior in problem.priors)]
-    best, y = groups[0][0], ends.y[:, :count]
-    # starts that did not converge have no minimum to report, unless they are the best there is
-    kept = [[i for i in group if ends.converged[i] or i == best] for group in groups]
-    minima = [
-        FitMinimum(
-            float(ends.squares[group[0]]),
-            problem.values_at(ends.y[group[0]]),
-            int(counts[group].sum()),
-            None,
-            ends.jacobian[group[0]][own, :count],
-            ends.residual[group[0]][own],
-        )
-        for group in kept
-        if group
-    ]
-    rows = slice(len(measured)) if measured.ndim else ...
-    low, high = (np.asarray(end)[:count] for end in (problem.low, problem.high))
-    return Solution(
-        minima=minima,
-        predicted=ends.predicted[best][rows],
-        status=ends.status[best][rows],
-        slopes=None if ends.slopes is None else ends.slopes[best],
-        converged=bool(ends.converged[best]),
-        stuck=bool(ends.stuck[best]),
-        at_bound=(y[best] <= low) | (y[best] >= high),
-        steps=int(np.max(ends.steps)),
-        lost=lost + int(counts.sum()) - sum(minimum.count for minimum in minima),
-    )
-
-
-def find_minima(problem: "FitProblem", starts: int | None, seed: int, search: Search) -> Solution:
-    """All starts to where their minima can be told apart, and the best of these to their ends.
-
-    Two thirds of the starts are those of `start_points`. The law is only piecewise smooth, so
-    that the sum of squares has side minima close to a minimum: the others begin around the best.
-    None: STARTS, others along the ratios of stiffness, and further ones around the best as long as
-    they lower it.
-    """
-    rounds, starts = (ROUNDS, STARTS) if starts is None else (1, starts)
-    rng, far = np.random.default_rng(seed), starts - starts // 3
-    points = start_points(problem, far, rng)
-
-    def rough(points: np.ndarray) -> Ends:
-        """To where minima can be told apart."""
-        many = stacked([problem], len(points))
-        return minimize(many, points, search, COARSE, rivals=True, what="starts")
-
-    if starts == 1:
-        return solution(problem, minimize(stacked([problem]), points, search, what="starts"))
-    if rounds > 1:
-        points = np.concatenate([points, _scanned(problem)])
-    ends = rough(points)
-    for _ in range(rounds if starts > far else 0):
-        least = np.nanmin(ends.squares)
-        more = rough(_near(problem, ends, starts - far, rng))
-        ends = jax.tree.map(lambda a, b: np.concatenate([a, b]), ends, more)
-        if not np.nanmin(more.squares) < least * (1 - 1 / ends.jacobian.shape[1]):
-            break
-    firsts = np.array([group[0] for group in _groups(problem, ends)])
-    best, variance = firsts[0], ends.squares[firsts[0]] / ends.jacobian.shape[1]
-    near = ends.squares[firsts] <= ends.squares[best] + HARDLY_WORSE * variance
-    near = firsts[near & (ends.converged[firsts] | (firsts == best))]
-    fine = minimize(stacked([problem], len(near)), ends.y[near], search, what="minima")
-    fine = fine._replace(steps=fine.steps + ends.steps[near])
-    for leaf, value in zip(jax.tree.leaves(ends), jax.tree.leaves(fine)):
-        leaf[near] = value
-    total = len(ends.y)
-    search.show(f"fit: {total} of {total} starts done", total, total)
-    return solution(problem, ends)
-
-
-def start_points(problem: "FitProblem", starts: int, rng: np.random.Generator) -> np.ndarray:
-    """Starts y (S, Q): the law's own values, then random ones inside the bounds."""
-    log, own = problem.parameters.log, problem.point(problem.start)
-    count = len(log)
-    low, high = (np.array(end, float)[:count] for end in (problem.low, problem.high))
-    reach = np.where(log, np.log(START_FACTOR), START_SCALES)
-    low = np.where(log | np.isinf(low), np.maximum(low, own[:count] - reach), low)
-    high = np.where(log | np.isinf(high), np.minimum(high, own[:count] + reach), high)
-    elastic = np.array([field == "restitution" for field in problem.parameters.of_fields])
-    low = np.where(elastic & (high > START_RESTITUTION), np.maximum(low, START_RESTITUTION), low)
-    points = np.zeros((starts, len(own)))
-    points[:, :count] = low + (high - low) * rng.random((starts, count))
-    points[0] = own
-    return points
-
-
-def _scanned(problem: "FitProblem") -> np.ndarray:
-    """Points (S, Q) with other ratios of stiffness, if few are free: each one in turn."""
-    fields, log = problem.parameters.of_fields, problem.parameters.log
-    ratios = [i for i, field in enumerate(fields) if field == "stiffness" and log[i]]
-    own = problem.point(problem.start)
-    if len(ratios) > SCANS:
-        return np.zeros((0, len(own)))
-    points = np.tile(own, (len(ratios), SCANNED, 1))
-    for row, i in zip(points, ratios, strict=True):
-        row[:, i] += np.linspace(-np.log(SCAN_FACTOR), np.log(SCAN_FACTOR), SCANNED)
-    return np.clip(points.reshape(-1, len(own)), problem.low, problem.high)
-
-
-def _near(problem: "FitProblem", ends: Ends, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Points (count, Q) around the best, as far off as its standard errors, inside the bounds."""
-    best = int(np.nanargmin(ends.squares))
-    jacobian, measured = np.nan_to_num(ends.jacobian[best]), int(np.sum(problem.weight > 0))
-    # directions that the data do not determine are not searched
-    least = RANK_TOLERANCE[problem.precision] ** 2
-    inverse = np.linalg.pinv(jacobian.T @ jacobian, rcond=least, hermitian=True)
-    spread = NEAR_SPREAD * np.sqrt(ends.squares[best] / measured * np.diag(inverse))
-    y = ends.y[best]
-    points = y + np.minimum(spread, START_SCALES) * rng.normal(size=(count, len(y)))
-    return np.clip(points, problem.low, problem.high)
-
-
-def _groups(problem: "FitProblem", ends: Ends) -> list[list[int]]:
-    """Ends in the same minimum, best minimum first.
-
-    Of equally good ends a converged one comes first, then the earliest start: the first start is
-    the user's own.
-    """
-    squares, y, least = ends.squares, ends.y[:, : len(problem.names)], np.nanmin(ends.squares)
-    unit, exact = SAME_COST / ends.jacobian.shape[1], ends.exact[0]
-    equal = squares <= least * (1 + unit) + exact
-    order = np.lexsort((np.arange(len(y)), ~ends.converged, np.where(equal, least, squares)))
-    groups: list[list[int]] = []
-    for i in order:
-        for group in groups:
-            first = group[0]
-            close = abs(squares[i] - squares[first]) <= unit * squares[first] + exact
-            if close and _same_values(problem, ends, first, y[i] - y[first]):
-                group.append(int(i))
-                break
-        else:
-            groups.append([int(i)])
-    return groups
-
-
-def _same_values(problem: "FitProblem", ends: Ends, first: int, apart: np.ndarray) -> bool:
-    """Whether values (P,) so far apart from those of an end are the same."""
-    if np.abs(apart).max() < SAME_VALUE:
-        return True
-    jacobian = ends.jacobian[first][:, : len(apart)]
-    if not np.isfinite(jacobian).all():
-        return False
-    _, singular, directions = np.linalg.svd(jacobian, full_matrices=False)
-    determined = singular > RANK_TOLERANCE[problem.precision] * singular[0]
-    noise = np.sqrt(ends.squares[first] / len(jacobian))
-    errors = np.where(determined, noise / np.where(determined, singular, 1.0), 0.0)
-    allowed = np.maximum(SAME_ERRORS * errors, SAME_VALUE)
-    return bool((np.abs(directions @ apart) <= allowed).all())
-
-
-def settled(
-    problems: "list[FitProblem]", points: np.ndarray, search: Search
-) -> "tuple[list[FitProblem], Ends]":
-    """Minima next to points (S, Q), equally many of each problem.
-
-    Errors of v- are passed on by the law of each problem's best minimum, until both agree.
-    """
-    each, start = len(points) // len(problems), points
-    for _ in range(SETTLING):
-        ends = minimize(stacked(problems, each), start, search)
-        if ends.slopes is None:
-            return problems, ends
-        best = np.nanargmin(ends.squares.reshape(-1, each), axis=1)
-        slopes = ends.slopes[np.arange(0, len(points), each) + best]
-        problems = [p.with_errors_before(slope) for p, slope in zip(problems, slopes)]
-        moved = np.abs(ends.y - start).max(axis=1) > SETTLED
-        start = ends.y
-        if not moved.any():  # residuals and Jacobians with the weights of the final law
-            last = search._replace(max_steps=1)
-            return problems, minimize(stacked(problems, each), start, last)
-    return problems, ends._replace(converged=ends.converged & ~moved)

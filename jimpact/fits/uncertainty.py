@@ -23,7 +23,8 @@ from jimpact.fits.parameters import (
 )
 from jimpact.fits.problem import FitProblem
 from jimpact.fits.report import as_record, pieces_in_words, report, save_fit, verdict
-from jimpact.fits.solve import RANK_TOLERANCE, FitMinimum, Search, minimize, solution, stacked
+from jimpact.fits.search import FitMinimum, solution
+from jimpact.fits.solve import RANK_TOLERANCE, Solver, minimize, stacked
 from jimpact.law import parameters_of
 from jimpact.scene import Scene
 
@@ -248,7 +249,7 @@ class Fit(Tabular, Generic[AnyLaw]):
         status: (K,) codes of `jimpact.STATUS` at the minimum.
         converged: whether the best start did.
         steps: iterations of the best start.
-        lost_starts: how many did not converge.
+        lost_starts: how many were given up far above the best, or did not converge.
         warnings: what is wrong with data or fit, in words.
         problem: what was solved.
         jacobian: derivatives of what was measured in the parameters (K, n, P), NaN where no
@@ -430,7 +431,7 @@ class Fit(Tabular, Generic[AnyLaw]):
         ties = dict(self.problem.ties)
         problem = FitProblem.from_shots(law, own, data, self.problem.parameters.labels, ties=ties)
         point, every = problem.point(problem.start)[None], np.ones((1, len(problem.low)), bool)
-        ends = minimize(stacked([problem]), point, Search(max_steps=1), fixed=every)
+        ends = minimize(stacked([problem]), point, Solver(max_steps=1), fixed=every)
         there = solution(problem, ends)
         slope = problem.of_data(there.jacobian)
         error = self.errors_of(problem.errors_of(slope / problem.steps_at(problem.start)))
@@ -475,7 +476,7 @@ class Fit(Tabular, Generic[AnyLaw]):
 
     @property
     def start_count(self) -> int:
-        """Starts, those that did not converge included."""
+        """Starts, those that were given up included."""
         return sum(minimum.count for minimum in self.starts) + self.lost_starts
 
     def __getitem__(self, name: str) -> FittedParameter:

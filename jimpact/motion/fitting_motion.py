@@ -10,7 +10,9 @@ import numpy as np
 
 from jimpact._checks import as_float_array
 from jimpact.fits.fitting import Fit, fit
-from jimpact.fits.problem import FitProblem, Prediction
+from jimpact.fits.observables import Prediction
+from jimpact.fits.problem import FitProblem
+from jimpact.fits.search import Search
 from jimpact.law import Law
 from jimpact.motion.record import Motion
 from jimpact.motion.simulate import simulate
@@ -134,16 +136,8 @@ def fit_motion(
     problem = FitProblem.from_observable(
         law, observable, measured, sigma, free, bounds, priors, ties
     )
-    return fit(
-        problem,
-        loss=loss,
-        starts=starts,
-        seed=seed,
-        max_steps=max_steps,
-        profiles=profiles,
-        progress=progress,
-        limit=limit,
-    )
+    search = Search(loss=loss, seed=seed, max_steps=max_steps, limit=limit, progress=progress)
+    return fit(problem, starts=starts, profiles=profiles, search=search)
 
 
 def _positions(motion: Motion) -> jax.Array:

@@ -376,7 +376,9 @@ def test_a_fit_passes_errors_on_by_the_law_it_finds():
     spread = ji.bootstrap(found, 400).value.std()
     np.testing.assert_allclose(spread, found.standard_error[0], rtol=0.1)
 
-    robust = ji.fit(ji.Newton(0.1), ji.chain([m1, m2]), data, loss="student", starts=1)
+    robust = ji.fit(
+        ji.Newton(0.1), ji.chain([m1, m2]), data, starts=1, search=ji.Search(loss="student")
+    )
     covariance = 0.02**2 * np.eye(2)
     covariance += jacobian(robust.value[0]) @ np.diag(before**2) @ jacobian(robust.value[0]).T
     size = np.sqrt(np.diag(covariance))

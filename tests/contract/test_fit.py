@@ -135,7 +135,7 @@ def test_shots_that_do_not_belong_are_named_and_can_be_outvoted():
     assert "Suspicious: shot 18," in reported(moved)
     assert abs(moved.value[0] - 0.9) > 0.02
     for loss in ("huber", "student"):
-        found = ji.fit(ji.Newton(0.5), PAIR, data, loss=loss)
+        found = ji.fit(ji.Newton(0.5), PAIR, data, search=ji.Search(loss=loss))
         assert abs(found.value[0] - 0.9) < 0.005
         assert abs(found.value[0] - 0.9) < 4 * found.standard_error[0] < 0.02
         assert "Suspicious: shot 18," in reported(found)
@@ -151,7 +151,7 @@ def test_outliers_do_not_hide_each_other_from_a_robust_loss():
     for loss in ("huber", "student"):
         (line,) = (
             x
-            for x in ji.fit(ji.Newton(0.5), PAIR, data, loss=loss).warnings
+            for x in ji.fit(ji.Newton(0.5), PAIR, data, search=ji.Search(loss=loss)).warnings
             if x.startswith("Suspicious")
         )
         assert line.startswith("Suspicious: shots 10, 6, 3, which")
@@ -168,7 +168,9 @@ def test_honest_shots_are_seldom_suspicious():
         )
         data = ji.Experiments(pre, post)
         named += "Suspicious" in reported(ji.fit(ji.Newton(0.9), PAIR, data))
-        outvoted += "Suspicious" in reported(ji.fit(ji.Newton(0.9), PAIR, data, loss="huber"))
+        outvoted += "Suspicious" in reported(
+            ji.fit(ji.Newton(0.9), PAIR, data, search=ji.Search(loss="huber"))
+        )
     assert named <= 3
     assert outvoted <= 3
 
@@ -191,7 +193,9 @@ def test_robust_losses_minimize_what_they_say():
     u = at_0 + grid[:, None] * (at_1 - at_0)  # linear in e
     for loss, rho in (("huber", huber), ("student", student)):
         best = grid[np.argmin(rho(u).sum(axis=1))]
-        np.testing.assert_allclose(ji.fit(problem, loss=loss).value, best, atol=2e-4)
+        np.testing.assert_allclose(
+            ji.fit(problem, search=ji.Search(loss=loss)).value, best, atol=2e-4
+        )
 
 
 def test_the_scale_of_robust_losses_is_that_of_normal_errors():
@@ -205,7 +209,9 @@ def test_the_scale_of_robust_losses_is_that_of_normal_errors():
         scale = np.median(np.abs(y - e * x)) / stats.norm.ppf(0.75)
         weight = np.minimum(1.0, 1.345 * scale / np.abs(y - e * x))
         e = (weight * x) @ y / ((weight * x) @ x)
-    fitted = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post), loss="huber")
+    fitted = ji.fit(
+        ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post), search=ji.Search(loss="huber")
+    )
     np.testing.assert_allclose(fitted.value, [e], rtol=1e-5)
 
 
@@ -330,7 +336,7 @@ def test_gradient_descent_agrees_with_levenberg_marquardt(method):
     data = ji.Experiments(PRE_3, post)
     law = ji.Newton([0.9, 0.9])
     best = ji.fit(law, BALLS, data)
-    found = ji.fit(law, BALLS, data, method=method, starts=2)
+    found = ji.fit(law, BALLS, data, starts=2, search=ji.Search(method=method))
     assert found.converged or method not in ("adam", "sgd", "lbfgs")
     tolerance = 1e-3 if found.converged else 0.2
     assert np.all(np.abs(found.value - best.value) < tolerance * best.standard_error)
@@ -362,7 +368,7 @@ def test_descent_comes_back_from_beyond_the_domain():
 
 def test_too_few_steps_are_reported():
     data = ji.Experiments(SHOTS, simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.01))
-    found = ji.fit(ji.Newton(0.9), PAIR, data, method="adam", starts=1, max_steps=3)
+    found = ji.fit(ji.Newton(0.9), PAIR, data, starts=1, search=ji.Search("adam", max_steps=3))
     assert not found.converged
     assert "not converged" in " ".join(found.warnings)
     assert "NOT converged" in str(found)
@@ -388,7 +394,7 @@ def test_user_bounds_hold():
 
 def test_starts_are_reproducible():
     data = ji.Experiments(SHOTS, simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.05))
-    first, again = (ji.fit(ji.Newton(0.9), PAIR, data, seed=3) for _ in range(2))
+    first, again = (ji.fit(ji.Newton(0.9), PAIR, data, search=ji.Search(seed=3)) for _ in range(2))
     np.testing.assert_array_equal(first.value, again.value)
 
 
@@ -971,7 +977,9 @@ def test_bad_profiles(options, message):
     found = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, SHOTS), starts=1)
     with pytest.raises(ValueError, match=message):
         ji.profile(found, **options)
-    robust = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, SHOTS), starts=1, loss="huber")
+    robust = ji.fit(
+        ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, SHOTS), starts=1, search=ji.Search(loss="huber")
+    )
     with pytest.raises(ValueError, match="by least squares"):
         ji.profile(robust)
 
@@ -1121,9 +1129,9 @@ PER_CONTACT = ji.LZB([0.9, 0.9], [1.0, 1.0])
         (ji.Newton(0.9), BALLS, TWO, {}, r"one velocity per body of the scene: it has 2 a shot, but the scene has 3"),
         (ji.Newton(0.9), None, TWO, {}, r"`scene` must be a Scene"),
         (ji.Newton([0.9, 0.9]), PAIR, TWO, {}, r"`restitution` must have shape \(1,\)"),
-        (ji.Newton(0.9), PAIR, TWO, {"method": "newton"}, r"`method` must be one of 'levenberg-marquardt', .*'newton'"),
+        (ji.Newton(0.9), PAIR, TWO, {"search": ji.Search("newton")}, r"`method` must be one of 'levenberg-marquardt', .*'newton'"),
         (ji.Newton(0.9), PAIR, TWO, {"starts": 0}, r"`starts` must be an int >= 1"),
-        (ji.Newton(0.9), PAIR, TWO, {"max_steps": 0}, r"`max_steps` must be an int >= 1"),
+        (ji.Newton(0.9), PAIR, TWO, {"search": ji.Search(max_steps=0)}, r"`max_steps` must be an int >= 1"),
     ],
 )  # fmt: skip
 def test_bad_arguments(law, scene, data, options, message):
@@ -1170,7 +1178,7 @@ def test_no_degree_of_freedom_leaves_errors_unknown():
 
 def test_a_progress_bar_can_be_asked_for(capsys):
     data = ji.Experiments(SHOTS, simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.01))
-    fit = ji.fit(ji.Newton(0.9), PAIR, data, progress=True)
+    fit = ji.fit(ji.Newton(0.9), PAIR, data, search=ji.Search(progress=True))
     count = fit.start_count  # what the report counts
     assert f"{count} of {count} starts" in str(fit)
     assert f"{count} of {count} starts done" in capsys.readouterr().err

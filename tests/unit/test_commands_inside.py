@@ -93,7 +93,7 @@ def test_unwritable_places_are_refused_before_anything_is_computed(
     [
         (study_file.MOTION_KEYS.values(), ji.simulate),
         (set(study_file.METHOD_KEYS.values()) - {"step"}, ji.EventDriven),
-        (study_file.FIT.keys, ji.fit),
+        (study_file.FIT.keys - inspect.signature(ji.Search).parameters.keys(), ji.fit),
         (study_file.FIT_MOTION.keys, ji.fit_motion),
         (study_file.BASE_KEYS.values(), HarmonicBase),
         ([SAMPLING_ARGUMENTS.get(x, x) for x in study_file.SAMPLING.keys], ji.monte_carlo),

@@ -5,7 +5,7 @@ from importlib.resources import files
 import numpy as np
 
 import jimpact as ji
-from jimpact.fits.checks import data_defects
+from jimpact.fits.data_checks import data_defects
 
 DATA = files("jimpact") / "data"
 

@@ -157,7 +157,7 @@ def test_a_kink_is_a_minimum_but_not_a_standard_error():
 
 def test_a_time_limit_ends_a_search():
     data = ji.Experiments(SHOTS, simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.02))
-    stopped = ji.fit(ji.Newton(0.9), PAIR, data, method="adam", starts=1, limit=0.0)
+    stopped = ji.fit(ji.Newton(0.9), PAIR, data, starts=1, search=ji.Search("adam", limit=0.0))
     assert stopped.verdict.startswith("No answer")
     assert stopped.steps <= 8
 

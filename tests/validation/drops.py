@@ -407,7 +407,7 @@ def edges() -> list[str]:
         shots = square.only(square.contacts == contacts)
         plain = ji.Experiments(shots.pre, shots.post, scenes=shots.scenes, units=shots.units)
         law, free = ji.Moreau(0.5, friction=0.2), ("restitution", "friction")
-        fit = ji.fit(law, None, plain, free, starts=1, loss="huber")
+        fit = ji.fit(law, None, plain, free, starts=1, search=ji.Search(loss="huber"))
         (e, mu), (d, dmu) = fit.value, fit.standard_error
         lines.append(row(words, len(plain.pre), f"{e:.2f} +- {d:.2f}", f"{mu:.2f} +- {dmu:.2f}"))
     head = ["Impacts cut out of the drops (`ji.data.square_impacts()`), Moreau's law:", ""]

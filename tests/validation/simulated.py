@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jimpact as ji
-from jimpact.fits.solve import Search, minimize, stacked
+from jimpact.fits.solve import Solver, minimize, stacked
 
 PAGE = Path(__file__).parents[2] / "docs" / "coverage.md"
 PAIR, BALLS = ji.chain([1.0, 2.0]), ji.chain([1.0, 1.0, 1.0])
@@ -204,7 +204,7 @@ def covered(row, fits):
         y = best.copy()
         y[:, i] = [f.problem.point(truth)[i] for f in fits]
         fixed = np.broadcast_to(np.arange(y.shape[1]) == i, y.shape)
-        squares = minimize(many, y, Search(), fixed=fixed).squares
+        squares = minimize(many, y, Solver(), fixed=fixed).squares
         more = squares - [f.starts[0].sum_of_squares for f in fits]
         inside.append(more <= [(f.quantile(0.95) * f.noise) ** 2 for f in fits])
     return linear.mean(axis=0), np.mean(inside, axis=1)
@@ -217,7 +217,7 @@ def with_priors(row, count):
         start = ji.FitProblem.from_shots(row.law, row.scene, data, row.free)
         mean = truth_of(row, start.names[:1])[0] + row.prior * (rng.normal() + row.off)
         known = {start.names[0]: (mean, row.prior)}
-        options = {"starts": 1, "profiles": False, "progress": False}
+        options = {"starts": 1, "profiles": False}
         fits.append(ji.fit(row.law, row.scene, data, row.free, priors=known, **options))
     return fits
 
@@ -227,7 +227,7 @@ def fitted(row, count):
     if row.prior:
         return with_priors(row, count)
     if row.loss != "squares":
-        options = {"loss": row.loss, "starts": 1, "profiles": False}
+        options = {"search": ji.Search(loss=row.loss), "starts": 1, "profiles": False}
         return [ji.fit(row.law, row.scene, data, row.free, **options) for data in row.data(count)]
     return ji.fit_many(row.law, row.scene, row.data(count), row.free)
 

@@ -1,0 +1,284 @@
+"""What is wrong with measured shots: rows of a test and the sentence that the report has for it."""
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.special import ndtri, stdtr
+
+from jimpact.files.records import listed
+from jimpact.fits.data import ROUNDING, Experiments, closed_normals
+from jimpact.scene import Scene, dense_mass
+
+# ------------------------------------------------------------------ thresholds of the data
+# Defects below this share of the momentum or energy before are not reported: a good measurement of
+# a velocity is accurate to a tenth of a percent. Ten times more would hide defects of a percent.
+DEFECT_TOLERANCE = 1e-3
+# With `sigma`, a defect is reported beyond this many of its standard errors, ...
+DEFECT_SIGMAS = 3.0
+# ... or beyond more, so that all shots together show one by chance at most this often.
+DEFECT_LEVEL = 0.02
+# Beyond this share of the momentum or energy before, in half of the shots or more, a defect needs
+# no test: no noise of a useful measurement is as large, but a wrong unit is. With ten times more, a
+# factor of 3.6 (km/h) in two shots would go unseen.
+GROSS = 0.5
+# Factors that a wrong unit leaves in velocities: cm/s or mm/s for m/s, km/h, a decimal slip. A
+# median ratio of velocities within UNIT_NEAR of one (or of its inverse) is reported. Ten times
+# nearer, and noise of a percent would hide it.
+UNIT_FACTORS, UNIT_NEAR = {10.0: "a decimal point", 100.0: "cm/s", 1000.0: "mm/s", 3.6: "km/h"}, 0.1
+
+LISTED = 6  # shots named one by one (with their ratios); of more, how many there are
+
+
+class Finding(NamedTuple):
+    """A line of the warnings, and what a sentence that quotes the fit has to say about it."""
+
+    line: str
+    reservation: str = ""
+
+
+class Check(NamedTuple):
+    """A row: its test yields the numbers of each finding, for the sentences to format."""
+
+    test: Callable[[Any], Iterable[dict[str, Any]]]
+    sentence: str
+    reservation: str = ""
+
+
+def findings(rows: Sequence[Check], judged: Any) -> list[Finding]:
+    """What the tests of these rows find, in words."""
+    return [
+        Finding(row.sentence.format(**each), row.reservation.format(**each))
+        for row in rows
+        for each in row.test(judged)
+    ]
+
+
+def share(count: int, total: int) -> str:
+    """So many of all shots, in words.
+
+    >>> from jimpact.fits.data_checks import share
+    >>> share(1, 1), share(6, 6), share(2, 6)
+    ('this shot', 'all 6 shots', '2 of 6 shots')
+    """
+    if count == total < 3:
+        return "this shot" if total == 1 else "both shots"
+    return f"all {total} shots" if count == total else f"{count} of {total} shots"
+
+
+# ------------------------------------------------------------------ what the data break
+
+
+class _Defect(NamedTuple):
+    """By how much a balance of the k-th shot fails, its scale, the momentum or energy before,
+    derivatives in v+ (and v-), their errors, a ratio."""
+
+    k: int
+    excess: float
+    scale: float
+    before: float
+    slope: np.ndarray
+    sigma: np.ndarray | None
+    ratio: float
+
+
+class DataBalances:
+    """Measured shots with the balances of each."""
+
+    def __init__(self, experiments: Experiments, scene: Scene | None, stored_energy: float):
+        self.experiments, self.scene, self.stored_energy = experiments, scene, stored_energy
+        self.total = len(experiments.shots)
+        self.momenta: dict[int, list[_Defect]] = {}  # by the momentum that is conserved
+        self.energies: list[_Defect] = []
+        self.resting: list[int] = []  # shots in which no contact approaches
+        errors = None if experiments.sigma is None else np.asarray(experiments.sigma, float)
+        if errors is not None and experiments.sigma_pre is not None:
+            errors = np.hstack([errors, np.asarray(experiments.sigma_pre, float)])
+        normals, masses = (experiments.each(scene, f) for f in (closed_normals, dense_mass))
+        for k, (rows, pre, post) in enumerate(experiments.balances(scene)):
+            slowest = -ROUNDING * np.abs(normals[k]).T @ np.abs(pre)
+            if stored_energy == 0 and (normals[k].T @ pre >= slowest).all():
+                self.resting.append(k)
+            if not np.isnan(post).any():
+                self._judge(k, rows, pre, post, masses[k], None if errors is None else errors[k])
+
+    def _judge(
+        self, k: int, rows: Any, pre: Any, post: Any, mass: np.ndarray, sigma: np.ndarray | None
+    ) -> None:
+        """Momentum and energy of a shot before and after."""
+        used = slice(len(post) if sigma is None else len(sigma))
+        for j, row in enumerate(rows):
+            excess, scale, before = row @ (post - pre), np.abs(row) @ np.abs(pre), row @ pre
+            back = before < -ROUNDING * scale
+            ratio = 1 + (-excess if back else excess) / scale if scale else np.inf
+            slope = np.append(row, -row)[used]
+            defect = _Defect(k, excess, scale, before, slope, sigma, ratio)
+            self.momenta.setdefault(j, []).append(defect)
+        t_minus, t_plus = 0.5 * pre @ mass @ pre, 0.5 * post @ mass @ post
+        gain = t_plus - t_minus - self.stored_energy
+        slope = np.append(mass @ post, -mass @ pre)[used]
+        ratio = t_plus / t_minus if t_minus > 0 else np.nan
+        self.energies.append(_Defect(k, gain, t_minus, t_minus, slope, sigma, ratio))
+
+    def listed(self, ratios: dict[int, float]) -> dict[str, Any]:
+        """Shots with their ratios, or the range of the ratios of many."""
+        shots = self.experiments.shots
+        text = ", ".join(f"shot {shots[k]}: {r:.4f}" for k, r in ratios.items())
+        if len(ratios) > LISTED:
+            values = list(ratios.values())
+            text = f"{len(values)} of {self.total} shots, {min(values):.4f} to {max(values):.4f}"
+        return {"shots": text, "share": share(len(ratios), self.total)}
+
+
+def _units(data: DataBalances) -> Iterable[dict[str, Any]]:
+    """Whether velocities after are those before but for a factor that a wrong unit leaves.
+
+    By the momentum that is conserved; where none is, by the energy where it grows.
+    """
+    ratios = [d.ratio for each in data.momenta.values() for d in each]
+    gains = [np.sqrt(d.ratio) for d in data.energies if d.ratio > 1]
+    what, values = ("momentum", ratios) if ratios else ("root of the energy", gains)
+    if not values or len(values) < 0.5 * max(len(ratios), len(data.energies)):
+        return
+    ratio = float(np.median(values))
+    for factor, unit in UNIT_FACTORS.items():
+        near = (factor, 1 / factor) if what == "momentum" else (factor,)
+        if any(abs(ratio / value - 1) < UNIT_NEAR for value in near):
+            yield {"what": what, "ratio": ratio, "unit": unit}
+            return
+
+
+def _momentum(data: DataBalances) -> Iterable[dict[str, Any]]:
+    """Shots that break a momentum beyond their noise, and the rms that this alone leaves."""
+    level = DEFECT_LEVEL / max(len(data.momenta), 1)
+    ratios = {k: r for each in data.momenta.values() for k, r in _beyond(each, level).items()}
+    if not ratios:
+        return
+    floor, experiments = "", data.experiments
+    if experiments.sigma is None:
+        corrected = experiments.momentum_corrected(data.scene)
+        change = np.asarray(experiments.post) - np.asarray(corrected.post)
+        floor = f" (rms {np.sqrt(np.nanmean(change**2)):.3g} m/s)"
+    yield data.listed(ratios) | {"floor": floor}
+
+
+def _energy(data: DataBalances) -> Iterable[dict[str, Any]]:
+    """Shots that gain energy beyond their noise."""
+    ratios = _beyond(data.energies, DEFECT_LEVEL, gains=True)
+    return [data.listed(ratios)] if ratios else []
+
+
+def _resting(data: DataBalances) -> Iterable[dict[str, Any]]:
+    """Shots in which no contact approaches."""
+    count = len(data.resting)
+    if count:
+        labels = listed([data.experiments.shots[k] for k in data.resting])
+        which = share(count, data.total)
+        yield {"count": count, "total": data.total, "labels": labels, "share": which}
+
+
+def _copies(data: DataBalances) -> Iterable[dict[str, Any]]:
+    """Whether most shots of a scene are one, several times or scaled, with no sigma."""
+    experiments = data.experiments
+    if experiments.scenes is not None or experiments.sigma is not None:
+        return
+    rows = np.hstack([np.asarray(experiments.pre, float), np.asarray(experiments.post, float)])
+    size = np.sqrt(np.nansum(rows**2, axis=1, keepdims=True))
+    unit = np.nan_to_num(rows / np.where(size > 0, size, 1.0), nan=np.inf)
+    # what more than half have in common is the median
+    same = np.isclose(unit, np.median(unit, axis=0), rtol=0, atol=ROUNDING).all(axis=1)
+    count, total = int(same.sum()), data.total
+    if 2 * count > total > 1:
+        which, some = f"All {total}", "the"
+        if count < total:
+            which, some = f"{count} of {total}", f"{count} of"
+        yield {"which": which, "some": some, "total": total}
+
+
+DATA_ROWS = (
+    Check(
+        _units,
+        "Units? The {what} after is {ratio:.3g} times that before: {unit} in one of the columns?",
+        "the units are suspect",
+    ),
+    Check(
+        _momentum,
+        "The data violate conservation of momentum (1 = conserved): {shots}; no law can reproduce "
+        "that part{floor}.",
+        "the data violate conservation of momentum in {share}",
+    ),
+    Check(
+        _energy,
+        "The data gain energy (1 = conserved): {shots}.",
+        "kinetic energy grows in {share}",
+    ),
+    Check(
+        _resting,
+        "No contact approaches in {count} of {total} shots ({labels}): are pre and post swapped, "
+        "or is a sign wrong?",
+        "no contact approaches in {share}",
+    ),
+    Check(
+        _copies,
+        "{which} shots are equal to the last digit, but for a factor: they carry no more "
+        "information than one of them, and none on the noise; without `sigma` or `resolution` the "
+        "errors are meaningless.",
+        "{some} {total} shots are copies of one",
+    ),
+)
+
+
+def data_defects(
+    experiments: Experiments, scene: Scene | None = None, stored_energy: float = 0.0
+) -> list[str]:
+    """What the data break beyond their error, a line each: momentum, energy, approach; copies.
+
+    Momentum is reported as `1 + excess / sum |m v-|`, the excess in the direction of the momentum
+    before: after over before where all bodies move one way. Without `sigma` the shots show their
+    noise: a defect is one that they have in common, the same excess or the same share of the
+    momentum before, whichever way that points (t tests), or one of half of the momentum in half of
+    the shots; of a single shot any above a tenth of a percent.
+
+    Args:
+        experiments: the shots; those with missing values are not judged.
+        scene: the common scene, None where the shots carry their own.
+        stored_energy: what the law may add to the energy (precompression) [J].
+
+    >>> import jimpact as ji
+    >>> from jimpact.fits.data_checks import data_defects
+    >>> data_defects(ji.Experiments([1.0, 0.0], [0.0, 1.2]), ji.chain([1.0, 1.0]))[1]
+    'The data gain energy (1 = conserved): shot 1: 1.4400.'
+    """
+    data = DataBalances(experiments, scene, stored_energy)
+    return [found.line for found in findings(DATA_ROWS, data)]
+
+
+def _beyond(defects: list[_Defect], level: float, gains: bool = False) -> dict[int, float]:
+    """Ratios of the shots whose balance fails by more than their noise; gains: upwards only."""
+    size = np.array([d.excess if gains else abs(d.excess) for d in defects])
+    if any(d.sigma is not None for d in defects):
+        sigmas = max(DEFECT_SIGMAS, float(ndtri(1 - 0.5 * level / len(defects))))
+        limit = [np.linalg.norm(d.slope * d.sigma) for d in defects]
+        return {d.k: d.ratio for d, x, y in zip(defects, size, limit) if x > sigmas * y}
+    scale = np.array([d.scale for d in defects])
+    flagged = {d.k: d.ratio for d, x in zip(defects, size > DEFECT_TOLERANCE * scale) if x}
+    if len(defects) < 2 or not flagged or np.mean(size > GROSS * scale) >= 0.5:
+        return flagged
+    weight = np.array([1 / np.linalg.norm(d.slope) if d.slope.any() else 0.0 for d in defects])
+    excess = weight * [d.excess for d in defects]
+    shapes = [np.sign(weight), weight * [d.before for d in defects]]
+    chances = [_chance(excess[weight > 0], shape[weight > 0], gains) for shape in shapes]
+    return flagged if min(chances) < level / len(shapes) else {}
+
+
+def _chance(excess: np.ndarray, shape: np.ndarray, gains: bool) -> float:
+    """How often noise alone follows a shape as much: Student's t; 1 where it cannot be judged."""
+    squares, freedom = float(shape @ shape), len(excess) - 1
+    if freedom < 1 or squares == 0:
+        return 1.0
+    part = float(shape @ excess) / squares
+    rest = float(np.sum((excess - part * shape) ** 2))
+    error = np.sqrt(rest / freedom / squares)
+    t = part / error if error else np.inf * np.sign(part)
+    above = float(stdtr(freedom, -t))
+    return above if gains else 2 * min(above, 1 - above)

@@ -1,0 +1,117 @@
+"""What is observed of a law: velocities after impacts, or a user's own function of it."""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact.compiling import quick_jit
+from jimpact.contact import contact_of
+from jimpact.fits.data import Experiments
+from jimpact.fits.parameters import placed
+from jimpact.impacts import impact
+from jimpact.law import AnyLaw, Law, forward_only
+from jimpact.scene import Scene
+from jimpact.status import CODE, sign_tolerance
+
+# Outcomes whose velocities are meaningless.
+UNUSABLE = ("infeasible", "max_steps", "not_finite")
+
+# Shots are filled up to 4, 8, 16, ... of them: a program serves all numbers in between, and the
+# copies that fill up cost far less than compiling another one.
+FEWEST = 4
+# Error of computed gap velocities, as a part of their noise. Ten times more: as large as the noise
+# itself, and the same in all shots.
+PART_OF_NOISE = 0.1
+# Tolerance for such data: one, since each compiles a program. Standard errors move by .1 %; at one
+# ten times more derivatives lose another digit.
+COARSE_RTOL = 1e-4
+_CONTACT = jax.jit(contact_of)  # remembers the shapes that it has seen; only these are asked for
+
+
+class Prediction(NamedTuple):
+    """What a law predicts: values, where they are meaningless, and status codes (S,)."""
+
+    value: jax.Array
+    bad: jax.Array
+    status: jax.Array
+
+
+class Shots(eqx.Module):
+    """The observable of impacts: v+ (K, n)."""
+
+    scenes: Scene  # stacked, one for each shot
+    pre: jax.Array  # (K, n), further columns where scenes were made alike
+    bodies: int = eqx.field(static=True)
+
+    def __call__(self, law: Law) -> Prediction:
+        """Velocities after every shot, and the status of its impact."""
+        law, scenes = placed(law, self.scenes)
+        out = jax.vmap(impact, in_axes=(None, 0, 0))(law, scenes, self.pre)
+        unusable = jnp.asarray([CODE[name] for name in UNUSABLE], out.status.dtype)
+        bad = jnp.any(out.status[:, None] == unusable[None, :], axis=1)
+        return Prediction(out.velocity[:, : self.bodies], bad[:, None], out.status)
+
+
+class Observed(eqx.Module):
+    """The observable of a user's own function of a law.
+
+    `absolute`: it may see absolute stiffnesses (a force, a time), not only their ratios.
+    """
+
+    function: Callable[[Law], Any] = eqx.field(static=True)
+    absolute: bool = eqx.field(static=True, default=False)
+
+    def __call__(self, law: Law) -> Prediction:
+        """The value of the function; NaN counts as meaningless."""
+        value = jnp.asarray(self.function(law))
+        return Prediction(value, ~jnp.isfinite(value), jnp.zeros(1, jnp.int32))
+
+
+def filled_count(count: int) -> int:
+    """How many shots a program has that serves so many."""
+    return FEWEST if count <= FEWEST else 2 ** math.ceil(math.log2(count))
+
+
+@quick_jit
+def slopes_before(law: Law, shots: Shots) -> jax.Array:
+    """Compiled `dv+/dv-` of every shot."""
+    law, scenes = placed(forward_only(law), shots.scenes)
+
+    def after(v: jax.Array, scene: Scene) -> jax.Array:
+        """v+ of v-."""
+        return impact(law, scene, v).velocity
+
+    return jax.vmap(jax.jacfwd(after))(shots.pre, scenes)
+
+
+def tolerated(
+    law: AnyLaw, scene: Scene | None, data: Experiments
+) -> tuple[AnyLaw, tuple[str, ...]]:
+    """The law at a tolerance that the noise of the data allows, and a sentence that says so.
+
+    Of a law without `rtol` that errs by more than signs do (`Law.accuracy`), where `sigma` is
+    known.
+    """
+    if data.sigma is None or getattr(law, "rtol", COARSE_RTOL) is not None:
+        return law, ()
+    pre, sigma = np.asarray(data.pre), np.asarray(data.sigma)
+    shapes = _CONTACT.eval_shape(data.largest_scene(scene), pre[0])
+    if not sign_tolerance(pre.dtype) < law.accuracy(shapes) < COARSE_RTOL:
+        return law, ()
+    normals = data.each(scene, lambda each: np.asarray(each.normals))
+    fastest = [np.abs(n.T @ v).max() for n, v in zip(normals, pre)]
+    noise = [np.sqrt(np.square(n.T) @ s**2).min() for n, s in zip(normals, sigma)]
+    # a noise of NaN, where a value was not measured, allows nothing
+    if not all(PART_OF_NOISE * s >= COARSE_RTOL * v for s, v in zip(noise, fastest)):
+        return law, ()
+    line = (
+        f"Velocities finer than {COARSE_RTOL:g} of the fastest approach: the law is computed with "
+        f"`rtol` = {COARSE_RTOL:g}, a tenth of the noise or less; give it an `rtol` to change that."
+    )
+    return dataclasses.replace(law, **{"rtol": COARSE_RTOL}), (line,)

@@ -1,0 +1,373 @@
+"""The lowest minimum of a fit, and others: where searches start, and which of their ends differ."""
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+from scipy.special import chdtrc
+
+from jimpact.compiling import quick_jit
+from jimpact.fits.solve import (
+    COARSE,
+    RANK_TOLERANCE,
+    SETTLED,
+    SETTLING,
+    Ends,
+    Method,
+    Solver,
+    in_lanes,
+    minimize,
+    stacked,
+)
+
+if TYPE_CHECKING:
+    from jimpact.fits.problem import FitProblem
+
+# Random starts: a stiffness within this factor of the user's, a parameter without two bounds
+# within this many natural scales of the user's.
+START_FACTOR = 5.0
+START_SCALES = 2.0
+# Random coefficients of restitution start above this: below, contacts of a chain re-close many
+# times, which takes ten times as long and hardly occurs in hard bodies. (Fits do go there.)
+START_RESTITUTION = 0.5
+# Ends are one minimum if their sums of squares differ by less than this many variances of a
+# residual, and their values by less than this share of a standard error, or of a natural scale
+# where the data do not determine them. What starts leave is a tenth of that.
+SAME_COST, SAME_ERRORS, SAME_VALUE = 1e-2, 0.2, 1e-3
+STARTS, ROUNDS = 12, 8  # by default, and how often others around the best follow
+# What chi^2 rejects at this level is searched for again, so often at most.
+REJECTED, TURNS = 0.1, 4
+IDLE_PARAMETERS = 4  # a round without a gain is the last one, or the second of more parameters
+# A search of its own choice starts at the lowest of so many points: values alone cost a tenth of
+# derivatives. Ten times more take longer than all that descends from them.
+SCANNED = 128
+SCAN_LANES = 8  # of them side by side
+SCAN_RTOL = 1e-4  # of these values, which need only be told apart; finer ones take twice as long
+# Several ratios often reproduce the same shots: one or two are scanned up to this factor.
+SCAN_FACTOR, SCANS = 100.0, 2
+# Starts around the best, in standard errors: nearer ones end in it, farther ones anywhere.
+NEAR_SPREAD, FAR_SPREAD = 2.0, 40.0
+ROUGH_STEPS = 16  # of a start, to where minima can be told apart
+
+
+@dataclass(frozen=True)
+class Search:
+    """How `fit` searches for the parameters, if not as it does by default.
+
+    Args:
+        method: 'levenberg-marquardt'; or gradient descent: 'adam', 'sgd', 'lbfgs' or an optax
+            transformation.
+        loss: 'squares'; or one that outliers move little: 'huber' (beyond 1.345 sigma the absolute
+            value), 'student' (the density of Student's t, 4 degrees of freedom). Where sigma is
+            not known, it is taken from the median of the residuals.
+        seed: of the random starts.
+        max_steps: iterations per start; None: 100, of 'adam' 500, of 'sgd' 1000.
+        limit: seconds after which no further step of the search is begun; None: no limit.
+        progress: bar on stderr; None: on a terminal, for fits longer than two seconds.
+
+    >>> import jimpact as ji
+    >>> data = ji.Experiments(pre=[[1.0, 0.0], [2.0, 0.0]], post=[[0.3, 0.7], [0.6, 1.4]])
+    >>> fit = ji.fit(ji.Newton(0.9), ji.chain([1.0, 1.0]), data, search=ji.Search(method="adam"))
+    >>> round(float(fit.law.restitution), 4)
+    0.4
+    """
+
+    method: Method = "levenberg-marquardt"
+    loss: str = "squares"
+    seed: int = 0
+    max_steps: int | None = None
+    limit: float | None = None
+    progress: float | None = None
+
+
+DEFAULT_SEARCH = Search()
+
+
+@dataclass(frozen=True, eq=False)
+class FitMinimum:
+    """A minimum that starts ended in: sum of squared (weighted) residuals, values, how many.
+
+    `standard_error` is None where it fits so much worse that it does not matter. A search knows the
+    `residual` (R,) of what was measured, then that of the priors, and its `jacobian` (R, P) in the
+    scaled parameters.
+    """
+
+    sum_of_squares: float
+    value: np.ndarray
+    count: int
+    standard_error: np.ndarray | None = None
+    jacobian: np.ndarray = None  # type: ignore[assignment]  # of a result: what a search knows
+    residual: np.ndarray = None  # type: ignore[assignment]
+
+
+class Solution(NamedTuple):
+    """All distinct minima, best first, and what the law of the best predicts."""
+
+    minima: list[FitMinimum]
+    predicted: np.ndarray  # shaped like what was measured
+    status: np.ndarray
+    slopes: np.ndarray | None  # `dv+/dv-` of the shots, where errors of v- are passed on
+    converged: bool
+    stuck: bool  # no step lowers the sum of squares, although derivatives promise it
+    at_bound: np.ndarray
+    steps: int
+    lost: int  # starts that were given up, or did not converge
+
+    @property
+    def value(self) -> np.ndarray:
+        """The parameters (P,) of the best."""
+        return self.minima[0].value
+
+    @property
+    def jacobian(self) -> np.ndarray:
+        """(R, P), of the scaled parameters at the best."""
+        return self.minima[0].jacobian
+
+
+def solution(
+    problem: "FitProblem", ends: Ends, counts: np.ndarray | None = None, lost: int = 0
+) -> Solution:
+    """The distinct minima among ends; counts: of the starts that an end is for."""
+    counts = np.ones(len(ends.y), int) if counts is None else counts
+    count, measured = len(problem.names), problem.measured
+    groups = _groups(problem, ends)
+    # without what filled up, and parameters that have no prior
+    first_prior = ends.residual.shape[1] - len(problem.low)
+    own = [*range(measured.size), *(first_prior + prior.parameter for prior in problem.priors)]
+    best, y = groups[0][0], ends.y[:, :count]
+    # starts that did not converge have no minimum to report, unless they are the best there is
+    kept = [[i for i in group if ends.converged[i] or i == best] for group in groups]
+    minima = [
+        FitMinimum(
+            float(ends.squares[group[0]]),
+            problem.values_at(ends.y[group[0]]),
+            int(counts[group].sum()),
+            None,
+            ends.jacobian[group[0]][own, :count],
+            ends.residual[group[0]][own],
+        )
+        for group in kept
+        if group
+    ]
+    rows = slice(len(measured)) if measured.ndim else ...
+    low, high = (np.asarray(end)[:count] for end in (problem.low, problem.high))
+    return Solution(
+        minima=minima,
+        predicted=ends.predicted[best][rows],
+        status=ends.status[best][rows],
+        slopes=None if ends.slopes is None else ends.slopes[best],
+        converged=bool(ends.converged[best]),
+        stuck=bool(ends.stuck[best]),
+        at_bound=(y[best] <= low) | (y[best] >= high),
+        steps=int(np.max(ends.steps)),
+        lost=lost + int(counts.sum()) - sum(minimum.count for minimum in minima),
+    )
+
+
+def find_minima(problem: "FitProblem", starts: int | None, seed: int, solver: Solver) -> Solution:
+    """All starts to where their minima can be told apart, and the best of these to its end.
+
+    Two thirds of the starts are those of `start_points`. The law is only piecewise smooth, so that
+    the sum of squares has side minima close to a minimum: the others begin around the best. Where
+    their number is left open, they are the lowest of many such points, further ones around the
+    best follow as long as they lower the sum of squares, and all is done again with other points
+    if sigma contradicts what was found, as long as that helps.
+    """
+    rng, turns = np.random.default_rng(seed), 1 if starts else TURNS
+    if starts == 1:
+        points = start_points(problem, 1, rng)
+        return solution(problem, minimize(stacked([problem]), points, solver, what="starts"))
+    ends = _rough_ends(problem, starts, rng, solver)
+    for _ in range(1, turns):
+        least = np.nanmin(ends.squares)
+        freedom = problem.values - len(problem.names)
+        if problem.sigma is None or freedom < 1 or chdtrc(freedom, least) > REJECTED:
+            break
+        more = _rough_ends(problem, starts, rng, solver)
+        ends = _both(ends, more)
+        if not _gains(more, least):
+            break
+    best = _groups(problem, ends)[0][:1]
+    fine = minimize(stacked([problem]), ends.y[best], solver, what="minima")
+    fine = fine._replace(steps=fine.steps + ends.steps[best])
+    for leaf, value in zip(jax.tree.leaves(ends), jax.tree.leaves(fine)):
+        leaf[best] = value
+    total = len(ends.y)
+    solver.show(f"fit: {total} of {total} starts done", total, total)
+    return solution(problem, ends)
+
+
+def _rough_ends(
+    problem: "FitProblem", starts: int | None, rng: np.random.Generator, solver: Solver
+) -> Ends:
+    """Where starts end, and others around the best, so far that minima can be told apart."""
+    count, noise = starts or STARTS, 0.0 if problem.sigma is None else 1.0
+    far, log = count - count // 3, problem.parameters.log
+    scanned = starts is None and bool(len(log) > 1 or log.any())
+    if solver.method == "levenberg-marquardt":
+        solver = solver._replace(max_steps=min(ROUGH_STEPS, solver.max_steps))
+
+    def rough(points: np.ndarray) -> Ends:
+        """To where minima can be told apart."""
+        many = stacked([problem], len(points))
+        return minimize(many, points, solver, COARSE, noise, "starts")
+
+    ends = rough((_first_points if scanned else start_points)(problem, far, rng))
+    idle = 0  # rounds without a gain, one after the other
+    for _ in range((1 if starts else ROUNDS) if count > far else 0):
+        points = _near(problem, ends, SCANNED if scanned else count - far, noise, rng)
+        if scanned:
+            points = _lowest(problem, points, count - far)
+        if not len(points):  # the data see none of the parameters
+            break
+        least, more = np.nanmin(ends.squares), rough(points)
+        ends = _both(ends, more)
+        idle = 0 if _gains(more, least) else idle + 1
+        if idle * IDLE_PARAMETERS >= len(log):
+            break
+    return ends
+
+
+def _both(first: Ends, second: Ends) -> Ends:
+    """All ends of two searches."""
+    return jax.tree.map(lambda a, b: np.concatenate([a, b]), first, second)
+
+
+def _gains(more: Ends, least: float) -> bool:
+    """Whether ends are lower than the least sum of squares by more than the noise of a value."""
+    return bool(np.nanmin(more.squares) < least * (1 - 1 / more.jacobian.shape[1]))
+
+
+def _box(problem: "FitProblem") -> np.ndarray:
+    """Ends (2, P) of y between which starts lie."""
+    log, count = problem.parameters.log, len(problem.names)
+    own = problem.point(problem.start)[:count]
+    low, high = (np.array(end, float)[:count] for end in (problem.low, problem.high))
+    reach = np.where(log, np.log(START_FACTOR), START_SCALES)
+    low = np.where(log | np.isinf(low), np.maximum(low, own - reach), low)
+    high = np.where(log | np.isinf(high), np.minimum(high, own + reach), high)
+    elastic = np.array([field == "restitution" for field in problem.parameters.of_fields])
+    low = np.where(elastic & (high > START_RESTITUTION), np.maximum(low, START_RESTITUTION), low)
+    return np.stack([low, high])
+
+
+def start_points(problem: "FitProblem", starts: int, rng: np.random.Generator) -> np.ndarray:
+    """Starts y (S, Q): the law's own values, then a Latin hypercube inside the bounds."""
+    low, high = _box(problem)
+    slices = rng.permuted(np.tile(np.arange(starts), (len(low), 1)), axis=1).T
+    points = np.tile(problem.point(problem.start), (starts, 1))
+    points[1:, : len(low)] = (low + (high - low) * (slices + rng.random(slices.shape)) / starts)[1:]
+    return points
+
+
+def _first_points(problem: "FitProblem", count: int, rng: np.random.Generator) -> np.ndarray:
+    """The law's own y, the lowest of many points, and those of each ratio where few are free."""
+    ratios = np.flatnonzero(problem.parameters.log)
+    points = start_points(problem, SCANNED, rng)
+    chosen = [points[:1], _lowest(problem, points[1:], count - 1)]
+    for i in ratios if len(ratios) <= SCANS else ():
+        line = np.tile(points[0], (SCANNED // 2, 1))
+        line[:, i] += np.linspace(-np.log(SCAN_FACTOR), np.log(SCAN_FACTOR), len(line))
+        chosen.append(_lowest(problem, np.clip(line, problem.low, problem.high), count // 2))
+    return np.concatenate(chosen)
+
+
+def _lowest(problem: "FitProblem", points: np.ndarray, count: int) -> np.ndarray:
+    """Of points (S, Q) the lowest that are lower than their nearest neighbours, at most so many."""
+    law, parameters = problem.law, len(problem.names)
+    if getattr(law, "rtol", SCAN_RTOL) is None:
+        law = replace(law, rtol=SCAN_RTOL)  # type: ignore[call-arg]
+    squares, many = np.empty(len(points)), stacked([replace(problem, law=law)], len(points))
+    every = np.arange(len(points))
+    for rows, some in in_lanes(_squares, every, SCAN_LANES, many, points):
+        squares[rows] = np.nan_to_num(some, nan=np.inf)
+    width = np.ptp(points[:, :parameters], axis=0)
+    apart = (points[:, None] - points)[..., :parameters] / np.where(width > 0, width, 1.0)
+    nearest = np.argsort(np.sum(apart**2, axis=-1), axis=1)[:, 1 : parameters + 2]
+    lowest = np.flatnonzero(squares < squares[nearest].min(axis=1))
+    return points[lowest[np.argsort(squares[lowest])][:count]]
+
+
+@quick_jit
+def _squares(problems: Any, points: jax.Array) -> jax.Array:
+    """Compiled `|r|^2` (S,) over `size` of problems at y (S, Q)."""
+    return eqx.filter_vmap(lambda problem, y: problem.squares(y))(problems, points)
+
+
+def _near(
+    problem: "FitProblem", ends: Ends, count: int, noise: float, rng: np.random.Generator
+) -> np.ndarray:
+    """Points (count, Q) around the best, as far off as its standard errors and more, in bounds."""
+    best = int(np.nanargmin(ends.squares))
+    jacobian, measured = np.nan_to_num(ends.jacobian[best]), int(np.sum(problem.weight > 0))
+    # directions that the data do not determine are not searched
+    least = RANK_TOLERANCE[problem.precision] ** 2
+    inverse = np.linalg.pinv(jacobian.T @ jacobian, rcond=least, hermitian=True)
+    variance = max(ends.squares[best] / measured, noise**2)
+    error, y = np.sqrt(variance * np.diag(inverse)), ends.y[best]
+    spread = np.exp(rng.uniform(np.log(NEAR_SPREAD), np.log(FAR_SPREAD), (count, 1)))
+    move = np.minimum(spread * error, START_SCALES) * rng.normal(size=(count, len(y)))
+    return np.clip(y + move, problem.low, problem.high)
+
+
+def _groups(problem: "FitProblem", ends: Ends) -> list[list[int]]:
+    """Ends in the same minimum, best minimum first.
+
+    Of equally good ends a converged one comes first, then the earliest start: the first start is
+    the user's own.
+    """
+    squares, y, least = ends.squares, ends.y[:, : len(problem.names)], np.nanmin(ends.squares)
+    unit, exact = SAME_COST / ends.jacobian.shape[1], ends.exact[0]
+    equal = squares <= least * (1 + unit) + exact
+    order = np.lexsort((np.arange(len(y)), ~ends.converged, np.where(equal, least, squares)))
+    groups: list[list[int]] = []
+    for i in order:
+        for group in groups:
+            first = group[0]
+            close = abs(squares[i] - squares[first]) <= unit * squares[first] + exact
+            if close and _same_values(problem, ends, first, y[i] - y[first]):
+                group.append(int(i))
+                break
+        else:
+            groups.append([int(i)])
+    return groups
+
+
+def _same_values(problem: "FitProblem", ends: Ends, first: int, apart: np.ndarray) -> bool:
+    """Whether values (P,) so far apart from those of an end are the same."""
+    if np.abs(apart).max() < SAME_VALUE:
+        return True
+    jacobian = ends.jacobian[first][:, : len(apart)]
+    if not np.isfinite(jacobian).all():
+        return False
+    _, singular, directions = np.linalg.svd(jacobian, full_matrices=False)
+    determined = singular > RANK_TOLERANCE[problem.precision] * singular[0]
+    noise = np.sqrt(ends.squares[first] / len(jacobian))
+    errors = np.where(determined, noise / np.where(determined, singular, 1.0), 0.0)
+    allowed = np.maximum(SAME_ERRORS * errors, SAME_VALUE)
+    return bool((np.abs(directions @ apart) <= allowed).all())
+
+
+def settled(
+    problems: "list[FitProblem]", points: np.ndarray, solver: Solver
+) -> "tuple[list[FitProblem], Ends]":
+    """Minima next to points (S, Q), equally many of each problem.
+
+    Errors of v- are passed on by the law of each problem's best minimum, until both agree.
+    """
+    each, start = len(points) // len(problems), points
+    for _ in range(SETTLING):
+        ends = minimize(stacked(problems, each), start, solver)
+        if ends.slopes is None:
+            return problems, ends
+        best = np.nanargmin(ends.squares.reshape(-1, each), axis=1)
+        slopes = ends.slopes[np.arange(0, len(points), each) + best]
+        problems = [p.with_errors_before(slope) for p, slope in zip(problems, slopes)]
+        moved = np.abs(ends.y - start).max(axis=1) > SETTLED
+        start = ends.y
+        if not moved.any():  # residuals and Jacobians with the weights of the final law
+            last = solver._replace(max_steps=1)
+            return problems, minimize(stacked(problems, each), start, last)
+    return problems, ends._replace(converged=ends.converged & ~moved)
