@@ -190,4 +190,20 @@ for i, axes in enumerate(figure.subplots(1, 3)):
 figure
 
 # %% [markdown]
+# ## Exercises
+#
+# 1. Fit `ji.Binary`, collisions one after the other, to the measured shot. Which $e$ does it give, and
+#    does it reproduce the shot as well as LZB?
+# 2. Halve the noise of the simulated shots. What happens to the standard errors?
+#
+# Answers:
+
+# %%
+binary = ji.fit(ji.Binary(0.9), balls, corrected)
+print(f"1. e = {binary.value[0]:.3f}, rms {binary.rms:.4f} m/s, LZB {lzb_corrected.rms:.4f} m/s")
+noise = 0.005
+finer = ji.fit(start, balls, simulated_shots(0), starts=8)
+print("2. errors over those before:", (finer.standard_error / first.standard_error).round(2))
+
+# %% [markdown]
 # *Next: [the same with your own file](02_your_own_csv.ipynb).*

@@ -143,6 +143,20 @@ page.write_text(f"<!DOCTYPE html><meta charset='utf-8'>{text}", encoding="utf-8"
 print(page.name, page.stat().st_size // 1000, "kB")
 
 # %% [markdown]
+# ## Exercises
+#
+# 1. Misread another number: write 61.9 of shot b as 69.1. Which line of the report would have told you?
+# 2. Let each contact have its own coefficient. Do the two differ?
+#
+# Answers:
+
+# %%
+path.write_text(table.replace("64.5", "46.5").replace("61.9", "69.1"))
+print("1.", "\n   ".join(ji.fit(fit.law, gliders, ji.read_experiments(path), free).warnings))
+each = ji.fit(fit.law, gliders, shots, {"restitution": [1, 2], "stiffness": [0, 1]})
+print("2.", each.verdict)
+
+# %% [markdown]
 # The command line does all of this, too: `jimpact new fit my_fit` creates a study and a CSV file,
 # `jimpact fit my_fit` prints the report.
 #

@@ -158,4 +158,18 @@ ji.plot.system(balls, candidates[plan[0]], "The shot to do next")
 print(f"run time {time.perf_counter() - began:.0f} s")
 
 # %% [markdown]
+# ## Exercises
+#
+# 1. How exact a camera determines the ratio to 0.05 with the first shot alone?
+# 2. Would ten repetitions of that shot do the same?
+#
+# Answers:
+
+# %%
+needed = sigma * 0.05 / fit.standard_error[1]
+print(f"1. errors are proportional to sigma: {needed:.4f} m/s")
+ten = ji.fit(fit.law, balls, shots(law(0.95, 3.0), np.tile(strike, (10, 1))), both)
+print(f"2. {ten.standard_error[1]:.3f}: as the root of their number, if errors are independent")
+
+# %% [markdown]
 # *Next: [a law that can describe any shot, and its limits](04_restitution_matrix.ipynb).*

@@ -118,4 +118,16 @@ assert any("lack of fit" in line.lower() for line in all_kinds.warnings)
 print(f"run time {time.perf_counter() - began:.0f} s")
 
 # %% [markdown]
+# ## Exercises
+#
+# 1. Newton's law is $E = e I$. For three equal balls it cannot create energy: check $e = 1$.
+# 2. And if the contacts differ, $E = \mathrm{diag}(1, 0)$?
+#
+# Answers:
+
+# %%
+for name, matrix in (("1. e = 1", np.eye(2)), ("2. diag(1, 0)", np.diag([1.0, 0.0]))):
+    print(name, "\n", ji.theory.audit_matrix(balls, matrix), "\n")
+
+# %% [markdown]
 # *Next: [400 measured impacts of a cube](05_a_tossed_cube.ipynb).*

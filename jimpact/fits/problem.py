@@ -468,7 +468,7 @@ class FitProblem:
         return residual, jacobian[:, :count], tuple(aux)
 
     def squares(self, y: jax.Array) -> jax.Array:
-        """The sum of squares of the residual of `evaluate`, without derivatives."""
+        """The sum of squares of the residual at `y` (Q,), see `evaluate`; without derivatives."""
         x = self._values(y)
         data, _ = self._errors(self.law_in_scene(x))
         of_priors = (x - self.prior_mean) * self.prior_weight
