@@ -33,8 +33,9 @@ _ITERATIONS = 8  # of Newton's method for the directions of slip; 4 to 6 are usu
 # Part of the largest mu p: the weight in the sharing of a contact without load. Ten times more: it
 # takes a visible share.
 _LEAST_SHARE = 1e-6
-# Projections at most, where interior points find nothing. Ten times more: jammed scenes end later.
-_PROJECTIONS = 5000
+# Projections at most, where interior points find nothing, and at most for each contact, if that is
+# more. Ten times more: jammed scenes end later.
+_PROJECTIONS, _PROJECTIONS_EACH = 5000, 20
 _POLISHES = 8  # steps of Newton's method; 1 to 3 are usual, ten times more change nothing
 # Added to the diagonal of the equations of Newton's method, which are singular where impulses are
 # free. Ten times more: another step of it.
@@ -548,7 +549,7 @@ def _projected(problem: _FrictionProblem, x: jax.Array, needed: jax.Array) -> ja
         x,
         jnp.ones((), x.dtype),
         problem.tolerance,
-        jnp.where(needed, _PROJECTIONS, 0),
+        jnp.where(needed, max(_PROJECTIONS, _PROJECTIONS_EACH * len(x)), 0),
         problem.load,
     ).impulse
 

@@ -97,7 +97,7 @@ def documents(paths, long_run=()):
 
 
 LONGEST = ("mujoco", "gradient_descent", "waves")
-LONGEST += ("03", "05", "06", "10", "11", "12", "13", "14", "16", "17")
+LONGEST += ("03", "05", "06", "08", "10", "11", "12", "13", "14", "15", "16", "17")
 
 
 @pytest.mark.parametrize("path", documents(p for p in DOCS if any(code_of(p))))
