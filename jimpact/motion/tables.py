@@ -137,17 +137,21 @@ def nan_derivatives(inputs: Any, known: jax.Array) -> jax.Array:
 
 @jax.custom_jvp
 def _undetermined(arrays: list[jax.Array], unknown: jax.Array) -> jax.Array:
-    """Zeros (r,), of which the `unknown` (r,) have derivatives NaN, of every order."""
+    """Zeros (r,), of which the `unknown` (r,) have derivatives NaN, of every order.
+
+    As those of a sine of all inputs, multiplied by something infinite: they are not 0.
+    """
     return jnp.zeros(unknown.shape)
 
 
 @_undetermined.defjvp
 def _undetermined_tangent(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
-    """Of the sum of all inputs, times a factor that is 1 and is itself undetermined."""
+    """Of the sine. Only products make it infinite: what has a cotangent of 0 remains 0."""
     arrays, unknown = primals
-    factor = 1 + jnp.sum(_undetermined(arrays, unknown))
-    total = sum(jnp.sum(_nan_unless_zero(x, jnp.any(unknown))) for x in tangents[0])
-    each = _nan_unless_zero(jnp.broadcast_to(total * factor, unknown.shape), unknown)
+    flat = jnp.concatenate([jnp.where(jnp.isfinite(x), x, 0.0).ravel() for x in arrays])
+    slope = jnp.cos(1 + flat @ np.sqrt(np.arange(2.0, 2 + flat.size)))  # no direction is level
+    total = sum(jnp.sum(_nan_unless_zero(slope * x, jnp.any(unknown))) for x in tangents[0])
+    each = _nan_unless_zero(jnp.broadcast_to(total, unknown.shape), unknown)
     return jnp.zeros(unknown.shape), jnp.where(unknown, each, 0.0).astype(float)
 
 

@@ -52,6 +52,12 @@ def test_what_a_motion_does_not_reach_has_no_derivatives():
         assert np.isnan(pull(jnp.array(cotangent))[0]).all()
     both = jax.vjp(lambda x: nan_derivatives(x, jnp.array([False, False])), inputs)[1]
     assert np.isnan(both(move[:, None])[0]).all()
+    modes = jax.jacfwd, jax.jacrev
+    for first in modes:
+        for second in modes:
+            hessians = second(first(reached))(inputs)
+            np.testing.assert_array_equal(hessians[0], 2 * np.eye(2))  # as if the other was known
+            assert np.isnan(hessians[1]).all()
 
 
 def test_a_motion_back_in_time_is_reported():
