@@ -182,7 +182,9 @@ def solve(
     free = inverted.weight.reshape(-1, 1) * inverted.pairs.T
     moves = jnp.abs(fixed.matrix.reshape(free.shape) @ free)
     root = float(jnp.finfo(matrix.dtype).eps) ** 0.5
-    not_unique = jnp.any(free != 0) | (jnp.max(jnp.abs(inverted.inverse)) > _RIDGE**-0.5)
+    not_unique = jnp.any(free != 0)
+    if rate.size > _SHARED:  # there the inverse is large where impulses are free
+        not_unique = jnp.max(jnp.abs(inverted.inverse)) > _RIDGE**-0.5
     code = jnp.where(not_unique, CODE["impulse_not_unique"], CODE["ok"])
     code = jnp.where(jnp.any(moves > root), CODE["several_outcomes"], code)
     status = jnp.maximum(status, code)
