@@ -28,7 +28,7 @@ API = {  # a page, and the modules whose public names it holds: the longest matc
     "Scenes": ("scene", "bodies.functions.scene_from_gaps", "bodies.mujoco_scene", "contact"),
     "Bodies": ("bodies",),
     "Laws": ("law", "registry", "laws"),
-    "Contact forces": ("laws.forces", "laws.calibration", "laws.materials"),
+    "Contact forces": ("laws.forces", "laws.calibration"),
     "Shots and fits": ("fits", "cli", "saved"),
     "Monte Carlo": ("montecarlo",),
     "Motions": ("motion",),

@@ -34,6 +34,7 @@ from .fits.fitting import (
 from .fits.posterior import posterior as posterior
 from .fits.problem import FitProblem as FitProblem
 from .fits.profiles import contour as contour, profile as profile
+from .fits.report import load_fit as load_fit
 from .fits.search import Search as Search
 from .fits.selection import (
     fit_laws as fit_laws,
@@ -77,7 +78,6 @@ from .laws.kinematic import (
 from .laws.lzb import (
     LZB as LZB,
 )
-from .laws.materials import hertz_stiffness as hertz_stiffness
 from .laws.mujoco_contact import (
     mujoco_restitution as mujoco_restitution,
     mujoco_solref as mujoco_solref,

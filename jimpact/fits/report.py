@@ -434,7 +434,27 @@ def save_fit(fit: "Fit", path: str | Path) -> Path:
 
 
 def load_fit(path: str | Path) -> "Fit":
-    """The fit that `Fit.save` wrote, see `ji.load`."""
+    """The fit that `Fit.save` wrote, to the last digit; `ji.load` reads motions, too.
+
+    The classes of its law and scene are imported by name, so read only files that you trust.
+
+    Args:
+        path: the file.
+
+    Returns:
+        `Fit`, with all that one can do with it.
+
+    Raises:
+        FileNotFoundError: no such file. ValueError: not a fit, one of another format, a law that
+            cannot be imported, or double precision while JAX is in single precision.
+
+    >>> import pathlib, tempfile, jimpact as ji
+    >>> data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.3, 0.7], [0.6, 1.4]], sigma=0.02)
+    >>> fit = ji.fit(ji.Newton(0.9), ji.chain([1.0, 1.0]), data)
+    >>> path = fit.save(pathlib.Path(tempfile.mkdtemp()) / "fit.json")
+    >>> ji.load_fit(path).verdict == fit.verdict
+    True
+    """
     from jimpact.fits.uncertainty import Fit  # which imports this module
 
     return Fit(**_read_fit(Path(path)))

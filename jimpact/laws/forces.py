@@ -208,7 +208,7 @@ def PowerLaw(stiffness: Any, exponent: Any = 1.5) -> Bistiffness:
 
 
 def Hertz(stiffness: Any) -> Bistiffness:
-    """Hertz contact `F = k x^1.5`, k in [N / m^1.5] (see `hertz_stiffness`).
+    """Hertz contact `F = k x^1.5`, k in [N / m^1.5] (see `ji.theory.hertz_stiffness`).
 
     Args:
         stiffness: k > 0, scalar or (m,) [N / m^1.5].

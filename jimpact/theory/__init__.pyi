@@ -38,6 +38,7 @@ from .impulse_ratios import (
     distributing_rule as distributing_rule,
     precompression_energy as precompression_energy,
 )
+from .materials import hertz_stiffness as hertz_stiffness
 from .quasi_velocities import (
     ContactPower as ContactPower,
     contact_power as contact_power,

@@ -38,10 +38,10 @@ def hertz_stiffness(
     Source: Hertz (1882); Johnson, Contact Mechanics (1985), (4.22)-(4.23).
 
     >>> import jimpact as ji
-    >>> k = ji.hertz_stiffness(216e9, 0.276, 4e-3)  # two steel beads of 8 mm
+    >>> k = ji.theory.hertz_stiffness(216e9, 0.276, 4e-3)  # two steel beads of 8 mm
     >>> f"{float(k):.3e}"
     '6.971e+09'
-    >>> plane = ji.hertz_stiffness(216e9, 0.276, 4e-3, radius2=float("inf"))
+    >>> plane = ji.theory.hertz_stiffness(216e9, 0.276, 4e-3, radius2=float("inf"))
     >>> round(float(plane / k), 6)  # a plane is stiffer by sqrt(2)
     1.414214
     """

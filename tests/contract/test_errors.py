@@ -221,9 +221,9 @@ CALLS = [
     (lambda: ji.calibrate(ji.KelvinVoigt(1.0, 0.0), 0.5, -1.0, 1.0), r"`mass`"),
     (lambda: ji.calibrate(ji.UserForce(lambda x, rate, p: x), 0.5, 1.0, 1.0), r"`force`"),
     (lambda: ji.measured_restitution(ji.Hertz(1.0), 1.0, 0.0), r"`speed`"),
-    (lambda: ji.hertz_stiffness(-1.0, 0.3, 1.0), r"`modulus"),
-    (lambda: ji.hertz_stiffness(1.0, 0.6, 1.0), r"`poisson"),
-    (lambda: ji.hertz_stiffness(1.0, 0.3, 1.0, radius2=0.0), r"`radius2"),
+    (lambda: ji.theory.hertz_stiffness(-1.0, 0.3, 1.0), r"`modulus"),
+    (lambda: ji.theory.hertz_stiffness(1.0, 0.6, 1.0), r"`poisson"),
+    (lambda: ji.theory.hertz_stiffness(1.0, 0.3, 1.0, radius2=0.0), r"`radius2"),
     (lambda: ji.theory.gap_scale(PAIR, ji.Newton(1.0), [1.0, 0.0]), r"`law`"),
     (lambda: ji.theory.gap_scale(PAIR, ji.LZB(1.0), [1.0]), r"`velocity`"),
     (
