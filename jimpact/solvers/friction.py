@@ -178,15 +178,7 @@ def solve(
     fixed = _FrictionProblem(*jax.lax.stop_gradient(problem[:4]), complementary)
     modes, x, status = (_enumerate if m <= ENUMERATED else _search)(fixed)
     modes, inverted = _most_at_rest(fixed, modes, x)
-    # what is free: contacts that slide may share p so that slip changes
-    free = inverted.weight.reshape(-1, 1) * inverted.pairs.T
-    moves = jnp.abs(fixed.matrix.reshape(free.shape) @ free)
-    root = float(jnp.finfo(matrix.dtype).eps) ** 0.5
-    not_unique = jnp.any(free != 0)
-    if rate.size > _SHARED:  # there the inverse is large where impulses are free
-        not_unique = jnp.max(jnp.abs(inverted.inverse)) > _RIDGE**-0.5
-    code = jnp.where(not_unique, CODE["impulse_not_unique"], CODE["ok"])
-    code = jnp.where(jnp.any(moves > root), CODE["several_outcomes"], code)
+    free, code = _freedom(fixed, inverted)
     status = jnp.maximum(status, code)
     x = _on_modes(problem, modes, inverted, x)
     wrong = ~(_misfit(fixed, jax.lax.stop_gradient(x)[..., None])[0] <= fixed.tolerance)
@@ -449,6 +441,19 @@ def _most_at_rest(
     shared = _on_modes(problem, rest, first, x)
     allowed = _misfit(problem, shared[..., None])[0] <= problem.tolerance
     return jax.tree.map(lambda leaf: jnp.where(allowed, *leaf), (both, inverted))
+
+
+def _freedom(problem: _FrictionProblem, inverted: _Inverted) -> tuple[jax.Array, jax.Array]:
+    """Columns (n, n) in which impulses are free, and a status that says what they change."""
+    free = inverted.weight.reshape(-1, 1) * inverted.pairs.T
+    if len(free) > _SHARED:  # there the inverse is large where impulses are free
+        not_unique = jnp.max(jnp.abs(inverted.inverse)) > _RIDGE**-0.5
+        return free, jnp.where(not_unique, CODE["impulse_not_unique"], CODE["ok"])
+    # contacts that slide may share p so that slip changes
+    moves = jnp.abs(problem.matrix.reshape(free.shape) @ free)
+    root = float(jnp.finfo(free.dtype).eps) ** 0.5
+    code = jnp.where(jnp.any(free != 0), CODE["impulse_not_unique"], CODE["ok"])
+    return free, jnp.where(jnp.any(moves > root), CODE["several_outcomes"], code)
 
 
 def _on_modes(
