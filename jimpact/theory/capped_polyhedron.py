@@ -10,7 +10,7 @@ import numpy as np
 _FLAT = 1e-6  # a row whose slack stays below this everywhere is an equality
 _ROUNDING = 1e-10  # feasibility of points that are computed in closed form
 _INDEPENDENT = 1e-8  # relative singular value that counts as nonzero
-_MOST_FACETS = 20_000  # candidate facets of a cone, all of which are tried
+_MOST_FACETS = 20_000  # bound on the facets of a cone; more take minutes
 _FARTHEST = 1e8  # distance after which the search for a minimum gives up and takes what it has
 _GRADIENT = 1e-12  # of least squares: a gradient below this is zero
 _ROUNDS = 10  # of least squares: rounds per column; two are usual
@@ -182,7 +182,7 @@ def least_squares(matrix: np.ndarray, target: np.ndarray) -> np.ndarray:
     """`x >= 0` of least `|matrix x - target|` (Lawson and Hanson 1974, ch. 23).
 
     Of scipy (1.17), `nnls` and the method `bvls` of `lsq_linear` both miss the minimum of some
-    degenerate problems met here.
+    degenerate problems met here: with `nnls`, `test_random_scenes_against_oracles` fails.
     """
     count = matrix.shape[1]
     x, passive, barred = np.zeros(count), np.zeros(count, bool), np.zeros(count, bool)
@@ -217,11 +217,13 @@ def _on_support(matrix: np.ndarray, target: np.ndarray, support: np.ndarray) -> 
 def cone_facets(generators: np.ndarray) -> np.ndarray:
     """Rows F of unit length with `{F w >= 0}` = the cone of the columns (r, m), of rank r.
 
-    A facet holds r - 1 independent generators, so all such subsets are tried.
+    The facets of the hull of the generators and the origin that pass through the origin.
 
     Raises:
-        ValueError: m > r and too many subsets.
+        ValueError: m > r and too many facets are possible.
     """
+    from scipy.spatial import ConvexHull  # late: slow to import
+
     rank, m = generators.shape
     if m == rank:
         inverse = np.linalg.inv(generators)
@@ -232,17 +234,14 @@ def cone_facets(generators: np.ndarray) -> np.ndarray:
             f"have more than {_MOST_FACETS} candidate facets."
         )
     unit = generators / np.linalg.norm(generators, axis=0)
+    if rank == 1:  # hulls begin with two dimensions
+        return unit[:, :1] if np.ptp(unit) == 0 else np.zeros((0, 1))
+    outward = ConvexHull(np.vstack([np.zeros(rank), unit.T])).equations
+    through_origin = outward[np.abs(outward[:, -1]) <= _INDEPENDENT, :-1]
     facets: list[np.ndarray] = []
-    for subset in combinations(range(m), rank - 1):
-        basis, singular, _ = np.linalg.svd(unit[:, subset])
-        if rank > 1 and singular[-1] <= _INDEPENDENT:
-            continue
-        normal = basis[:, -1]
-        for side in (normal, -normal):
-            if (side @ unit >= -_INDEPENDENT).all() and not any(
-                np.linalg.norm(side - known) <= _INDEPENDENT for known in facets
-            ):
-                facets.append(side)
+    for normal in -through_origin:  # a facet that is no simplex is reported in parts
+        if not any(np.linalg.norm(normal - known) <= _INDEPENDENT for known in facets):
+            facets.append(normal)
     return np.array(facets).reshape(-1, rank)
 
 
