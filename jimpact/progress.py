@@ -111,17 +111,26 @@ def waiting(step: str, progress: float | None = None) -> Iterator[None]:
 def counting_bar(
     total: int, unit: str, progress: float | None, done: int = 0
 ) -> Iterator[Callable[[int], None]]:
-    """Yield `advance(more)`, which counts up to a total; the rate leaves out `done` before."""
-    begin, new = time.perf_counter(), 0
+    """Yield `advance(more)`, which counts up to a total.
+
+    The rate counts from the first advance on, which waits for a program to be compiled.
+    """
+    begin, first, finished = 0.0, done, done
     with progress_bar(progress) as show:
 
         def advance(more: int) -> None:
             """Count so many more."""
-            nonlocal new
-            new += more
-            rate = new / max(time.perf_counter() - begin, 1e-9)
-            rate_text = f", {rate:,.0f}/s" if rate >= 10 else ""
-            show(f"{done + new:,} of {total:,} {unit}{rate_text}", done + new, total)
+            nonlocal begin, first, finished
+            finished += more
+            text = f"{finished:,} of {total:,} {unit}"
+            if not begin:
+                begin, first = time.perf_counter(), finished
+            elif rate := (finished - first) / max(time.perf_counter() - begin, 1e-9):
+                if rate >= 10:
+                    text += f", {rate:,.0f}/s"
+                if not sys.stderr.isatty():  # a bar says it itself
+                    text += f", {(total - finished) / rate:,.0f} s left"
+            show(text, finished, total)
 
         yield advance
 
