@@ -114,7 +114,7 @@ ji.plot.monte_carlo(whole, "Two million impacts, gaps up to 20 micrometres")
 # ## Several machines
 #
 # Start `dask scheduler` on one machine and `dask worker tcp://machine0:8786 --nthreads 1` on the
-# others, then run `jimpact montecarlo study.toml --executor dask --scheduler tcp://machine0:8786
+# others, then run `jimpact montecarlo study.toml --executor tcp://machine0:8786
 # --folder run`. The page *Monte Carlo* of the docs lists the details.
 #
 # *Next: [a block that rocks](11_rocking_block.ipynb).*

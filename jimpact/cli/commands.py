@@ -342,7 +342,7 @@ def montecarlo(command: options.MonteCarloCommand, steps: Steps) -> CommandResul
     chosen = {"samples": command.samples, "key": command.seed, "folder": command.folder}
     result = ji.monte_carlo(
         **study.monte_carlo | without_none(chosen),
-        executor=command.scheduler or command.executor,
+        executor=command.executor,
         keep_samples=command.keep_samples,
         progress=steps.patience,
     )

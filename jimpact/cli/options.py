@@ -201,10 +201,8 @@ class MonteCarloCommand(DrawingCommand):
     """Number of samples; default: the study's, or 100000."""
     seed: Count = None
     """Seed; default: the study's, or 0."""
-    executor: Literal["serial", "devices", "dask"] = "serial"
-    """Compute one chunk after another, on all devices of the process, or on Dask workers."""
-    scheduler: Annotated[str | None, _option("ADDRESS", str)] = None
-    """Address of a Dask scheduler; default: workers on this machine."""
+    executor: str = "serial"
+    """serial, devices (all of the process), dask (here), or the address of a Dask scheduler."""
     folder: Folder = None
     """Folder of finished chunks; the same command again continues from there."""
     keep_samples: Flag = False
@@ -216,8 +214,8 @@ class MonteCarloCommand(DrawingCommand):
         study = study_file.check_study(self.study, motion=False)
         if "monte_carlo" not in study.tables:
             raise ValueError(f"the study '{self.study}' must have a [monte_carlo] table.")
-        if self.scheduler is not None and self.executor != "dask":
-            raise ValueError(f"--scheduler needs --executor dask, but it is {self.executor}.")
+        if ":" not in self.executor:  # else an address
+            check_choice("executor", self.executor, ("serial", "devices", "dask"))
         if self.folder is not None:
             check_writable("--folder", self.folder)
 
