@@ -28,6 +28,7 @@ from jimpact.fits.search import (
 )
 from jimpact.fits.solve import (
     DEFAULT_STEPS,
+    FINE_OF_MANY,
     HARDLY_WORSE,
     SETTLED,
     Ends,
@@ -386,7 +387,8 @@ def fit_many(
             first, solver = problems[members[0]], Solver(max_steps=max_steps, show=show)
             points = start_points(first, starts, np.random.default_rng(seed))
             points = np.tile(points, (len(members), 1))
-            found, ends = settled([problems[k] for k in members], points, solver)
+            some = [problems[k] for k in members]
+            found, ends = settled(some, points, solver, FINE_OF_MANY)
             for i, (k, problem) in enumerate(zip(members, found)):
                 each[k] = ends.rows(slice(i * starts, (i + 1) * starts))
                 problems[k] = problem
@@ -539,6 +541,6 @@ def _refits(fit: Fit, problems: list[FitProblem], progress: float | None) -> Ref
     """Minima of these problems next to a fit."""
     points = np.tile(fit.problem.point(fit.value), (len(problems), 1))
     with progress_bar(progress) as show:
-        _, ends = settled(problems, points, Solver(show=show))
+        _, ends = settled(problems, points, Solver(show=show), FINE_OF_MANY)
     predicted = ends.predicted[:, : len(fit.predicted)] if fit.predicted.ndim else ends.predicted
     return Refits(fit.names, fit.problem.values_at(ends.y), predicted, ends.converged)

@@ -351,15 +351,16 @@ def _same_values(problem: "FitProblem", ends: Ends, first: int, apart: np.ndarra
 
 
 def settled(
-    problems: "list[FitProblem]", points: np.ndarray, solver: Solver
+    problems: "list[FitProblem]", points: np.ndarray, solver: Solver, stop: float = 0.0
 ) -> "tuple[list[FitProblem], Ends]":
     """Minima next to points (S, Q), equally many of each problem.
 
-    Errors of v- are passed on by the law of each problem's best minimum, until both agree.
+    Errors of v- are passed on by the law of each problem's best minimum, until both agree. `stop`:
+    as of `minimize`.
     """
     each, start = len(points) // len(problems), points
     for _ in range(SETTLING):
-        ends = minimize(stacked(problems, each), start, solver)
+        ends = minimize(stacked(problems, each), start, solver, stop)
         if ends.slopes is None:
             return problems, ends
         best = np.nanargmin(ends.squares.reshape(-1, each), axis=1)

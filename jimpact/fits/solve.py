@@ -33,11 +33,11 @@ DEFAULT_STEPS = {"levenberg-marquardt": 100, "lbfgs": 100, "adam": 500, "sgd": 1
 # What an undamped Gauss-Newton step still promises, in variances of one residual (|r|^2 / R): the
 # distance to the minimum is its root, in standard errors. A solve is done at FINE, or at ROUNDING
 # where no lower point is found: sums of squares are right to so much; one of many starts at COARSE,
-# which is enough to tell minima apart; and the answer stands below CONVERGED, a tenth of a
-# standard error.
+# which is enough to tell minima apart; one of many data sets at FINE_OF_MANY, a ten-thousandth of a
+# standard error, with two thirds of the steps; and the answer stands below CONVERGED, a tenth.
 FINE = {"float64": 1e-17, "float32": 1e-4}
 ROUNDING = {"float64": 1e-7, "float32": 1e-3}
-COARSE, CONVERGED = 1e-3, 1e-2
+COARSE, FINE_OF_MANY, CONVERGED = 1e-3, 1e-8, 1e-2
 DESCENDED = 1e-6  # the same for gradient descent, which has no step that would make up for it
 # ... or less than this: residuals are of order 1, and impacts are good to 1e-8 (1e-5), which
 # counts where no lower point is found.
