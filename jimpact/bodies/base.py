@@ -191,6 +191,10 @@ class Body(eqx.Module):
         """Curves (k, 2) of (x, y) [m] that show it at q; mass points get the radius `point`."""
         raise TypeError(f"{type(self).__name__} has no outlines: give `outlines` yourself.")
 
+    def outlines_by_body(self, q: np.ndarray, point: float) -> Sequence[Sequence[np.ndarray]]:
+        """The outlines of each body, for its colour; here each outline is a body."""
+        return [[curve] for curve in self.outlines(q, point)]
+
     @property
     def names(self) -> tuple[str, ...]:
         """Coordinates of q by name and unit, "x [m]", for pictures; (): nobody named them."""

@@ -96,13 +96,17 @@ class PendulumCradle(Body):
 
     def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
         """Strings and balls."""
+        return [curve for curves in self.outlines_by_body(q, point) for curve in curves]
+
+    def outlines_by_body(self, q: np.ndarray, point: float) -> list[list[np.ndarray]]:
+        """String and ball of each."""
         length, radius = float(self.length), np.asarray(self.radius)
         between = radius[:-1] + radius[1:] + np.asarray(self.gaps)
         curves = []
         for x, r, angle in zip(np.cumsum([0.0, *between]), radius, q):
             pivot = np.array([x, 0.0])
             centre = pivot + length * np.array([np.sin(angle), -np.cos(angle)])
-            curves += [np.stack([pivot, centre]), centre + r * CIRCLE]
+            curves.append([np.stack([pivot, centre]), centre + r * CIRCLE])
         return curves
 
 

@@ -361,13 +361,16 @@ class RigidBodies(Body):
 
     def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
         """Polygons, wheels and rods; of space in projection, with a shadow on the first plane."""
+        return [curve for curves in self.outlines_by_body(q, point) for curve in curves]
+
+    def outlines_by_body(self, q: np.ndarray, point: float) -> list[list[np.ndarray]]:
+        """The outlines of each body."""
         at = self.all_bodies(jnp.asarray(q, self.points.dtype))
         each = zip(self.shapes, self.points, self.rims, np.asarray(at), np.asarray(self.turns(at)))
         draw = self._plane_curves if self.dimension == 2 else self._space_curves
         return [
-            curve
+            draw(shape, np.asarray(points)[: shape.size], float(rim), at, turn)
             for shape, points, rim, at, turn in each
-            for curve in draw(shape, np.asarray(points)[: shape.size], float(rim), at, turn)
         ]
 
     def _plane_curves(

@@ -482,7 +482,7 @@ class Coin(_SpatialBody):
             return length
         return jnp.minimum(length, lengths(self._toward(q)[1][None, :2])[0][0] - FLAT)
 
-    def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
+    def outlines_by_body(self, q: np.ndarray, point: float) -> list[list[np.ndarray]]:
         """Its rims, or their corners, a diameter, and their shadow, in projection."""
         corners = self.points.shape[1] // 2
         around = np.linspace(0, 2 * np.pi, corners + 1)
@@ -491,7 +491,7 @@ class Coin(_SpatialBody):
         across = np.asarray(self._rims(jnp.asarray([[-1.0, 0.0], [1.0, 0.0]])))
         turn = np.asarray(rotation(jnp.asarray(q)[3:]))
         curves = [q[:3] + curve @ turn.T for curve in (*rims, across[2:])]
-        return [line for curve in curves for line in self.with_shadow(curve)]
+        return [[line for curve in curves for line in self.with_shadow(curve)]]
 
 
 # ------------------------------------------------------------------------------- construction

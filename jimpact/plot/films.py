@@ -20,13 +20,14 @@ from jimpact.motion.system import System
 from jimpact.plot.motions import (
     POINT,
     base_path,
+    colours_of,
     course_of,
     one_motion,
     plane_of,
     set_limits,
     stretch_of,
 )
-from jimpact.plot.style import GREY, colour_of
+from jimpact.plot.style import GREY
 from jimpact.progress import counting_bar
 
 ENDINGS = (".gif", ".mp4", ".html")
@@ -112,6 +113,7 @@ class _Film(NamedTuple):
     speed: float
     rate: float  # frames in a second
     curves: list[list[np.ndarray]]  # of each frame
+    colours: list[str]  # of the curves of a frame
     floors: list[tuple[np.ndarray, float]]  # normal, offset
     ground: np.ndarray  # (K, 2) displacement of the base
 
@@ -158,7 +160,8 @@ def _film(system: System, motion: Motion, title: str, speed: float | None, rate:
             ground = np.insert(ground, 0, 0.0, axis=1)
     curves = [[curve + moved for curve in body.outlines(x, point)] for x, moved in zip(q, ground)]
     floors = [plane_of(angle, offset) for angle, offset in body.floors]
-    return _Film(title, time, speed, rate, curves, floors, ground)
+    colours = colours_of(body, q[0], point)
+    return _Film(title, time, speed, rate, curves, colours, floors, ground)
 
 
 def positions(at: np.ndarray, q: np.ndarray, slopes: np.ndarray, time: np.ndarray) -> np.ndarray:
@@ -185,7 +188,7 @@ def _write(film: _Film, path: Path, advance: Callable[[int], None]) -> None:
     figure = Figure(figsize=(4.8, 4.8), dpi=80)
     axes = figure.add_axes(_PLACE)
     set_limits(axes, film.curves, film.ground, film.floors)
-    lines = [axes.plot([], [], color=colour_of(i // 2))[0] for i in range(len(film.curves[0]))]
+    lines = [axes.plot([], [], color=colour)[0] for colour in film.colours]
     drawn = [axes.plot([], [], color=GREY, lw=2)[0] for _ in film.floors]
     view = np.array([axes.get_xlim(), axes.get_ylim()])
 

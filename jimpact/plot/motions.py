@@ -374,15 +374,22 @@ def _range(values: np.ndarray) -> float:
 
 def draw_body(axes: Axes, body: Body, q: np.ndarray) -> None:
     """A body at q, with what it stands on."""
-    curves = [body.outlines(q, POINT * (np.ptp(q) or 1.0))]
+    point = POINT * (np.ptp(q) or 1.0)
+    curves = [body.outlines(q, point)]
     floors, ground = [plane_of(*floor) for floor in body.floors], np.zeros((1, 2))
     set_limits(axes, curves, ground, floors)
-    for i, points in enumerate(curves[0]):
-        axes.plot(*points.T, color=colour_of(i // 2))
+    for points, colour in zip(curves[0], colours_of(body, q, point), strict=True):
+        axes.plot(*points.T, color=colour)
     view = np.array([axes.get_xlim(), axes.get_ylim()])
     for n, offset in floors:
         axes.plot(*stretch_of(n, offset, view, ground[0]), color=GREY, lw=2)
     axes.set(xlim=view[0], ylim=view[1])
+
+
+def colours_of(body: Body, q: np.ndarray, point: float) -> list[str]:
+    """The colour of each outline: one for each body."""
+    each = enumerate(body.outlines_by_body(q, point))
+    return [colour_of(i) for i, curves in each for _ in curves]
 
 
 def stretch_of(n: np.ndarray, offset: float, view: np.ndarray, ground: np.ndarray) -> np.ndarray:

@@ -469,6 +469,9 @@ def test_every_body_can_be_drawn():
         curves = body.outlines(q, 0.01)
         assert len(curves) == count
         assert all(curve.ndim == 2 and curve.shape[1] == 2 for curve in curves)
+        owners = body.outlines_by_body(q, 0.01)
+        assert len(owners) == getattr(body, "count", 1)
+        assert sum(map(len, owners)) == count
     np.testing.assert_allclose(heap.floors, [[0.0, 0.0], [1.57, -3.0]], rtol=1e-15)
     box = ji.Box([0.2, 0.2, 0.2])
     edges, shadow = box.outlines(np.array([0, 0, 1.0, 1, 0, 0, 0]), 0.01)
