@@ -96,10 +96,17 @@ def check_values(
     open_low: bool = False,
     nan_allowed: bool = False,
 ) -> None:
-    """Raise a ValueError unless all entries are numbers between `low` and `high`."""
+    """Raise a ValueError unless all entries are numbers between `low` and `high`.
+
+    A TypeError for what is no array of numbers.
+    """
     if value is None or is_traced(value):
         return
-    entries = np.asarray(value, dtype=float)
+    try:
+        entries = np.asarray(value, dtype=float)
+    except (TypeError, ValueError) as error:
+        what = type(value).__name__
+        raise TypeError(f"Argument `{name}` must hold numbers, but is a {what}.") from error
     finite = np.isfinite(entries) | (np.isnan(entries) & nan_allowed)
     inside = (entries > low if open_low else entries >= low) & (entries <= high)
     bad = ~(finite & (inside | np.isnan(entries)))

@@ -115,6 +115,10 @@ SCENES = [
     (lambda: ji.Bodies([ji.Coin(0.1, 0.02)]), r"a Coin with round rims: give it `corners`"),
     (lambda: ji.Block(1.0, 1.0).at([0.0, 1.0, 0.0]), r"`position` must have shape \(2,\)"),
     (lambda: ji.plot.system(ji.Block(1.0, 1.0), [np.nan] * 3), r"`state` must be finite"),
+    (
+        lambda: ji.advise(ji.chain([1.0, 1.0]), [1.0, 0.0], ji.Newton(0.5)),
+        r"`tolerance` must hold numbers, but is a Newton",
+    ),
     (lambda: ji.Bodies([ji.Column([1.0])]), r"`bodies` must hold planar bodies"),
     (lambda: ji.Bodies([ji.Disc(1.0)], []), r"must give a contact"),
     (lambda: ji.Bodies([ji.Disc(1.0)], [np.nan]), r"`planes`"),
