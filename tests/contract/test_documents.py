@@ -96,8 +96,8 @@ def documents(paths, long_run=()):
     ]
 
 
-LONGEST = ("mujoco", "gradient_descent", "waves")
-LONGEST += ("03", "05", "06", "08", "10", "11", "12", "13", "14", "15", "16", "17")
+LONGEST = ("mujoco", "gradient_descent", "speed_accuracy", "waves")
+LONGEST += tuple(f"{i:02d}" for i in range(2, 18) if i != 4)
 
 
 @pytest.mark.parametrize("path", documents(p for p in DOCS if any(code_of(p))))

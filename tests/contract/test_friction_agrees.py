@@ -124,7 +124,7 @@ def lifted(scenes):
     ]
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_planar_outcomes_are_those_of_sweeps(scenes):
     given, expected = scenes
     after, statuses = impacts(given)
@@ -153,7 +153,7 @@ def test_outcomes_do_not_depend_on_the_description(scenes):
     assert same(impacts(given)[0] / unit, expected)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_planar_scenes_in_space_have_the_same_outcome(scenes):
     given, expected = scenes
     after, statuses = impacts(lifted(given))
