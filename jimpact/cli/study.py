@@ -3,7 +3,7 @@
 import importlib.util
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,13 @@ from jimpact.scene import Scene, chain
 
 # Keys of [monte_carlo] that `monte_carlo` calls otherwise.
 SAMPLING_ARGUMENTS = {"velocity_m_per_s": "velocity", "gaps_m": "gaps", "seed": "key"}
+
+
+def fit_arguments(options: dict[str, Any], search: Search) -> dict[str, Any]:
+    """Arguments of `fit` from the options of a study, of which all but two belong to its search."""
+    own = {name: options[name] for name in ("starts", "profiles") if name in options}
+    others = {name: value for name, value in options.items() if name not in own}
+    return own | {"search": replace(search, **others)}
 
 
 @dataclass(frozen=True)
@@ -66,9 +73,7 @@ class Study:
     def run(self, **options: Any) -> Fit:
         """`fit` with the study's options, or with those that are passed and not None."""
         problem = self._problem(of_shots)  # `fit` passes on errors of v-
-        chosen = self.options | without_none(options)
-        direct = {name: chosen.pop(name) for name in ("starts", "profiles") if name in chosen}
-        return fit(problem, **direct, search=Search(**chosen))
+        return fit(problem, **fit_arguments(self.options | without_none(options), Search()))
 
     @property
     def problem(self) -> FitProblem:

@@ -21,7 +21,7 @@ from jimpact.status import STATUS
 
 Observe = Callable[[Motion], jax.Array]
 
-MAX_PASSES = 50  # steps of one start before it gives up
+DEFAULT_SEARCH = Search(max_steps=50)  # more steps only cost time: a pass simulates motions
 # Motions that are simulated side by side. With ten times as many, all wait for the one with the
 # most events, and on two cores the linear algebra of jaxlib 0.10.2 hung.
 LANES = 32
@@ -71,13 +71,9 @@ def fit_motion(
     priors: Mapping[str, Any] | None = None,
     ties: Mapping[str, Any] | None = None,
     observe: Observe | None = None,
-    loss: str = "squares",
     starts: int = 1,
-    seed: int = 0,
-    max_steps: int = MAX_PASSES,
     profiles: bool = False,
-    progress: float | None = None,
-    limit: float | None = None,
+    search: Search = DEFAULT_SEARCH,
     **options: Any,
 ) -> Fit:
     """The parameters of `law` with which `simulate` comes nearest to one or more measured motions.
@@ -100,7 +96,7 @@ def fit_motion(
         sigma: standard errors of the measurement, scalar or shaped like it; None: estimated.
         bounds, priors, ties: as in `fit`.
         observe: Motion -> array; None: the positions. E.g. `lambda m: m.events.time[:10]`.
-        loss, starts, seed, max_steps, profiles, progress, limit: as in `fit`.
+        starts, profiles, search: as in `fit`; by default 50 steps a start.
         options: of `simulate`; `samples` follows from `measured` where `observe` is None.
 
     Returns:
@@ -136,7 +132,6 @@ def fit_motion(
     problem = FitProblem.from_observable(
         law, observable, measured, sigma, free, bounds, priors, ties
     )
-    search = Search(loss=loss, seed=seed, max_steps=max_steps, limit=limit, progress=progress)
     return fit(problem, starts=starts, profiles=profiles, search=search)
 
 
