@@ -192,7 +192,12 @@ class Body(eqx.Module):
         raise TypeError(f"{type(self).__name__} has no outlines: give `outlines` yourself.")
 
     def outlines_by_body(self, q: np.ndarray, point: float) -> Sequence[Sequence[np.ndarray]]:
-        """The outlines of each body, for its colour; here each outline is a body."""
+        """The outlines of each body, for its colour; here each outline is a body.
+
+        Args:
+            q: configuration (n,).
+            point: radius of mass points [m].
+        """
         return [[curve] for curve in self.outlines(q, point)]
 
     @property
