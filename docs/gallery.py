@@ -3,7 +3,6 @@
 Run by hand, from a clone; `chart_three_balls` takes minutes. A docstring is the caption.
 """
 
-import inspect
 import subprocess
 import sys
 from collections.abc import Callable
@@ -18,7 +17,6 @@ import jimpact as ji
 from jimpact.plot.style import COLOURS, legend_below, logarithmic, new_figure, styled
 
 PICTURES = Path(__file__).parent / "pictures"
-DROPS = PICTURES.parents[1] / "tests" / "data" / "drops.npz"  # written by tests/validation/drops.py
 DRAWN: dict[str, Callable] = {}
 CRADLE = ji.chain([1.0, 1.0, 1.0])
 STRIKER = jnp.array([1.0, 0.0, 0.0])  # one ball strikes two that touch [m/s]
@@ -311,9 +309,9 @@ def force_chains():
 
 @picture
 @styled()
-def drops(numbers=DROPS):
+def drops():
     """Drops of a square: median error of the predicted angle after a hit, from two flights."""
-    with np.load(numbers) as stored:
+    with np.load(Path(__file__).parents[1] / "tests" / "data" / "drops.npz") as stored:
         curves = {name: stored[name] for name in stored.files}
     figure, panels = new_figure(3.0, "", 1, 2, sharey=True)
     for axes, kind in zip(panels, ("first flight", "flight after an impact")):
@@ -332,9 +330,10 @@ def main(names: list[str]) -> None:
     jax.config.update("jax_enable_x64", True)
     for name in names or DRAWN:
         path, draw = PICTURES / f"{name}.png", DRAWN[name]
-        figure = draw(path) if "path" in inspect.signature(draw).parameters else draw()
-        if figure is not None:
-            figure.savefig(path, dpi=150)
+        if draw.__code__.co_argcount:
+            draw(path)
+        else:
+            draw().savefig(path, dpi=150)
         print(path)
 
 

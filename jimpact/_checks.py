@@ -15,6 +15,8 @@ import numpy as np
 if TYPE_CHECKING:
     import jax
 
+EXECUTORS = ("serial", "devices", "dask")  # where chunks of a Monte Carlo run are computed
+
 
 def needed(module: str, how: str) -> ModuleType:
     """The module, or an ImportError that says how to get it."""
@@ -33,6 +35,11 @@ def is_traced(value: Any) -> bool:
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(value))
 
 
+def _not_numeric(name: str, value: Any) -> TypeError:
+    """The error for what is no array of numbers."""
+    return TypeError(f"Argument `{name}` must be numeric, but has value {short_repr(value)}.")
+
+
 def as_float_array(name: str, value: Any) -> "jax.Array":
     """`value` as a floating JAX array; text, objects and complex numbers are refused."""
     import jax
@@ -45,9 +52,7 @@ def as_float_array(name: str, value: Any) -> "jax.Array":
     else:
         host = np.asarray(value)
         if host.dtype.kind not in "fiub":
-            raise TypeError(
-                f"Argument `{name}` must be numeric, but has value {short_repr(value)}."
-            )
+            raise _not_numeric(name, value)
         array = jnp.asarray(value)
     if jnp.issubdtype(array.dtype, jnp.complexfloating):
         raise TypeError(f"Argument `{name}` must be real, but has dtype {array.dtype}.")
@@ -96,17 +101,13 @@ def check_values(
     open_low: bool = False,
     nan_allowed: bool = False,
 ) -> None:
-    """Raise a ValueError unless all entries are numbers between `low` and `high`.
-
-    A TypeError for what is no array of numbers.
-    """
+    """Raise a ValueError unless all entries lie between `low` and `high`; TypeError: no numbers."""
     if value is None or is_traced(value):
         return
     try:
         entries = np.asarray(value, dtype=float)
     except (TypeError, ValueError) as error:
-        what = type(value).__name__
-        raise TypeError(f"Argument `{name}` must hold numbers, but is a {what}.") from error
+        raise _not_numeric(name, value) from error
     finite = np.isfinite(entries) | (np.isnan(entries) & nan_allowed)
     inside = (entries > low if open_low else entries >= low) & (entries <= high)
     bad = ~(finite & (inside | np.isnan(entries)))
@@ -255,3 +256,15 @@ def in_common_dtype(*trees: Any) -> Any:
         return trees
     dtype = jnp.result_type(*leaves)
     return jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, trees)
+
+
+def check_executor(executor: Any) -> None:
+    """Raise a ValueError unless chunks of a Monte Carlo run can be computed with it."""
+    known = callable(getattr(executor, "map", None))
+    if isinstance(executor, str):
+        known = executor in EXECUTORS or ":" in executor  # host and port of a scheduler
+    if not known:
+        raise ValueError(
+            f"Argument `executor` must be one of {', '.join(EXECUTORS)}, the address of a Dask "
+            f"scheduler, or an object with a method `map`, but is {executor!r}."
+        )

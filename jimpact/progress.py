@@ -115,21 +115,21 @@ def counting_bar(
 
     The rate counts from the first advance on, which waits for a program to be compiled.
     """
-    begin, first, finished = 0.0, done, done
+    began, finished = None, done  # when the first advance came, and what was finished then
     with progress_bar(progress) as show:
 
         def advance(more: int) -> None:
             """Count so many more."""
-            nonlocal begin, first, finished
+            nonlocal began, finished
             finished += more
+            now = time.perf_counter()
+            began = began or (now, finished)
+            rate = (finished - began[1]) / max(now - began[0], 1e-9)
             text = f"{finished:,} of {total:,} {unit}"
-            if not begin:
-                begin, first = time.perf_counter(), finished
-            elif rate := (finished - first) / max(time.perf_counter() - begin, 1e-9):
-                if rate >= 10:
-                    text += f", {rate:,.0f}/s"
-                if not sys.stderr.isatty():  # a bar says it itself
-                    text += f", {(total - finished) / rate:,.0f} s left"
+            if rate >= 10:
+                text += f", {rate:,.0f}/s"
+            if rate and not sys.stderr.isatty():  # a bar says it itself
+                text += f", {(total - finished) / rate:,.0f} s left"
             show(text, finished, total)
 
         yield advance

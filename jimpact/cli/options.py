@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import tyro
 
-from jimpact._checks import check_choice
+from jimpact._checks import check_choice, check_executor
 from jimpact.cli import starting
 from jimpact.files import study_file
 from jimpact.files.records import Column, Table
@@ -214,8 +214,7 @@ class MonteCarloCommand(DrawingCommand):
         study = study_file.check_study(self.study, motion=False)
         if "monte_carlo" not in study.tables:
             raise ValueError(f"the study '{self.study}' must have a [monte_carlo] table.")
-        if ":" not in self.executor:  # else an address
-            check_choice("executor", self.executor, ("serial", "devices", "dask"))
+        check_executor(self.executor)
         if self.folder is not None:
             check_writable("--folder", self.folder)
 

@@ -29,7 +29,7 @@ from jimpact.fits.fitting import Fit
 from jimpact.fits.parameters import default_free
 from jimpact.law import Law
 from jimpact.laws import REGISTRY
-from jimpact.motion.fitting_motion import DEFAULT_SEARCH, fit_motion
+from jimpact.motion.fitting_motion import MOTION_SEARCH, fit_motion
 from jimpact.motion.methods import METHODS, Method, as_method
 from jimpact.motion.record import Motion
 from jimpact.motion.simulate import simulate
@@ -77,7 +77,7 @@ class MotionStudy:
             )
         arguments = {key: x for key, x in self.arguments.items() if key != "samples"}
         arguments["t_end"] = start, float(times[-1])
-        arguments |= fit_arguments(self.options | without_none(options), DEFAULT_SEARCH)
+        arguments |= fit_arguments(self.options | without_none(options), MOTION_SEARCH)
         arguments |= {"free": self.free, "bounds": self.bounds, "priors": self.priors}
         return fit_motion(self.system, self.law, q, sigma=sigma, **arguments)
 

@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jimpact._checks import in_common_dtype, needed
+from jimpact._checks import check_executor, in_common_dtype, needed
 from jimpact.law import Law
 from jimpact.montecarlo.gaps import gap_scale
 from jimpact.montecarlo.plan import Plan, Run, Sources, planned_run
@@ -27,7 +27,6 @@ from jimpact.scene import Scene
 
 CHUNK = 4096  # samples: fast on a CPU for cheap and costly laws alike; a GPU wants more
 BINS = 1000  # of a histogram; ten times more: quantiles finer than 100 000 samples determine them
-EXECUTORS = ("serial", "devices", "dask")
 # Chunks that a `map` gets at once. Ten times more: their results fill the memory of the workers;
 # ten times less: workers wait for the last chunk of each part.
 WINDOW = 512
@@ -97,7 +96,7 @@ def monte_carlo(
     [-0.6, 0.16, 1.24]
     """
     run = planned_run(Sources(law, velocity, gaps), scene, samples, key, chunk, bins, keep_samples)
-    _check_executor(executor)
+    check_executor(executor)
     if keep_samples and folder is None:
         raise ValueError("Argument `folder` must be given to keep samples, but is None.")
     store = None if folder is None else Store(folder, run.identity)
@@ -179,18 +178,6 @@ def _gap_scale(sources: Sources, scene: Scene) -> np.ndarray | None:
 
 
 # ------------------------------------------ where chunks are computed, which changes no result
-
-
-def _check_executor(executor: Any) -> None:
-    """Raise where nothing can compute chunks with it."""
-    known = callable(getattr(executor, "map", None))
-    if isinstance(executor, str):
-        known = executor in EXECUTORS or ":" in executor  # host and port of a scheduler
-    if not known:
-        raise ValueError(
-            f"Argument `executor` must be one of {', '.join(EXECUTORS)}, the address of a Dask "
-            f"scheduler, or an object with a method `map`, but is {executor!r}."
-        )
 
 
 def _computed(executor: Any, plan: Plan, tasks: Iterable[Task]) -> Generator[Chunk]:

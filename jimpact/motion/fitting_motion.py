@@ -21,7 +21,8 @@ from jimpact.status import STATUS
 
 Observe = Callable[[Motion], jax.Array]
 
-DEFAULT_SEARCH = Search(max_steps=50)  # more steps only cost time: a pass simulates motions
+# Steps of one start before it gives up: more only cost time, since each simulates all motions.
+MOTION_SEARCH = Search(max_steps=50)
 # Motions that are simulated side by side. With ten times as many, all wait for the one with the
 # most events, and on two cores the linear algebra of jaxlib 0.10.2 hung.
 LANES = 32
@@ -73,7 +74,7 @@ def fit_motion(
     observe: Observe | None = None,
     starts: int = 1,
     profiles: bool = False,
-    search: Search = DEFAULT_SEARCH,
+    search: Search = MOTION_SEARCH,
     **options: Any,
 ) -> Fit:
     """The parameters of `law` with which `simulate` comes nearest to one or more measured motions.
@@ -96,7 +97,8 @@ def fit_motion(
         sigma: standard errors of the measurement, scalar or shaped like it; None: estimated.
         bounds, priors, ties: as in `fit`.
         observe: Motion -> array; None: the positions. E.g. `lambda m: m.events.time[:10]`.
-        starts, profiles, search: as in `fit`; by default 50 steps a start.
+        starts, profiles: as in `fit`.
+        search: see `Search`; the default takes at most 50 steps a start.
         options: of `simulate`; `samples` follows from `measured` where `observe` is None.
 
     Returns:

@@ -37,8 +37,8 @@ def styled(kind: type = object) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Draw in the style sheet, and leave matplotlib's settings alone, what is of this kind."""
 
     def decorated(picture: Callable[P, R]) -> Callable[P, R]:
-        """The function, its first argument checked."""
-        first = next(iter(inspect.signature(picture).parameters))
+        """The function, its first argument, if it has one, checked."""
+        first = next(iter(inspect.signature(picture).parameters), "")
 
         @functools.wraps(picture)
         def drawn(*args: P.args, **keywords: P.kwargs) -> R:

@@ -117,7 +117,7 @@ SCENES = [
     (lambda: ji.plot.system(ji.Block(1.0, 1.0), [np.nan] * 3), r"`state` must be finite"),
     (
         lambda: ji.advise(ji.chain([1.0, 1.0]), [1.0, 0.0], ji.Newton(0.5)),
-        r"`tolerance` must hold numbers, but is a Newton",
+        r"`tolerance` must be numeric, but has value Newton\(",
     ),
     (lambda: ji.Bodies([ji.Column([1.0])]), r"`bodies` must hold planar bodies"),
     (lambda: ji.Bodies([ji.Disc(1.0)], []), r"must give a contact"),
