@@ -18,7 +18,7 @@ from .bodies.shapes import (
     SpatialDimer as SpatialDimer,
     Sphere as Sphere,
 )
-from .cli.study_motion import read_study as read_study
+from .cli.study import read_study as read_study
 from .contact import (
     Contact as Contact,
     delassus_matrix as delassus_matrix,

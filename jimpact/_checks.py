@@ -41,7 +41,7 @@ def _not_numeric(name: str, value: Any) -> TypeError:
 
 
 def as_float_array(name: str, value: Any) -> "jax.Array":
-    """`value` as a floating JAX array; text, objects and complex numbers are refused."""
+    """`value` as a floating JAX array; text, truth values, objects, complex numbers are refused."""
     import jax
     import jax.numpy as jnp
 
@@ -51,7 +51,7 @@ def as_float_array(name: str, value: Any) -> "jax.Array":
         array = jnp.asarray(value)
     else:
         host = np.asarray(value)
-        if host.dtype.kind not in "fiub":
+        if host.dtype.kind not in "fiu":
             raise _not_numeric(name, value)
         array = jnp.asarray(value)
     if jnp.issubdtype(array.dtype, jnp.complexfloating):

@@ -4,10 +4,8 @@ import inspect
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from jimpact._checks import check_choice
-from jimpact.law import Domain, Law, Option, declarations_of, options_of
+from jimpact.law import Law, options_of
 
 EVERY_PROPERTY = frozenset(
     {"impulse_sign", "gap_velocity_sign", "energy", "velocity_scaling", "mass_scaling"}
@@ -51,38 +49,6 @@ class Row(NamedTuple):
         """Parameters without a default."""
         empty = inspect.Parameter.empty
         return tuple(name for name, x in self.arguments.items() if x.default is empty)
-
-    @property
-    def declaration(self) -> dict[str, Any]:
-        """What studies and the command line know of the law, as JSON can hold it.
-
-        `data/names.json` has it of the package's laws, so that a study is checked without JAX. A
-        range is (low, high or None, whether low itself is excluded, the option that lifts high).
-        """
-        declared = declarations_of(self.law)
-        if self.make is not None:  # which takes other values by these names
-            declared = {k: x for k, x in declared.items() if k not in self.arguments}
-        domains = {k: x for k, x in declared.items() if isinstance(x, Domain)}
-        return {
-            "summary": self.summary,
-            "right_when": self.right_when,
-            "fails_when": self.fails_when,
-            "source": self.source,
-            "bibtex": self.bibtex,
-            "arguments": list(self.arguments),
-            "parameters": list(self.parameters),
-            "free": sorted({*self.parameters, *domains}),
-            "ranges": {
-                k: [x.low, x.high if np.isfinite(x.high) else None, x.open_low, x.high_unless]
-                for k, x in domains.items()
-                if np.isfinite(x.low)
-            },
-            "choices": {
-                k: list(x.choices)
-                for k, x in declared.items()
-                if isinstance(x, Option) and x.choices
-            },
-        }
 
     def build(self, **parameters: Any) -> Law:
         """The law with these parameters."""

@@ -22,7 +22,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_shape, check_values, in_numbers, is_traced
+from jimpact._checks import (
+    as_float_array,
+    check_choice,
+    check_shape,
+    check_values,
+    in_numbers,
+    is_traced,
+)
 from jimpact.compiling import full_precision
 from jimpact.solvers.dense import solve_definite, solve_mass_matrix
 from jimpact.solvers.sparse import Neighbours, Sparse
@@ -219,11 +226,7 @@ def chain(masses: Any, wall: bool | str = False, gaps: Any = None) -> Scene:
     >>> ji.chain([1.0, 1.0, 1.0], wall=True).contacts
     3
     """
-    if wall not in WALLS:
-        raise ValueError(
-            f"Argument `wall` must be one of False, True, 'left', 'right', 'both', "
-            f"but has value {wall!r}."
-        )
+    check_choice("wall", wall, tuple(WALLS))
     mass = as_float_array("masses", masses)
     if mass.ndim != 1:
         raise ValueError(f"Argument `masses` must have shape (n,), but has shape {mass.shape}.")

@@ -21,9 +21,10 @@ import numpy as np
 import jimpact as ji
 from jimpact.cli import options
 from jimpact.cli.program_cache import stored_programs
-from jimpact.cli.study import Study, impact_study, without_none
+from jimpact.cli.study import Study, impact_study, motion_study, read_study
+from jimpact.cli.study_file import NO_DATA, without_none
+from jimpact.cli.study_motion import MotionStudy
 from jimpact.files.records import Column, Table, as_data
-from jimpact.files.study_file import is_motion
 from jimpact.law import with_parameter
 from jimpact.progress import Steps, waiting, wrapped
 from jimpact.registry import registered_laws
@@ -31,7 +32,6 @@ from jimpact.registry import registered_laws
 if TYPE_CHECKING:
     from matplotlib.figure import Figure  # which takes long to import
 
-    from jimpact.cli.study_motion import MotionStudy
     from jimpact.fits.report import Fit
     from jimpact.fits.selection import LawFits
     from jimpact.motion.record import Motion
@@ -123,8 +123,9 @@ def _impact_of(command: options.ShotCommand) -> tuple[Study, np.ndarray, np.ndar
             )
         return study, before, None
     data = study.experiments
-    assert data is not None  # `ShotCommand.check`
-    if shot >= len(data.shots):
+    if data is None:
+        raise ValueError("--velocity must be given, because the study has no [data].")
+    if not 0 <= shot < len(data.shots):
         raise ValueError(f"--shot must lie in [1, {len(data.shots)}], but is {command.shot}.")
     study = replace(study, scene=data.scene_of(study.scene, shot))
     return study, np.asarray(data.pre[shot]), np.asarray(data.post[shot])
@@ -151,16 +152,14 @@ def fit(command: options.FitCommand, steps: Steps) -> CommandResult:
         "seed": command.seed,
         "progress": steps.patience,
     }
-    study: Study | MotionStudy
+    study = read_study(command.study, command.law)
     fits: dict[str, Fit] = {}
-    if is_motion(command.study):
-        from jimpact.cli.study_motion import motion_study
-
-        study = motion_study(command.study, command.law)
+    if isinstance(study, MotionStudy):
+        if command.method is not None or command.all_free:
+            raise ValueError("--method, --law all, --all-free must be left out for a motion.")
         fits[RAW] = study.fit(**chosen, limit=command.limit)
         steps(_fit_in_words(RAW, fits[RAW]))
         return _fits_result(study.title, fits)
-    study = impact_study(command.study, command.law)
     end = np.inf if command.limit is None else time.monotonic() + command.limit
     chosen |= {"method": command.method}
     for name, each in _fits_of(study, command.all_free, fits):
@@ -214,6 +213,8 @@ def _plain(heads: Iterable[str], rows: Sequence[Sequence[Any]]) -> Table:
 def _fit_every_law(command: options.FitCommand, steps: Steps) -> CommandResult:
     """All laws on the study's data; the picture is that of the first one."""
     study = impact_study(command.study)
+    if study.experiments is None:
+        raise ValueError(NO_DATA)
     fits = _laws_fitted(study, steps, starts=command.starts, seed=command.seed)
     best = fits.best
     picture = ji.plot.fit(best.fit, None, f"{study.title}: {best.name}")
@@ -225,7 +226,7 @@ def _laws_fitted(study: Study, steps: Steps, **chosen: int | None) -> "LawFits":
 
     `chosen`: starts and seed in the place of the study's.
     """
-    assert study.experiments is not None  # `FitCommand.check`
+    assert study.experiments is not None  # the callers have seen to it
     values = {key: x for key, x in study.parameters.items() if key != "restitution"}
     searches = {key: x for key, x in study.options.items() if key in ("starts", "seed")}
     friction = [name for name in study.free if name in FRICTION_PARAMETERS]
@@ -339,6 +340,8 @@ def compare(command: options.CompareCommand, steps: Steps) -> CommandResult:
 def montecarlo(command: options.MonteCarloCommand, steps: Steps) -> CommandResult:
     """Random gaps, velocities, parameters."""
     study = impact_study(command.study)
+    if not study.monte_carlo:
+        raise ValueError(f"the study '{command.study}' must have a [monte_carlo] table.")
     chosen = {"samples": command.samples, "key": command.seed, "folder": command.folder}
     result = ji.monte_carlo(
         **study.monte_carlo | without_none(chosen),
@@ -465,8 +468,6 @@ def _advise_parameters(study: Study) -> dict[str, Any]:
 
 def simulate(command: options.SimulateCommand, steps: Steps) -> CommandResult:
     """A whole motion; one that does not reach its end is drawn and printed as far as it goes."""
-    from jimpact.cli.study_motion import motion_study
-
     study = motion_study(command.study)
     system, title = study.system, study.title
     motion = jax.block_until_ready(

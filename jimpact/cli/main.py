@@ -1,4 +1,4 @@
-"""The program `jimpact`. Heavy imports wait until a command runs and its study is checked.
+"""The program `jimpact`. Heavy imports wait until a command runs.
 
 Ctrl-C ends a command at once, whatever it does: XLA cannot be interrupted by an exception while
 it compiles. The message says which steps are done and what remains on the disk.

@@ -1,6 +1,6 @@
 """Options of `jimpact fit`, `compare`, `montecarlo` and so on, one class for each command.
 
-`check` refuses what is wrong before JAX is imported, that is at once.
+`check` refuses options that are wrong before JAX is imported, that is at once.
 """
 
 import dataclasses
@@ -12,9 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import tyro
 
-from jimpact._checks import check_choice, check_executor
-from jimpact.cli import starting
-from jimpact.files import study_file
+from jimpact._checks import check_executor
 from jimpact.files.records import Column, Table
 
 EVERY_LAW = "all"  # in the place of a law's name
@@ -40,7 +38,7 @@ Names = Annotated[tuple[str, ...], _option("NAME ...")]
 class Command:
     """Options of every command."""
 
-    light: ClassVar[bool] = False  # whether it needs no JAX and has a method `run`
+    light: ClassVar[bool] = False  # whether it computes nothing and has a method `run`
 
     json: Flag = False
     """Print JSON instead of text."""
@@ -117,12 +115,6 @@ def check_writable(option: str, folder: Path) -> None:
         raise ValueError(f"{option} must be writable, but '{folder}' is not: {reason}.") from None
 
 
-def check_methods(methods: tuple[str, ...], choices: tuple[str, ...]) -> None:
-    """Raise a ValueError unless all methods are among the choices."""
-    for method in methods:
-        check_choice("methods", method, choices)
-
-
 @dataclasses.dataclass(frozen=True)
 class ShotCommand(DrawingCommand):
     """Options of a command about one impact."""
@@ -133,17 +125,6 @@ class ShotCommand(DrawingCommand):
     """Velocities before the impact [m/s], one a body; default: those of a measured shot."""
     shot: int = 1
     """Which measured shot, counted from 1."""
-
-    def check(self) -> None:
-        """Also the study, and whether it has velocities."""
-        super().check()
-        shots = study_file.check_study(self.study, motion=False).rows
-        if self.velocity:
-            return
-        if not shots:
-            raise ValueError("--velocity must be given, because the study has no [data].")
-        if not 1 <= self.shot <= shots:
-            raise ValueError(f"--shot must lie in [1, {shots}], but is {self.shot}.")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -167,20 +148,10 @@ class FitCommand(DrawingCommand):
     """Seconds after which no further step is begun; default: no limit."""
 
     def check(self) -> None:
-        """Also the study, which must have data."""
+        """Also the limit."""
         super().check()
         if self.limit is not None and not self.limit > 0:
             raise ValueError(f"--limit must be > 0 seconds, but is {self.limit:g}.")
-        if self.method is not None:
-            check_choice("method", self.method, study_file.names()["fit_methods"])
-        law = None if self.law == EVERY_LAW else self.law
-        study = study_file.check_study(self.study, law)
-        if study.motion and (self.method is not None or self.law == EVERY_LAW or self.all_free):
-            raise ValueError("--method, --law all, --all-free must be left out for a motion.")
-        if self.law == EVERY_LAW and not study.rows:
-            raise ValueError("--law all must be left out where no shots are fitted.")
-        if "data" not in study.tables:
-            raise ValueError(study_file.NO_DATA)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -209,11 +180,8 @@ class MonteCarloCommand(DrawingCommand):
     """Keep the raw samples in the folder, too."""
 
     def check(self) -> None:
-        """Also the study, which must say what is random."""
+        """Also the executor and the folder."""
         super().check()
-        study = study_file.check_study(self.study, motion=False)
-        if "monte_carlo" not in study.tables:
-            raise ValueError(f"the study '{self.study}' must have a [monte_carlo] table.")
         check_executor(self.executor)
         if self.folder is not None:
             check_writable("--folder", self.folder)
@@ -238,11 +206,6 @@ class ChartCommand(ShotCommand):
     repeats: int = 5
     """Timings of each entry, taken in turn."""
 
-    def check(self) -> None:
-        """Also the methods' names."""
-        super().check()
-        check_methods(self.methods, tuple(study_file.names()["methods"]))
-
 
 @dataclasses.dataclass(frozen=True)
 class StabilityCommand(DrawingCommand):
@@ -252,13 +215,6 @@ class StabilityCommand(DrawingCommand):
     """Methods by name; default: default, rk4, verlet and impulse_euler."""
     full: Flag = False
     """Also other numbers of balls, all pairs of axes, 300 points between them."""
-
-    def check(self) -> None:
-        """Also the methods' names."""
-        super().check()
-        methods = study_file.names()["methods"]
-        batched = [name for name, in_jax in methods.items() if in_jax]
-        check_methods(self.methods, tuple(batched))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -296,7 +252,7 @@ class SimulateCommand(DrawingCommand):
     """Coordinate of the phase portrait, counted from 1; default: one that moves."""
 
     def check(self) -> None:
-        """Also the other pictures and the study."""
+        """Also the other pictures."""
         super().check()
         if self.portrait is not None:
             checked_file("--portrait", self.portrait, PICTURES)
@@ -308,7 +264,6 @@ class SimulateCommand(DrawingCommand):
             raise ValueError(
                 f"--portrait and --out must be two files, but are both '{self.portrait}'."
             )
-        study_file.check_study(self.study, motion=True)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -323,23 +278,23 @@ class LawsCommand(Command):
     light: ClassVar[bool] = True
 
     def run(self) -> int:
-        """Print them; JAX is imported only for a module."""
-        if self.module is not None:
-            from jimpact.cli.study import import_laws
+        """Print them."""
+        from jimpact.cli.starting import laws_as_text
+        from jimpact.cli.study_file import REGISTRY, import_laws
 
+        if self.module is not None:
             import_laws(self.module, Path())
-        laws = study_file.declared_laws()
         keys = ("parameters", "summary", "right_when", "fails_when", "source")
-        rows = {name: {key: row[key] for key in keys} for name, row in laws.items()}
+        rows = {name: {key: getattr(row, key) for key in keys} for name, row in REGISTRY.items()}
         if self.json:
             text = json.dumps(rows, indent=2)
         elif self.bibtex:
-            text = "\n\n".join(dict.fromkeys(row["bibtex"] for row in laws.values()))
+            text = "\n\n".join(dict.fromkeys(row.bibtex for row in REGISTRY.values()))
         elif self.csv:
             lines = [[x, " ".join(row.pop("parameters")), *row.values()] for x, row in rows.items()]
             text = Table([Column(key) for key in ("law", *keys)], lines).to_csv()
         else:
-            text = starting.laws_as_text(rows)
+            text = laws_as_text(rows)
         print(text)
         return 0
 
@@ -372,8 +327,10 @@ class NewCommand:
 
     def run(self) -> int:
         """Write the files, and print the next command."""
+        from jimpact.cli.starting import begin
+
         folder = self.folder or Path(f"my_{self.kind}")
-        for path in starting.begin(self.kind, folder, self.like):
+        for path in begin(self.kind, folder, self.like):
             print(f"written: {path}")
         print(f"Next: jimpact {self.kind} {folder}")
         return 0

@@ -1,4 +1,4 @@
-"""What the command line does without JAX: begin a user's own study, print laws."""
+"""What the command line does without computing: begin a user's own study, print laws."""
 
 import json
 import shutil
@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from jimpact.files.study_file import STUDY, located
+from jimpact.cli.study_file import STUDY, located
 
 WIDEST = 100  # characters; longer lines of prose are hard to read
 TEMPLATES, DATA = Path(__file__).with_name("new_studies.toml"), "shots.csv"

@@ -1,45 +1,50 @@
-"""Studies of one impact: scene, law, what is free and the data, built of a checked TOML file."""
+"""Studies of one impact: scene, law, what is free and the data; and `read_study` for any study."""
 
-import importlib.util
-import sys
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
-
-import numpy as np
+from typing import Any, TypeVar
 
 import jimpact as ji
 from jimpact.bodies.base import CLOSED_BELOW, Body
-from jimpact.files.study_file import (
-    AT_KEYS,
+from jimpact.cli.study_file import (
     NO_DATA,
-    CheckedStudy,
-    body_keys,
-    distribution,
-    from_file,
+    arguments_of,
+    body_of,
+    check_keys,
+    check_kind,
+    check_tables,
+    fit_arguments,
+    law_of,
+    located,
+    read_tables,
+    without_none,
 )
+from jimpact.cli.study_motion import MotionStudy, motion_study_of
 from jimpact.fits.data import Experiments, read_experiments
 from jimpact.fits.fitting import Fit, fit
-from jimpact.fits.matrices import admissible_start
 from jimpact.fits.parameters import OF_SPEED, default_free
 from jimpact.fits.problem import FitProblem, of_shots
 from jimpact.fits.search import Search
 from jimpact.law import Law, free_parameters_of
-from jimpact.laws import REGISTRY
-from jimpact.laws.kinematic import RestitutionMatrix
 from jimpact.montecarlo.distributions import Distribution, RandomLaw
 from jimpact.scene import Scene, chain
 
-# Keys of [monte_carlo] that `monte_carlo` calls otherwise.
-SAMPLING_ARGUMENTS = {"velocity_m_per_s": "velocity", "gaps_m": "gaps", "seed": "key"}
+# Keys of the tables, and the arguments that they are: of `chain`, of `Body.scene`, of
+# `read_experiments`, of `monte_carlo`.
+CHAIN = {"masses_kg": "masses", "wall": "wall", "gaps_m": "gaps"}
+CONFIGURATION = {"q": "q", "closed_below_m": "closed_below"}
+DATA = ("file", "momentum_corrected", "near_m", "contacts")
+SAMPLING = {
+    **{"velocity_m_per_s": "velocity", "gaps_m": "gaps", "law": "law", "samples": "samples"},
+    **{"seed": "key", "chunk": "chunk", "bins": "bins"},
+}
+DISTRIBUTIONS: dict[tuple[str, ...], Callable[..., Distribution]] = {
+    ("high", "low"): ji.Uniform,
+    ("mean", "std"): ji.Normal,
+}  # by their keys
 
-
-def fit_arguments(options: dict[str, Any], search: Search) -> dict[str, Any]:
-    """Arguments of `fit` from the options of a study, of which all but two belong to its search."""
-    own = {name: options[name] for name in ("starts", "profiles") if name in options}
-    others = {name: value for name, value in options.items() if name not in own}
-    return own | {"search": replace(search, **others)}
+AnyStudy = TypeVar("AnyStudy")
 
 
 @dataclass(frozen=True)
@@ -88,56 +93,129 @@ class Study:
         return of_shots(self.law, self.scene, self.experiments, *choice)
 
 
+def read_study(path: str | Path, law: str | None = None) -> Study | MotionStudy:
+    """A study from its TOML file: of one impact, or with a table [system] of a motion.
+
+    Args:
+        path: path of the file or of its folder, or the name of a bundled study
+            (`three_balls.toml`, `cradle_motion.toml`).
+        law: name of another law in the place of the study's.
+
+    The tables of a file on impacts:
+
+    - `[scene]`: masses_kg, wall, gaps_m (a chain, see `chain`); or kind, the name of a body, with
+      its arguments (`width_m`, `mass_kg`, ...), q, its configuration at the impact, closed_below_m.
+    - `[law]`: name (`jimpact laws`), start values (a number for all contacts or a list with one
+      each), options, module (a file or module that registers the law, see `register`). A
+      `restitution_matrix` without its matrix starts from an admissible one.
+    - `[law.bounds]`: pairs, as `restitution = [0, 1]` or `"restitution[2]" = [0.5, 1]`.
+    - `[law.priors]`: means with standard deviations, as `restitution = [0.9, 0.02]`, see `fit`.
+    - `[fit]`: free (a list of names, or a table of masks), method, loss, starts, seed, max_steps,
+      profiles.
+    - `[data]`: file (relative to the study, see `read_experiments`), momentum_corrected; of shots
+      with scenes of their own near_m, contacts (only shots with that many). Without data a study
+      can be compared, not fitted.
+    - `[monte_carlo]`: velocity_m_per_s, gaps_m, law, samples, seed, chunk, bins; see
+      `monte_carlo`.
+
+    On a motion, with [law], [law.bounds], [law.priors] and [fit] (without method) as above:
+
+    - `[system]`: kind, the name of a body, with its arguments (`width_m`, `mass_kg`, ...), and
+      gravity_m_per_s2, 0 for none.
+    - `[base]`: amplitude_m, frequency_hz, phase_rad, direction (vertical; in the plane also
+      horizontal, in space x or y).
+    - `[motion]`: q0, v0, t_start_s, t_end_s, samples, method, max_events, options of the method
+      (step_s, closed_below_m, max_steps, rtol, slow), and friction of the system.
+    - `[data]`: file, a CSV file with columns t[s] in equal steps, q_1[m], q_2[rad], ... and perhaps
+      sigma_q_1[m], ...
+
+    Returns:
+        A `Study`, or a `MotionStudy`.
+
+    Raises:
+        FileNotFoundError: no such study or data file.
+        ValueError: the file is not TOML; a key is unknown or missing; scene, system, law or data
+            refuse a value.
+
+    >>> import jimpact as ji
+    >>> ji.read_study("three_balls.toml").title, ji.read_study("cradle_motion.toml").title
+    ('Three equal hard balls, one shot', "Newton's cradle, three balls")
+    """
+
+    def build(tables: dict[str, Any], place: Path) -> Study | MotionStudy:
+        """The study, of whatever kind it is."""
+        return (motion_study_of if "motion" in tables else _impact_study)(tables, place, law)
+
+    return _built(path, "[law]", build)
+
+
 def impact_study(path: str | Path, law: str | None = None) -> Study:
-    """The study of one impact, see `read_study`."""
-    return from_file(path, law, False, study_of, import_module_of)
+    """The study of one impact, see `read_study`; one of a motion is refused."""
+    return _built(path, "[scene]", lambda tables, place: _impact_study(tables, place, law))
 
 
-def study_of(checked: CheckedStudy) -> Study:
-    """The study of checked tables."""
-    tables, free = checked.tables, checked.law.free
+def motion_study(path: str | Path) -> MotionStudy:
+    """The study of a motion, see `read_study`; one of an impact is refused."""
+    return _built(path, "[system]", lambda tables, place: motion_study_of(tables, place, None))
+
+
+def _built(
+    path: str | Path, table: str, build: Callable[[dict[str, Any], Path], AnyStudy]
+) -> AnyStudy:
+    """What is built of the tables of a file; an error names the file.
+
+    `table` is the head of a table that all bundled studies of this kind have.
+    """
+    place = located(Path(path), table)
+    try:
+        return build(read_tables(place), place)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{place}: {error}") from None
+
+
+def _impact_study(tables: Mapping[str, Any], place: Path, law_name: str | None) -> Study:
+    """The study of these tables."""
+    check_tables(tables, ("scene", "law"), ("fit", "data", "monte_carlo"))
     scene, body = _scene(tables["scene"])
-    row, values = REGISTRY[checked.law.name], checked.law.arguments
-    if row.law is RestitutionMatrix and "matrix" not in values:
-        values = values | {"matrix": admissible_start([scene])}
-    values = with_exponent(values, free)
-    law = row.build(**values)
+    law, values, fitted = law_of(tables, law_name, place.parent, scene)
     fittable = free_parameters_of(law)
     bounce = [name for name in ("restitution", *OF_SPEED) if name in fittable]
     data = tables.get("data")
-    return Study(
-        checked.title,
+    study = Study(
+        str(tables.get("title", place.stem)),
         scene,
         law,
-        free=free or dict.fromkeys(bounce or default_free(law), True),
-        bounds=checked.law.bounds,
-        experiments=None if data is None else _experiments(data, checked.path, body or scene),
+        free=fitted.free or dict.fromkeys(bounce or default_free(law), True),
+        bounds=fitted.bounds,
+        experiments=None if data is None else _experiments(data, place, body or scene),
         parameters=values,
-        options=checked.fit_options,
-        priors=checked.law.priors,
+        options=fitted.options,
+        priors=fitted.priors,
         monte_carlo=_sampling(tables["monte_carlo"], law, scene) if "monte_carlo" in tables else {},
     )
+    if study.experiments is not None:
+        study._problem(of_shots)  # it refuses what is wrong with [fit], [law.bounds], [law.priors]
+    return study
 
 
-def without_none(options: Mapping[str, Any]) -> dict[str, Any]:
-    """The options that are not None, which means: as the study says."""
-    return {key: value for key, value in options.items() if value is not None}
+def _scene(table: Mapping[str, Any]) -> tuple[Scene, Body | None]:
+    """The scene of a study, and the body whose scene it is."""
+    if "kind" not in table:
+        return chain(**arguments_of("[scene]", table, CHAIN, ("masses_kg",))), None
+    body = body_of("[scene]", table, tuple(CONFIGURATION))
+    check_keys("[scene]", table, tuple(table), ("q",))
+    place = {CONFIGURATION[key]: x for key, x in table.items() if key in CONFIGURATION}
+    return body.scene(**place), body
 
 
-def with_exponent(values: dict[str, Any], free: Mapping[str, Any]) -> dict[str, Any]:
-    """A law's values: fixed exponents are fast as numbers, free ones must be arrays."""
-    if "exponent" not in values:
-        return values
-    exponent = values["exponent"]
-    if "exponent" in free:
-        return values | {"exponent": np.asarray(exponent, float)}
-    return values | {"exponent": tuple(exponent) if isinstance(exponent, list) else exponent}
-
-
-def _experiments(table: Mapping[str, Any], path: Path, place: Scene | Body) -> Experiments:
+def _experiments(table: Mapping[str, Any], study: Path, place: Scene | Body) -> Experiments:
     """The shots of the table [data], with the scenes that they have of their own."""
-    file, near = path.parent / table["file"], table.get("near_m", CLOSED_BELOW)
-    experiments = read_experiments(file, place, near)
+    check_keys("[data]", table, DATA, ("file",))
+    check_kind("[data]", "file", table["file"], str, "a path")
+    corrected = table.get("momentum_corrected", False)
+    check_kind("[data]", "momentum_corrected", corrected, bool, "true or false")
+    near = table.get("near_m", CLOSED_BELOW)
+    experiments = read_experiments(study.parent / table["file"], place, near)
     if experiments.scenes is None:
         for key in ("contacts", "near_m"):
             if key in table:
@@ -146,93 +224,31 @@ def _experiments(table: Mapping[str, Any], path: Path, place: Scene | Body) -> E
             experiments.scene_of(place, 0)  # raises where their sizes differ
     if "contacts" in table:
         experiments = experiments.with_contacts(table["contacts"])
-    if table.get("momentum_corrected", False):
+    if corrected:
         return experiments.momentum_corrected(place if isinstance(place, Scene) else None)
     return experiments
 
 
-def body_of(where: str, table: Mapping[str, Any], others: tuple[str, ...] = ()) -> Body:
-    """The body that a table of a study describes.
-
-    `kind` is the name of a body's class (`Block`, `Box`, `Bodies`, ..., in any case); the
-    other keys are the arguments of that class, with their units behind them: `width_m`, `mass_kg`,
-    `inertia_kg_m2`, `angle_rad`. Bodies of `Bodies` are tables of this
-    kind themselves.
-    `others` are keys of the table that mean something else.
-
-    >>> from jimpact.cli.study import body_of
-    >>> body_of("[scene]", {"kind": "Block", "width_m": 0.2, "height_m": 0.6}).names
-    ('x [m]', 'y [m]', 'angle [rad]')
-    """
-    kind, keys = body_keys(where, table, others)
-    arguments = {name: table[key] for key, name in keys.items() if key in table}
-    for several in {"bodies", "fixed"} & set(arguments):
-        within = f"{where.removesuffix(']')}.{several}]"
-        arguments[several] = [body_of(within, x) for x in arguments[several]]
-    return getattr(ji, kind)(**arguments)
-
-
-def _scene(table: Mapping[str, Any]) -> tuple[Scene, Body | None]:
-    """The scene of a study, and the body whose scene it is."""
-    if "kind" in table:
-        body = body_of("[scene]", table, AT_KEYS)
-        return body.scene(table["q"], table.get("closed_below_m", CLOSED_BELOW)), body
-    return chain(table["masses_kg"], table.get("wall", False), table.get("gaps_m")), None
-
-
 def _sampling(table: Mapping[str, Any], law: Law, scene: Scene) -> dict[str, Any]:
-    """Arguments of `monte_carlo` from the table [monte_carlo].
-
-    Keys: velocity_m_per_s and gaps_m, a list, or a table with low and high (uniform) or mean and
-    std (normal; gaps truncated at 0); law, a table of such tables by parameter; samples, seed,
-    chunk, bins.
-    """
+    """Arguments of `monte_carlo` from the table [monte_carlo]; tables in it are distributions."""
+    check_keys("[monte_carlo]", table, SAMPLING, ("velocity_m_per_s",))
     laws = table.get("law", {})
-    drawn = {name: _distribution(f"law.{name}", value) for name, value in laws.items()}
+    if not isinstance(laws, dict):
+        raise ValueError(f"[monte_carlo.law] must be a table, but is {laws!r}.")
+    random = {name: _distribution(f"law.{name}", x) for name, x in laws.items()}
     arguments = {
-        SAMPLING_ARGUMENTS.get(key, key): _distribution(key, value)
-        if isinstance(value, dict)
-        else value
-        for key, value in table.items()
+        SAMPLING[key]: _distribution(key, x) if isinstance(x, dict) else x
+        for key, x in table.items()
         if key != "law"
     }
-    return {"scene": scene, "law": RandomLaw(law, **drawn) if drawn else law} | arguments
+    return {"scene": scene, "law": RandomLaw(law, **random) if random else law} | arguments
 
 
-def _distribution(name: str, value: Any) -> Distribution:
+def _distribution(key: str, table: Any) -> Distribution:
     """The distribution that a table of a study means."""
-    return getattr(ji, distribution(name, value))(**value)
-
-
-def import_module_of(tables: Mapping[str, Any], folder: Path) -> None:
-    """Import the module that the table [law] of a study names, if it names one."""
-    law = tables.get("law")
-    if isinstance(law, dict) and "module" in law:
-        import_laws(str(law["module"]), folder)
-
-
-def import_laws(module: str, folder: Path) -> None:
-    """Import a module that registers laws: a file (.py, relative to the folder), or by its name."""
-    if not module.endswith(".py"):
-        importlib.import_module(module)
-        return
-    path = (folder / module).resolve()
-    if not path.is_file():
+    kind = DISTRIBUTIONS.get(tuple(sorted(table))) if isinstance(table, dict) else None
+    if kind is None:
         raise ValueError(
-            f"`module` must be a file or an importable module, but '{path}' does not exist."
+            f"`{key}` in [monte_carlo] must have low and high, or mean and std, but is {table!r}."
         )
-    imported = sys.modules.get(path.stem)
-    if imported is not None:
-        if Path(getattr(imported, "__file__", None) or "").resolve() == path:
-            return
-        raise ValueError(f"`module` must have a new name, but another '{path.stem}' is imported.")
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    assert spec is not None
-    assert spec.loader is not None
-    loaded = importlib.util.module_from_spec(spec)
-    sys.modules[path.stem] = loaded  # before it runs: classes are looked up there by name
-    try:
-        spec.loader.exec_module(loaded)
-    except BaseException:
-        del sys.modules[path.stem]
-        raise
+    return kind(**table)

@@ -12,12 +12,12 @@ import numpy as np
 
 from jimpact._checks import ABBREVIATIONS, suggestion
 from jimpact.contact import Contact
-from jimpact.files.study_file import OF_A_SCENE
 from jimpact.law import (
     Domain,
     Impulses,
     Law,
     OptionalValues,
+    declarations_of,
     forwards_to_law,
     free_parameters_of,
     parameter,
@@ -32,6 +32,7 @@ Ties = tuple[tuple[str, Callable[["Values"], Any]], ...]  # names, and what they
 Limits = tuple[np.ndarray, np.ndarray]  # lowest and highest values (P,)
 DEFAULT_FREE = ("restitution", "stiffness")  # or a matrix, or what else a law has
 OF_SPEED = ("speed_exponent", "yield_speed")  # a law has them only if requested
+OF_A_SCENE = ("mass", "gaps", "tilt")  # parts of a scene that a fit may have as parameters
 
 # What is fitted in its logarithm, a stiffness, may without bounds move this far from its start:
 # beyond, the softer contact has no further influence that a measurement could see.
@@ -236,9 +237,15 @@ def _unknown_field(law: Law, field: str, known: list[str]) -> str:
             f"Argument `free` must not hold `{field}`: it is a fixed number of this {name}; "
             f"give {field}=jnp.asarray(...) to the law to make it a parameter."
         )
+    declared = declarations_of(type(law))
+    if isinstance(declared.get(field), Domain):
+        return (
+            f"Argument `free` must not hold `{field}`, because this {name} has none: give it one."
+        )
+    words = suggestion(field, declared, ABBREVIATIONS) or suggestion(field, known)
     return (
         f"Argument `free` must name parameters of {name}, one of {', '.join(known)}, "
-        f"but has {field!r}.{suggestion(field, known, ABBREVIATIONS)}"
+        f"but has {field!r}.{words}"
     )
 
 

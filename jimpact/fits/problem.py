@@ -18,7 +18,6 @@ import numpy as np
 
 from jimpact._checks import as_float_array, check_concrete, check_kind, check_values
 from jimpact.compiling import full_precision
-from jimpact.files.study_file import OF_A_SCENE
 from jimpact.fits.data import Experiments, kept_by_corrections
 from jimpact.fits.matrices import AdmissibleMatrices, matrix_region
 from jimpact.fits.observables import (
@@ -32,6 +31,7 @@ from jimpact.fits.observables import (
 )
 from jimpact.fits.parameters import (
     DEFAULT_FREE,
+    OF_A_SCENE,
     LawInScene,
     Limits,
     Parameters,

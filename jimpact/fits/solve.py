@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jimpact._checks import suggestion
 from jimpact.compiling import quick_jit
 from jimpact.progress import Show
 
@@ -136,6 +137,7 @@ def default_steps(method: Any) -> int:
         raise ValueError(
             f"Argument `method` must be one of {', '.join(map(repr, DEFAULT_STEPS))} or an "
             f"optax.GradientTransformation, but has value {method!r}."
+            f"{suggestion(method, DEFAULT_STEPS)}"
         )
     return DEFAULT_STEPS["adam"]
 

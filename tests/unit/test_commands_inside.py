@@ -11,10 +11,10 @@ from commands_cases import BODIES, SHOTS, STUDY, call, written
 
 import jimpact as ji
 from jimpact import HarmonicBase
+from jimpact.cli import study, study_file, study_motion
 from jimpact.cli.commands import _per_contact
 from jimpact.cli.main import keep_programs
-from jimpact.cli.study import SAMPLING_ARGUMENTS, body_of
-from jimpact.files import study_file
+from jimpact.cli.study_file import body_of
 
 
 @pytest.fixture(autouse=True)
@@ -91,12 +91,13 @@ def test_unwritable_places_are_refused_before_anything_is_computed(
 @pytest.mark.parametrize(
     ("arguments", "function"),
     [
-        (study_file.MOTION_KEYS.values(), ji.simulate),
-        (set(study_file.METHOD_KEYS.values()) - {"step"}, ji.EventDriven),
-        (study_file.FIT.keys - inspect.signature(ji.Search).parameters.keys(), ji.fit),
-        (study_file.FIT_MOTION.keys, ji.fit_motion),
-        (study_file.BASE_KEYS.values(), HarmonicBase),
-        ([SAMPLING_ARGUMENTS.get(x, x) for x in study_file.SAMPLING.keys], ji.monte_carlo),
+        (study.CHAIN.values(), ji.chain),
+        (study.CONFIGURATION.values(), ji.Body.scene),
+        (study.SAMPLING.values(), ji.monte_carlo),
+        (study_motion.MOTION.values(), ji.simulate),
+        (set(study_motion.METHOD.values()) - {"step"}, ji.EventDriven),
+        (study_motion.BASE.values(), HarmonicBase),
+        (set(study_file.FIT) - inspect.signature(ji.Search).parameters.keys(), ji.fit),
     ],
 )
 def test_keys_of_studies_are_arguments_of_functions(arguments, function):

@@ -8,7 +8,7 @@ from command_line import main
 
 import jimpact as ji
 from jimpact import read_study
-from jimpact.cli.study import import_laws
+from jimpact.cli.study_file import import_laws
 
 pytestmark = pytest.mark.release  # they compile programs of their own
 

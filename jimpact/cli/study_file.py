@@ -1,0 +1,298 @@
+"""What studies of impacts and of motions share: their file, keys of its tables, law and body."""
+
+import dataclasses
+import importlib.util
+import inspect
+import sys
+import tomllib
+from collections.abc import Mapping
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import jimpact as ji
+from jimpact._checks import check_word, suggestion
+from jimpact.bodies import assembly, particles, pendulums, shapes
+from jimpact.bodies.base import Body
+from jimpact.fits.matrices import admissible_start
+from jimpact.fits.parameters import OF_A_SCENE, entry_of
+from jimpact.fits.search import Search
+from jimpact.law import Law
+from jimpact.laws import REGISTRY
+from jimpact.laws.kinematic import RestitutionMatrix
+from jimpact.scene import Scene
+
+STUDY = "study.toml"  # in a folder that `jimpact new` has made
+NO_DATA = "a study must have a [data] table to be fitted, but has none."
+BODIES = {  # classes of bodies by name, which a study writes in any case
+    name: kind
+    for module in (assembly, particles, pendulums, shapes)
+    for name, kind in vars(module).items()
+    if name in dir(ji) and isinstance(kind, type) and issubclass(kind, Body) and kind is not Body
+}
+# Units of the bodies' arguments, which a study writes behind their names. Words and directions have
+# no unit here, nor have lists of points [m] or of mixed units (`corners` of a Polygon, `planes`,
+# `at`), which the classes document.
+_UNITS = {
+    **dict.fromkeys(("mass", "masses", "sphere_mass", "rod_mass"), "kg"),
+    **dict.fromkeys(
+        ("width", "height", "length", "thickness", "radius", "radii", "gaps", "sizes"), "m"
+    ),
+    **dict.fromkeys(("centre", "rounding"), "m"),
+    "inertia": "kg_m2",
+    "angle": "rad",
+}
+
+
+# -------------------------------------------------------------------------- locating and reading
+
+
+def located(path: Path, table: str) -> Path:
+    """The file, that of a folder (`jimpact new`), or the bundled study of this name.
+
+    `table` is the head of a table of the studies that an error lists.
+    """
+    if path.is_file():
+        return path
+    if (path / STUDY).is_file():
+        return path / STUDY
+    bundled = Path(str(files("jimpact") / "data"))
+    if path.parent == Path() and (bundled / path).is_file():
+        return bundled / path
+    if path.is_dir():
+        raise FileNotFoundError(
+            f"Folder '{path}' holds no study: it has no {STUDY} (`jimpact new` writes one)."
+        )
+    tables = sorted(bundled.glob("*.toml"))
+    choices = [x.name for x in tables if table in x.read_text(encoding="utf-8")]
+    raise FileNotFoundError(
+        f"Study '{path}' does not exist; bundled studies are {', '.join(choices)}."
+        f"{suggestion(path, choices)}"
+    )
+
+
+def read_tables(path: Path) -> dict[str, Any]:
+    """The tables of a TOML file; an error says where it is none."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        if path.suffix == ".csv":
+            raise ValueError(
+                "a study must be a TOML file, but this is a CSV file. `jimpact new fit my_fit` "
+                "writes a study; name this file under [data] in it."
+            ) from None
+        raise ValueError(f"the study must be a TOML file: {_position(error)}.") from None
+
+
+def _position(error: Exception) -> str:
+    """Where a file is not TOML, and why.
+
+    >>> from jimpact.cli.study_file import _position
+    >>> _position(ValueError("Expected ']' (at line 9, column 7)"))
+    "line 9, column 7: expected ']'"
+    """
+    reason, _, place = str(error).rstrip(")").partition(" (at ")
+    reason = reason[:1].lower() + reason[1:]
+    return f"{place}: {reason}" if place else reason
+
+
+# ------------------------------------------------------------------------------------------- keys
+
+
+def check_keys(where: str, table: Any, allowed: Any, required: tuple[str, ...] = ()) -> None:
+    """Raise a ValueError for unknown or missing keys of a table."""
+    if not isinstance(table, Mapping):
+        raise ValueError(f"{where} must be a table, but is {table!r}.")
+    for key in required:
+        if key not in table:
+            raise ValueError(
+                f"{where} must have the key `{key}`, but has {', '.join(table) or 'none'}."
+            )
+    for key in table:
+        if key not in allowed:
+            raise ValueError(
+                f"{where} may have the keys {', '.join(allowed)}, but has `{key}`."
+                f"{suggestion(key, allowed)}"
+            )
+
+
+def check_kind(where: str, key: str, value: Any, kind: type, words: str) -> None:
+    """Raise a ValueError for a value of another kind, which `words` name."""
+    if not isinstance(value, kind):
+        raise ValueError(f"`{key}` in {where} must be {words}, but is {value!r}.")
+
+
+def arguments_of(
+    where: str, table: Any, keys: Mapping[str, str], required: tuple[str, ...] = ()
+) -> dict[str, Any]:
+    """The values of a table by the arguments that its keys stand for; other keys are refused."""
+    check_keys(where, table, keys, required)
+    return {keys[key]: value for key, value in table.items()}
+
+
+def check_tables(
+    study: Mapping[str, Any], required: tuple[str, ...], others: tuple[str, ...]
+) -> None:
+    """Raise a ValueError for tables that are unknown, missing or none; a title is allowed, too."""
+    for scene, system, kind in (("scene", "system", "a motion"), ("system", "scene", "one impact")):
+        if system in required and system not in study and scene in study:
+            raise ValueError(
+                f"the study must be of {kind}, with [{system}], but has [{scene}]: "
+                "`jimpact simulate` takes [system], other commands [scene]."
+            )
+    check_keys("the study", study, ("title", *required, *others), required)
+    for name in (*required, *others):
+        if not isinstance(study.get(name, {}), dict):
+            raise ValueError(f"`{name}` must be a table, but is {study[name]!r}.")
+
+
+# ------------------------------------------------------------------------- tables of every study
+
+# Keys of [fit], all of which are arguments of `fit` or `Search`; `method` is of impacts only.
+FIT = ("free", "method", "loss", "starts", "seed", "max_steps", "profiles")
+
+
+class Fitted(NamedTuple):
+    """What a study says of its fit: what is free (names -> masks), limits, options of `fit`."""
+
+    free: dict[str, Any]
+    bounds: dict[str, Any]
+    priors: dict[str, Any]
+    options: dict[str, Any]
+
+
+def law_of(
+    tables: Mapping[str, Any], other_law: str | None, folder: Path, scene: Scene | None = None
+) -> tuple[Law, dict[str, Any], Fitted]:
+    """The law of a study, its values, and what [fit], [law.bounds] and [law.priors] say of it.
+
+    Args:
+        tables: of the study.
+        other_law: name of a law in the place of the study's; values that it does not take are left
+            out.
+        folder: of the study, in which a module may lie that registers its law.
+        scene: for a `RestitutionMatrix` without its matrix, which starts from an admissible one.
+    """
+    table = tables["law"]
+    check_keys("[law]", table, tuple(table), required=("name",))
+    if "module" in table:
+        import_laws(str(table["module"]), folder)
+    study_law = str(table["name"]).lower()
+    name = (other_law or study_law).lower()
+    for word in (study_law, name):
+        check_word("the law", word, REGISTRY)
+    others = ("name", "module", "bounds", "priors")
+    check_keys("[law]", table, (*REGISTRY[study_law].arguments, *others))
+    allowed = (*REGISTRY[study_law].parameters, *OF_A_SCENE)
+    for key in ("bounds", "priors"):
+        pairs = table.get(key, {})
+        fields = {entry_of(x)[0]: x for x in pairs} if isinstance(pairs, dict) else pairs
+        check_keys(f"[law.{key}]", fields, allowed)
+    row = REGISTRY[name]
+    values = {key: x for key, x in table.items() if key in row.arguments}
+    if row.law is RestitutionMatrix and "matrix" not in values and scene is not None:
+        values["matrix"] = admissible_start([scene])
+    options = dict(tables.get("fit", {}))
+    check_keys("[fit]", options, FIT)
+    free = _masks(options.pop("free", []))
+    values = _with_exponent(values, free)
+
+    def kept(pairs: Mapping[str, Any]) -> dict[str, Any]:
+        """What belongs to this law, where it stands in the place of the study's."""
+        fields = (*row.parameters, *OF_A_SCENE)
+        return {x: y for x, y in pairs.items() if other_law is None or entry_of(x)[0] in fields}
+
+    bounds, priors = kept(table.get("bounds", {})), kept(table.get("priors", {}))
+    return row.build(**values), values, Fitted(kept(free), bounds, priors, options)
+
+
+def _masks(free: Any) -> dict[str, Any]:
+    """What is free, by name: True, or a mask over contacts."""
+    if isinstance(free, dict):
+        return free
+    if isinstance(free, list) and all(isinstance(name, str) for name in free):
+        return dict.fromkeys(free, True)
+    raise ValueError(f"`free` must be a list of names or a table of masks, but is {free!r}.")
+
+
+def _with_exponent(values: dict[str, Any], free: Mapping[str, Any]) -> dict[str, Any]:
+    """A law's values: fixed exponents are fast as numbers, free ones must be arrays."""
+    if "exponent" not in values:
+        return values
+    exponent = values["exponent"]
+    if "exponent" in free:
+        return values | {"exponent": np.asarray(exponent, float)}
+    return values | {"exponent": tuple(exponent) if isinstance(exponent, list) else exponent}
+
+
+def without_none(options: Mapping[str, Any]) -> dict[str, Any]:
+    """The options that are not None, which means: as the study says."""
+    return {key: value for key, value in options.items() if value is not None}
+
+
+def fit_arguments(options: Mapping[str, Any], search: Search) -> dict[str, Any]:
+    """Arguments of `fit` from the options of a study, of which all but two belong to its search."""
+    own = {name: options[name] for name in ("starts", "profiles") if name in options}
+    check_kind("[fit]", "profiles", own.get("profiles") or False, bool, "true or false")
+    others = {name: value for name, value in options.items() if name not in own}
+    return own | {"search": dataclasses.replace(search, **others)}
+
+
+def body_of(where: str, table: Any, others: tuple[str, ...] = ()) -> Body:
+    """The body that a table of a study describes.
+
+    `kind` is the name of a body's class (`Block`, `Box`, `Bodies`, ..., in any case); the other
+    keys are the arguments of that class, with their units behind them: `width_m`, `mass_kg`,
+    `inertia_kg_m2`, `angle_rad`. Bodies of `Bodies` are tables of this kind themselves.
+    `others` are keys of the table that mean something else.
+
+    >>> from jimpact.cli.study_file import body_of
+    >>> body_of("[scene]", {"kind": "Block", "width_m": 0.2, "height_m": 0.6}).names
+    ('x [m]', 'y [m]', 'angle [rad]')
+    """
+    check_keys(where, table, tuple(table), required=("kind",))
+    names = {name.lower(): name for name in sorted(BODIES)}
+    name = names.get(str(table["kind"]).lower(), table["kind"])
+    check_word(f"`kind` in {where}", name, names.values())
+    parameters = inspect.signature(BODIES[name]).parameters
+    keys = {f"{key}_{_UNITS[key]}" if key in _UNITS else key: key for key in parameters}
+    required = tuple(
+        x for x, key in keys.items() if parameters[key].default is inspect.Parameter.empty
+    )
+    check_keys(where, table, ("kind", *keys, *others), required)
+    arguments = {key: table[x] for x, key in keys.items() if x in table}
+    for several in {"bodies", "fixed"} & set(arguments):
+        within = f"{where.removesuffix(']')}.{several}]"
+        if not isinstance(arguments[several], list):
+            raise ValueError(f"[{within}] must be tables, each headed by [{within}].")
+        arguments[several] = [body_of(within, part) for part in arguments[several]]
+    return BODIES[name](**arguments)
+
+
+def import_laws(module: str, folder: Path) -> None:
+    """Import a module that registers laws: a file (.py, relative to the folder), or by its name."""
+    if not module.endswith(".py"):
+        importlib.import_module(module)
+        return
+    path = (folder / module).resolve()
+    if not path.is_file():
+        raise ValueError(
+            f"`module` must be a file or an importable module, but '{path}' does not exist."
+        )
+    imported = sys.modules.get(path.stem)
+    if imported is not None:
+        if Path(getattr(imported, "__file__", None) or "").resolve() == path:
+            return
+        raise ValueError(f"`module` must have a new name, but another '{path.stem}' is imported.")
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None
+    assert spec.loader is not None
+    loaded = importlib.util.module_from_spec(spec)
+    sys.modules[path.stem] = loaded  # before it runs: classes are looked up there by name
+    try:
+        spec.loader.exec_module(loaded)
+    except BaseException:
+        del sys.modules[path.stem]
+        raise
