@@ -9,6 +9,7 @@ import numpy as np
 from scipy.special import chdtrc
 
 from jimpact.compiling import quick_jit
+from jimpact.fits.observables import Shots
 from jimpact.fits.solve import (
     COARSE,
     RANK_TOLERANCE,
@@ -38,13 +39,19 @@ START_RESTITUTION = 0.5
 SAME_COST, SAME_ERRORS, SAME_VALUE = 1e-2, 0.2, 1e-3
 STARTS, ROUNDS = 12, 8  # by default, and how often others around the best follow
 # What chi^2 rejects at this level is searched for again, so often at most.
-REJECTED, TURNS = 0.1, 4
+REJECTED, TURNS = 0.01, 4
 IDLE_PARAMETERS = 4  # a round without a gain is the last one, or the second of more parameters
-# A search of its own choice starts at the lowest of so many points: values alone cost a tenth of
-# derivatives. Ten times more take longer than all that descends from them.
-SCANNED = 128
+# A search of its own choice starts at the lowest of so many points for P parameters, and around the
+# best at the lowest of the least number: values alone cost a tenth of derivatives. A box of P
+# dimensions with a side minimum in most of its corners needs 2^P; ten times more points take
+# longer than all that descends from them.
+SCANNED, MOST_SCANNED, SCANNED_A_CORNER = 128, 1024, 16
 SCAN_LANES = 8  # of them side by side
 SCAN_RTOL = 1e-4  # of these values, which need only be told apart; finer ones take twice as long
+# Steps a coordinate of an impact in these values, three times what most take. Shots that need more
+# count as failed: they hardly belong to a low point, and all beside them would wait up to a hundred
+# times as long. With ten times as many, scans take most of a fit again.
+SCAN_STEPS = 40
 # Several ratios often reproduce the same shots: one or two are scanned up to this factor.
 SCAN_FACTOR, SCANS = 100.0, 2
 # Starts around the best, in standard errors: nearer ones end in it, farther ones anywhere.
@@ -265,7 +272,10 @@ def start_points(problem: "FitProblem", starts: int, rng: np.random.Generator) -
 def _first_points(problem: "FitProblem", count: int, rng: np.random.Generator) -> np.ndarray:
     """The law's own y, the lowest of many points, and those of each ratio where few are free."""
     ratios = np.flatnonzero(problem.parameters.log)
-    points = start_points(problem, SCANNED, rng)
+    corners = 2 ** len(problem.parameters.log)
+    points = start_points(
+        problem, min(max(SCANNED, SCANNED_A_CORNER * corners), MOST_SCANNED), rng
+    )
     chosen = [points[:1], _lowest(problem, points[1:], count - 1)]
     for i in ratios if len(ratios) <= SCANS else ():
         line = np.tile(points[0], (SCANNED // 2, 1))
@@ -279,6 +289,9 @@ def _lowest(problem: "FitProblem", points: np.ndarray, count: int) -> np.ndarray
     law, parameters = problem.law, len(problem.names)
     if getattr(law, "rtol", SCAN_RTOL) is None:
         law = replace(law, rtol=SCAN_RTOL)  # type: ignore[call-arg]
+    if isinstance(problem.observe, Shots) and hasattr(law, "max_steps"):
+        steps = min(SCAN_STEPS * problem.observe.bodies, law.max_steps)
+        law = replace(law, max_steps=steps)  # type: ignore[call-arg]
     squares, many = np.empty(len(points)), stacked([replace(problem, law=law)], len(points))
     every = np.arange(len(points))
     for rows, some in in_lanes(_squares, every, SCAN_LANES, many, points):
