@@ -136,7 +136,7 @@ def main():
     exact = np.asarray(ours(1e-12)[0](on_device))
     made = {rtol: ours(rtol) for rtol in (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9)}
     print(f"{os.cpu_count()} cores, batch {BATCH}, load {os.getloadavg()[0]:.1f}")
-    print("measure  target               setting    error us/impact  ratio  first s")
+    print("measure  target               setting    error µs/impact  ratio  first s")
     for measure, target in (("rms", 1e-5), ("rms", 1e-7), ("max", 1e-5), ("max", 1e-7)):
         rtol, e_ours = tuned(lambda r: made[r][0](on_device), exact, made, target, measure)
         steps = [0.2 / 2 ** (p / 2) for p in range(30)]

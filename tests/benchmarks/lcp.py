@@ -73,7 +73,7 @@ def main():
         "qpax": qpax_solver(),
     }
     print(
-        f"{'m':>2} {'solver':24} {'us':>8} {'ratio':>7} {'compile s':>9} {'max |w-|, |z-|':>15} jvp us"
+        f"{'m':>2} {'solver':24} {'µs':>8} {'ratio':>7} {'compile s':>9} {'max |w-|, |z-|':>15} jvp µs"
     )
     for m in (2, 3, 5, 8):
         w, q = problems(m)

@@ -1,7 +1,7 @@
 """What motions cost, an event: `python tests/benchmarks/motions.py`.
 
 A bouncing ball and a rocking block, one and a batch, and the gradient of one. Medians of
-alternating repeats, compilation apart. Aims in a batch: the ball 26 us, the block 100 us.
+alternating repeats, compilation apart. Aims in a batch: the ball 26 µs, the block 100 µs.
 """
 
 from harness import alternating, arguments, columns, show, write_csv
@@ -59,7 +59,7 @@ def main():
     for row in rows:
         if row["what"] == "batch":
             print(
-                f"aim: {row['motion']}, batch: {row['cpu_us']:.0f} us, {AIMS[row['motion']]:.0f} aimed at"
+                f"aim: {row['motion']}, batch: {row['cpu_us']:.0f} µs, {AIMS[row['motion']]:.0f} aimed at"
             )
     write_csv(options.out / "motions.csv", rows)
 

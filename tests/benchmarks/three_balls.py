@@ -4,7 +4,7 @@ A batch of LZB impacts (masses 1, v- = (1, 0, 0), e = 0.9, k2 / k1 log-uniform i
 jimpact as it is used, `jit(vmap(impact))`, beside hand-written C++, diffrax, numba and Siconos.
 Each method runs at its loosest setting whose largest error of v+ over the batch, against a run at
 rtol 1e-13, reaches the target. Alternating repeats, medians with quartiles, compile time apart.
-`cpu us` is processor time of all threads: C++, numba and XLA's loops each use one core here.
+`cpu_us` [µs] is processor time of all threads: C++, numba and XLA's loops each use one core here.
 """
 
 import os

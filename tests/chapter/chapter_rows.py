@@ -112,7 +112,7 @@ SECTIONS = {
             slow=True,
             allowed=2e-4,
         ),
-        Row("6.1.1", "how long one bead presses [us]",
+        Row("6.1.1", "how long one bead presses [µs]",
             "ji.history(ji.LZB(0.92, [9.858e9]), ji.chain([2.05e-3], wall='right'),"
             " [(2 * 9.80665 * 3.1e-3) ** 0.5]).duration * 1e6",
             "less than 32", 1e6 * PRESSES, "34.6 for N = 1, 225.5 for 8, 316 for 12 at 5.1 mm",
