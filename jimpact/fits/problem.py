@@ -61,8 +61,8 @@ PENALTY = 1e3  # times the largest measured value
 # Programs of up to so many shots (or values in a row) are shared by all numbers of starts.
 FEW = 64
 # Problems that a program solves side by side: starts of one, and many problems. With ten times
-# more of them, all wait for the one whose impacts take longest.
-LANES, LANES_OF_MANY = 2, 64
+# more of them, all wait for the one whose impacts take longest; an accelerator needs them to be busy.
+LANES, LANES_OF_MANY, LANES_ON_ACCELERATOR = 2, 64, 1024
 
 
 _ARRAYS = (
@@ -492,7 +492,8 @@ class FitProblem:
         """
         listed = isinstance(self.observe, Shots) or self.measured.ndim == 2
         if listed and self.measured.shape[1] <= FEW:
-            return LANES if count <= LANES_OF_MANY else LANES_OF_MANY
+            many = LANES_OF_MANY if jax.default_backend() == "cpu" else LANES_ON_ACCELERATOR
+            return LANES if count <= LANES_OF_MANY else many
         return LANES if count > 1 else 1
 
     def _shifted(self, shift: jax.Array) -> "FitProblem":

@@ -39,7 +39,7 @@ START_RESTITUTION = 0.5
 SAME_COST, SAME_ERRORS, SAME_VALUE = 1e-2, 0.2, 1e-3
 STARTS, ROUNDS = 12, 8  # by default, and how often others around the best follow
 # What chi^2 rejects at this level is searched for again, so often at most.
-REJECTED, TURNS = 0.01, 4
+REJECTED, TURNS = 0.1, 4
 IDLE_PARAMETERS = 4  # a round without a gain is the last one, or the second of more parameters
 # A search of its own choice starts at the lowest of so many points for P parameters, and around the
 # best at the lowest of the least number: values alone cost a tenth of derivatives. A box of P
@@ -186,15 +186,15 @@ def find_minima(problem: "FitProblem", starts: int | None, seed: int, solver: So
     if starts == 1:
         points = start_points(problem, 1, rng)
         return solution(problem, minimize(stacked([problem]), points, solver, what="starts"))
-    ends = _rough_ends(problem, starts, rng, solver)
+    ends, idle = _rough_ends(problem, starts, rng, solver), 0
     for _ in range(1, turns):
         least = np.nanmin(ends.squares)
         freedom = problem.values - len(problem.names)
         if problem.sigma is None or freedom < 1 or chdtrc(freedom, least) > REJECTED:
             break
         more = _rough_ends(problem, starts, rng, solver)
-        ends = _both(ends, more)
-        if not _gains(more, least):
+        ends, idle = _both(ends, more), 0 if _gains(more, least) else idle + 1
+        if idle * IDLE_PARAMETERS >= len(problem.names):
             break
     best = _groups(problem, ends)[0][:1]
     fine = minimize(stacked([problem]), ends.y[best], solver, what="minima")

@@ -198,7 +198,7 @@ def fits(largest: int) -> Iterator[dict[str, Any]]:
     pre[:, 2] = -rng.uniform(0.0, 1.0, 12)
     exact = jax.vmap(lambda v: ji.impact(ji.LZB(0.9, [1.0, 3.0], 1.5), scene, v).velocity)(pre)
     start = ji.LZB(0.8, [1.0, 1.0], 1.5)
-    for sets in sizes(largest // 16, 64, 1024):
+    for sets in sizes(largest // 16, 64, 1024, 8192):
         post = np.asarray(exact) + 0.01 * rng.normal(size=(sets, 12, 3))
         data = [ji.Experiments(pre, each, sigma=0.01) for each in post]
 
