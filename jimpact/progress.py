@@ -1,6 +1,7 @@
 """Progress of long work on stderr: a bar on a terminal, elsewhere a line now and then."""
 
 import contextlib
+import re
 import shutil
 import sys
 import textwrap
@@ -153,11 +154,17 @@ class Steps:
 
 
 def wrapped(text: str) -> str:
-    """The text with its sentences wrapped to the terminal's width; tables are left unchanged."""
+    """The text with its sentences wrapped to the terminal's width; tables are left unchanged.
+
+    A sentence may stand behind a word or two and spaces: it stays in its column.
+    """
     width = shutil.get_terminal_size((len(text), 0)).columns
-    return "\n".join(
-        textwrap.fill(line, width, subsequent_indent=" " * (len(line) - len(line.lstrip(" -"))))
-        if len(line) > width and "  " not in line.strip()
-        else line
-        for line in text.splitlines()
-    )
+    lines = []
+    for line in text.splitlines():
+        indent = re.match(r" *(- )?", line)[0]  # type: ignore[index]
+        head = re.match(r"\S+(?: \S+)?  +", line)
+        start = indent if head is None else head[0]
+        if len(line) > width and "  " not in line[len(start) :]:
+            line = textwrap.fill(line, width, subsequent_indent=" " * len(start))
+        lines.append(line)
+    return "\n".join(lines)

@@ -273,9 +273,7 @@ def _first_points(problem: "FitProblem", count: int, rng: np.random.Generator) -
     """The law's own y, the lowest of many points, and those of each ratio where few are free."""
     ratios = np.flatnonzero(problem.parameters.log)
     corners = 2 ** len(problem.parameters.log)
-    points = start_points(
-        problem, min(max(SCANNED, SCANNED_A_CORNER * corners), MOST_SCANNED), rng
-    )
+    points = start_points(problem, min(max(SCANNED, SCANNED_A_CORNER * corners), MOST_SCANNED), rng)
     chosen = [points[:1], _lowest(problem, points[1:], count - 1)]
     for i in ratios if len(ratios) <= SCANS else ():
         line = np.tile(points[0], (SCANNED // 2, 1))

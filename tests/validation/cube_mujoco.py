@@ -30,7 +30,7 @@ HIGH = np.array([0.05, 3.0, 2.0, 0.9999, 0.9999, 0.02, 0.1])
 def scene() -> Any:
     """The cube above a plane; its frame is that of the inertia, at the centre of mass."""
     spheres = [
-        f'<geom type="sphere" size="{ROUNDING}" pos="{x} {y} {z}"/>' for x, y, z in cube().points
+        f'<geom type="sphere" size="{ROUNDING}" pos="{x} {y} {z}"/>' for x, y, z in cube().points[0]
     ]
     inertia = " ".join(map(str, BOX[2]))
     text = SCENE.format(mass=BOX[1], inertia=inertia, corners="".join(spheres))
