@@ -61,7 +61,7 @@ PENALTY = 1e3  # times the largest measured value
 # Programs of up to so many shots (or values in a row) are shared by all numbers of starts.
 FEW = 64
 # Problems that a program solves side by side: starts of one, and many problems. With ten times
-# more of them, all wait for the one whose impacts take longest; an accelerator needs them to be busy.
+# more of them, all wait for the one whose impacts take longest; an accelerator has idle cores.
 LANES, LANES_OF_MANY, LANES_ON_ACCELERATOR = 2, 64, 1024
 
 

@@ -54,6 +54,11 @@ _LABELS = {
     "balls": "balls N",
     "friction": "friction μ",
 }
+_CLASS_LABELS = {  # where the name of a class does not say why
+    "flagged": "flagged by its status, or refused",
+    "unchecked": "unchecked: no reference",
+    "wrong": "wrong, unnoticed",
+}
 _TICKS = 5  # labelled values along an axis, at most
 _STYLES = {"moreau": "--", "binary": ":"}
 _FLOOR = 1e-9  # smaller errors are drawn here
@@ -297,7 +302,8 @@ def _legend_of_classes(figure: Figure, result: StabilityMap) -> None:
     """The classes that occur."""
     codes = [each.codes.ravel() for name in result.methods for each in result.slices[name]]
     occurring = np.unique(np.concatenate(codes)).tolist()
-    legend_below(figure, 4, [Patch(color=CLASS_COLOURS[i], label=CLASSES[i]) for i in occurring])
+    rows = [(CLASS_COLOURS[i], _CLASS_LABELS.get(CLASSES[i], CLASSES[i])) for i in occurring]
+    legend_below(figure, 4, [Patch(color=colour, label=label) for colour, label in rows])
 
 
 @styled(ValidityMap)
