@@ -278,7 +278,7 @@ class Ends(NamedTuple):
     jacobian: np.ndarray  # (S, R, Q)
     predicted: np.ndarray
     status: np.ndarray
-    slopes: np.ndarray | None  # `dv+/dv-` of the shots, where errors of v- are passed on
+    slopes: Any  # `dv+/dv-` of the shots, where errors of v- are passed on, else None
     converged: np.ndarray  # (S,) whether so close to a minimum that it stands
     stuck: np.ndarray  # (S,) no step lowers the sum of squares, although derivatives promise it
     steps: np.ndarray
@@ -339,6 +339,13 @@ def minimize(
         steps=np.asarray(steps),
         exact=EXACT[dtype] * size**2,
     )
+
+
+def outcome_at(problem: "FitProblem", x: Any) -> Ends:
+    """Residual, derivatives and predictions at x (P,), by the program that searches."""
+    point = problem.point(np.asarray(x))[None]
+    once, every = Solver(max_steps=1), np.ones(point.shape, bool)
+    return minimize(stacked([problem]), point, once, fixed=every)
 
 
 def in_lanes(

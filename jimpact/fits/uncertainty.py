@@ -24,7 +24,7 @@ from jimpact.fits.parameters import (
 from jimpact.fits.problem import FitProblem
 from jimpact.fits.report import as_record, pieces_in_words, report, save_fit, verdict
 from jimpact.fits.search import FitMinimum, solution
-from jimpact.fits.solve import RANK_TOLERANCE, Solver, minimize, stacked
+from jimpact.fits.solve import RANK_TOLERANCE, outcome_at
 from jimpact.law import parameters_of
 from jimpact.scene import Scene
 
@@ -419,8 +419,7 @@ class Fit(Tabular, Generic[AnyLaw]):
             )
         check_values("shots", data)
         data = Experiments(data, np.zeros_like(np.asarray(data, float)), scenes=scenes, units=units)
-        law = self.problem.law_in_scene(self.value)
-        if isinstance(law, LawInScene) and scene is not None:
+        if isinstance(self.problem.law, LawInScene) and scene is not None:
             raise ValueError(
                 "Argument `scene` must be left out where parts of the scene were fitted: they hold "
                 "for that of the fit only."
@@ -428,13 +427,10 @@ class Fit(Tabular, Generic[AnyLaw]):
         own = self.problem.scene if scene is None else scene
         largest = own if scenes is None else max(scenes, key=lambda each: each.contacts)
         self._check_scene(largest, len(units))
-        ties = dict(self.problem.ties)
-        problem = FitProblem.from_shots(law, own, data, self.problem.parameters.labels, ties=ties)
-        point, every = problem.point(problem.start)[None], np.ones((1, len(problem.low)), bool)
-        ends = minimize(stacked([problem]), point, Solver(max_steps=1), fixed=every)
-        there = solution(problem, ends)
+        problem = self.problem.of_other(data, own)
+        there = solution(problem, outcome_at(problem, self.value))
         slope = problem.of_data(there.jacobian)
-        error = self.errors_of(problem.errors_of(slope / problem.steps_at(problem.start)))
+        error = self.errors_of(problem.errors_of(slope / problem.steps_at(self.value)))
         value, noise = there.predicted, self._noise_of(shots)
         half = quantile * np.hypot(error, noise)
         return Predicted(value, error, np.asarray(there.status), noise, value - half, value + half)

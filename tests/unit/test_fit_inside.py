@@ -73,6 +73,7 @@ def test_a_mass_with_a_prior_is_fitted_with_the_law():
     np.testing.assert_allclose(found.chi_squared, 2 * best.cost, rtol=1e-8)
     np.testing.assert_allclose(found.scene.mass, [1.0, found.value[1]])
     assert type(found.law) is type(found.problem.to_law(found.value)) is ji.Newton
+    np.testing.assert_allclose(found.predict(SHOTS).velocity, found.predicted, atol=1e-12)
     with pytest.raises(ValueError, match="`scene` must be left out"):
         found.predict(SHOTS, BALLS)
 
