@@ -224,7 +224,7 @@ def matrix_region(problem: "FitProblem", scenes: list[Scene]) -> AdmissibleMatri
     law, owner = problem.law, problem.owner
     if not encloses(law, scenes[0].contacts):
         return None
-    if any(name.split("[")[0] == "matrix" for name, _ in problem.ties):
+    if any(tie.field == "matrix" for tie in problem.ties):
         raise ValueError("Argument `ties` must not tie a `matrix` that has to stay admissible.")
     moves = np.where(owner[:, None] == np.arange(len(owner)), problem.scale, 0.0)
     origin, start = np.where(owner < 0, problem.fixed, 0.0), problem.point(problem.start)

@@ -13,14 +13,7 @@ from scipy.special import ndtri, stdtrit
 from jimpact._checks import check_choice, check_kind, check_values
 from jimpact.files.records import Column, Table, Tabular
 from jimpact.fits.data import Experiments
-from jimpact.fits.parameters import (
-    AnyLaw,
-    LawInScene,
-    entry_of,
-    tied_names,
-    tied_places,
-    value_of,
-)
+from jimpact.fits.parameters import AnyLaw, LawInScene, tied_names, tied_value
 from jimpact.fits.problem import FitProblem
 from jimpact.fits.report import as_record, pieces_in_words, report, save_fit, verdict
 from jimpact.fits.search import FitMinimum, solution
@@ -360,9 +353,7 @@ class Fit(Tabular, Generic[AnyLaw]):
         def values(x: jax.Array) -> jax.Array:
             """The tied entries of parameters x."""
             law = problem.law_in_scene(x)
-            parts = [jnp.ravel(value_of(law, entry_of(name)[0])) for name, _ in ties]
-            places = tied_places(law, ties).values()
-            return jnp.concatenate([part[np.array(at)] for part, at in zip(parts, places)])
+            return jnp.concatenate([tied_value(law, tie) for tie in ties])
 
         x = jnp.asarray(self.value, problem.precision)
         errors = self.errors_of(np.asarray(jax.jacfwd(values)(x), float))
