@@ -1,6 +1,6 @@
-"""What is wrong with measured shots: rows of a test and the sentence that the report has for it."""
+"""What is wrong with measured shots: tests, each with the sentence that the report has for it."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -37,21 +37,9 @@ class Finding(NamedTuple):
     reservation: str = ""
 
 
-class Check(NamedTuple):
-    """A row: its test yields the numbers of each finding, for the sentences to format."""
-
-    test: Callable[[Any], Iterable[dict[str, Any]]]
-    sentence: str
-    reservation: str = ""
-
-
-def findings(rows: Sequence[Check], judged: Any) -> list[Finding]:
-    """What the tests of these rows find, in words."""
-    return [
-        Finding(row.sentence.format(**each), row.reservation.format(**each))
-        for row in rows
-        for each in row.test(judged)
-    ]
+def findings(checks: Sequence[Callable[[Any], Iterator[Finding]]], judged: Any) -> list[Finding]:
+    """What these checks find, one after the other."""
+    return [found for check in checks for found in check(judged)]
 
 
 def share(count: int, total: int) -> str:
@@ -120,17 +108,16 @@ class DataBalances:
         ratio = t_plus / t_minus if t_minus > 0 else np.nan
         self.energies.append(_Defect(k, gain, t_minus, t_minus, slope, sigma, ratio))
 
-    def listed(self, ratios: dict[int, float]) -> dict[str, Any]:
+    def listed(self, ratios: dict[int, float]) -> str:
         """Shots with their ratios, or the range of the ratios of many."""
-        shots = self.experiments.shots
-        text = ", ".join(f"shot {shots[k]}: {r:.4f}" for k, r in ratios.items())
-        if len(ratios) > LISTED:
-            values = list(ratios.values())
-            text = f"{len(values)} of {self.total} shots, {min(values):.4f} to {max(values):.4f}"
-        return {"shots": text, "share": share(len(ratios), self.total)}
+        if len(ratios) <= LISTED:
+            shots = self.experiments.shots
+            return ", ".join(f"shot {shots[k]}: {r:.4f}" for k, r in ratios.items())
+        values = ratios.values()
+        return f"{len(ratios)} of {self.total} shots, {min(values):.4f} to {max(values):.4f}"
 
 
-def _units(data: DataBalances) -> Iterable[dict[str, Any]]:
+def _units(data: DataBalances) -> Iterator[Finding]:
     """Whether velocities after are those before but for a factor that a wrong unit leaves.
 
     By the momentum that is conserved; where none is, by the energy where it grows.
@@ -144,11 +131,15 @@ def _units(data: DataBalances) -> Iterable[dict[str, Any]]:
     for factor, unit in UNIT_FACTORS.items():
         near = (factor, 1 / factor) if what == "momentum" else (factor,)
         if any(abs(ratio / value - 1) < UNIT_NEAR for value in near):
-            yield {"what": what, "ratio": ratio, "unit": unit}
+            yield Finding(
+                f"Units? The {what} after is {ratio:.3g} times that before: {unit} in one of the "
+                "columns?",
+                "the units are suspect",
+            )
             return
 
 
-def _momentum(data: DataBalances) -> Iterable[dict[str, Any]]:
+def _momentum(data: DataBalances) -> Iterator[Finding]:
     """Shots that break a momentum beyond their noise, and the rms that this alone leaves."""
     level = DEFECT_LEVEL / max(len(data.momenta), 1)
     ratios = {k: r for each in data.momenta.values() for k, r in _beyond(each, level).items()}
@@ -159,25 +150,34 @@ def _momentum(data: DataBalances) -> Iterable[dict[str, Any]]:
         corrected = experiments.momentum_corrected(data.scene)
         change = np.asarray(experiments.post) - np.asarray(corrected.post)
         floor = f" (rms {np.sqrt(np.nanmean(change**2)):.3g} m/s)"
-    yield data.listed(ratios) | {"floor": floor}
+    yield Finding(
+        f"The data violate conservation of momentum (1 = conserved): {data.listed(ratios)}; no law "
+        f"can reproduce that part{floor}.",
+        f"the data violate conservation of momentum in {share(len(ratios), data.total)}",
+    )
 
 
-def _energy(data: DataBalances) -> Iterable[dict[str, Any]]:
+def _energy(data: DataBalances) -> Iterator[Finding]:
     """Shots that gain energy beyond their noise."""
-    ratios = _beyond(data.energies, DEFECT_LEVEL, gains=True)
-    return [data.listed(ratios)] if ratios else []
+    if ratios := _beyond(data.energies, DEFECT_LEVEL, gains=True):
+        yield Finding(
+            f"The data gain energy (1 = conserved): {data.listed(ratios)}.",
+            f"kinetic energy grows in {share(len(ratios), data.total)}",
+        )
 
 
-def _resting(data: DataBalances) -> Iterable[dict[str, Any]]:
+def _resting(data: DataBalances) -> Iterator[Finding]:
     """Shots in which no contact approaches."""
-    count = len(data.resting)
-    if count:
+    if count := len(data.resting):
         labels = listed([data.experiments.shots[k] for k in data.resting])
-        which = share(count, data.total)
-        yield {"count": count, "total": data.total, "labels": labels, "share": which}
+        yield Finding(
+            f"No contact approaches in {count} of {data.total} shots ({labels}): are pre and post "
+            "swapped, or is a sign wrong?",
+            f"no contact approaches in {share(count, data.total)}",
+        )
 
 
-def _copies(data: DataBalances) -> Iterable[dict[str, Any]]:
+def _copies(data: DataBalances) -> Iterator[Finding]:
     """Whether most shots of a scene are one, several times or scaled, with no sigma."""
     experiments = data.experiments
     if experiments.scenes is not None or experiments.sigma is not None:
@@ -189,43 +189,16 @@ def _copies(data: DataBalances) -> Iterable[dict[str, Any]]:
     same = np.isclose(unit, np.median(unit, axis=0), rtol=0, atol=ROUNDING).all(axis=1)
     count, total = int(same.sum()), data.total
     if 2 * count > total > 1:
-        which, some = f"All {total}", "the"
-        if count < total:
-            which, some = f"{count} of {total}", f"{count} of"
-        yield {"which": which, "some": some, "total": total}
+        every = count == total
+        yield Finding(
+            f"{f'All {total}' if every else f'{count} of {total}'} shots are equal to the last "
+            "digit, but for a factor: they carry no more information than one of them, and none "
+            "on the noise; without `sigma` or `resolution` the errors are meaningless.",
+            f"{'the' if every else f'{count} of'} {total} shots are copies of one",
+        )
 
 
-DATA_ROWS = (
-    Check(
-        _units,
-        "Units? The {what} after is {ratio:.3g} times that before: {unit} in one of the columns?",
-        "the units are suspect",
-    ),
-    Check(
-        _momentum,
-        "The data violate conservation of momentum (1 = conserved): {shots}; no law can reproduce "
-        "that part{floor}.",
-        "the data violate conservation of momentum in {share}",
-    ),
-    Check(
-        _energy,
-        "The data gain energy (1 = conserved): {shots}.",
-        "kinetic energy grows in {share}",
-    ),
-    Check(
-        _resting,
-        "No contact approaches in {count} of {total} shots ({labels}): are pre and post swapped, "
-        "or is a sign wrong?",
-        "no contact approaches in {share}",
-    ),
-    Check(
-        _copies,
-        "{which} shots are equal to the last digit, but for a factor: they carry no more "
-        "information than one of them, and none on the noise; without `sigma` or `resolution` the "
-        "errors are meaningless.",
-        "{some} {total} shots are copies of one",
-    ),
-)
+DATA_CHECKS = (_units, _momentum, _energy, _resting, _copies)
 
 
 def data_defects(
@@ -250,7 +223,7 @@ def data_defects(
     'The data gain energy (1 = conserved): shot 1: 1.4400.'
     """
     data = DataBalances(experiments, scene, stored_energy)
-    return [found.line for found in findings(DATA_ROWS, data)]
+    return [found.line for found in findings(DATA_CHECKS, data)]
 
 
 def _beyond(defects: list[_Defect], level: float, gains: bool = False) -> dict[int, float]:

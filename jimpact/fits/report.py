@@ -36,6 +36,13 @@ UNSEEN = "start value; not determined by the data"  # note on a value in bracket
 FORMAT = 1  # of the file; it changes where older files could not be read any more
 _PACKAGES = ("jax", "jaxlib", "equinox", "numpy", "scipy")
 _REBUILT = "problem"  # the field of a fit that is made again from its parts
+_KINDS: dict[str, Any] = {  # of values in the file that are not arrays, mappings or classes
+    "static": StaticNumber,
+    "statics": StaticNumbers,
+    "number": float,
+    "tuple": tuple,
+    "list": list,
+}
 
 
 def joined_words(parts: Sequence[str]) -> str:
@@ -52,21 +59,18 @@ def _values_in_words(fit: "Fit") -> str:
     """Values with their errors, what they assume, and what the data do not determine."""
     seen, data = fit.determined, _data_name(fit)
     determined = np.flatnonzero(seen)
-    others = [_full_name(fit, int(i)) for i in np.flatnonzero(~seen)]
+    others = " and ".join(_full_name(fit, int(i)) for i in np.flatnonzero(~seen))
     parts = [_with_error(fit, int(i)) for i in determined]
-    if len(determined) > _PARAMETERS_NAMED:
-        worst = determined[int(np.argmax(np.nan_to_num(fit.standard_error[determined])))]
-        least_certain = _with_error(fit, int(worst))
-        parts = [f"{len(determined)} parameters are fitted, the least certain {least_certain}"]
-    assumed = _assumptions(fit) + [
-        f"the {prior} of {name}"
-        for i, name in enumerate(fit.names)
-        if (prior := _prior(fit, i)) and not fit.from_prior[i]
-    ]
+    if len(parts) > _PARAMETERS_NAMED:
+        worst = int(np.argmax(np.nan_to_num(fit.standard_error[determined])))
+        parts = [f"{len(parts)} parameters are fitted, the least certain {parts[worst]}"]
+    priors = {name: _prior(fit, i) for i, name in enumerate(fit.names) if not fit.from_prior[i]}
+    assumed = _assumptions(fit)
+    assumed += [f"the {prior} of {name}" for name, prior in priors.items() if prior]
     if parts and assumed:
         parts[-1] += f", assuming {joined_words(assumed)}"
     if others:
-        parts.append(f"{' and '.join(others)} cannot be determined from {data}")
+        parts.append(f"{others} cannot be determined from {data}")
     if any("different minima fit equally well" in line for line in fit.warnings):
         parts.append("other values fit equally well")
     return "; ".join(parts)
@@ -275,21 +279,19 @@ def _section(title: str, lines: tuple[str, ...]) -> list[str]:
 
 def _minima(fit: "Fit") -> list[str]:
     """Where the starts ended."""
-    total, lost = fit.start_count, fit.lost_starts
-    unfinished = f"{lost} of {total} starts were given up." if lost else ""
-    if len(fit.starts) == 1:
-        one = f"{total - lost} of {total} starts ended in this minimum. {unfinished}"
-        return [one.rstrip()] if total > 1 else []
-    where = f"{len(fit.starts)} minima"
-    if fit.rank < len(fit.names):
-        where = f"{len(fit.starts)} points of one valley"
+    total, lost, count = fit.start_count, fit.lost_starts, len(fit.starts)
+    unfinished = [f"{lost} of {total} starts were given up."] if lost else []
+    if count == 1:
+        ended = f"{total - lost} of {total} starts ended in this minimum."
+        return [" ".join([ended, *unfinished])] if total > 1 else []
+    where = f"{count} minima" if fit.rank == len(fit.names) else f"{count} points of one valley"
     lines = [f"{total} starts ended in {where}:  sum of squares, number of starts, values"]
     for minimum in fit.starts[:_MINIMA_SHOWN]:
         values = named_values(fit, minimum.value)
         lines.append(f"  {minimum.sum_of_squares:12.5g} {minimum.count:4d}   {values}")
-    if len(fit.starts) > _MINIMA_SHOWN:
-        lines.append(f"  ... and {len(fit.starts) - _MINIMA_SHOWN} more")
-    return [*lines, unfinished] if unfinished else lines
+    if count > _MINIMA_SHOWN:
+        lines.append(f"  ... and {count - _MINIMA_SHOWN} more")
+    return lines + unfinished
 
 
 def _without_rounding(values: np.ndarray) -> np.ndarray:
@@ -388,13 +390,11 @@ def as_record(fit: "Fit") -> dict[str, Any]:
         }
         for i, (name, ends) in enumerate(zip(fit.names, fit.confidence_interval()))
     ]
+    of_minimum = ("sum_of_squares", "value", "count")
     record = {
         "law": type(fit.law).__name__,
         "parameters": parameters,
-        "starts": [
-            {"sum_of_squares": s.sum_of_squares, "value": s.value, "count": s.count}
-            for s in fit.starts
-        ],
+        "starts": [{name: getattr(each, name) for name in of_minimum} for each in fit.starts],
         "shots": [] if fit.experiments is None else fit.experiments.shots,
         "status": [STATUS[code].name for code in fit.status],
     }
@@ -457,7 +457,28 @@ def load_fit(path: str | Path) -> "Fit":
     """
     from jimpact.fits.uncertainty import Fit  # which imports this module
 
-    return Fit(**_read_fit(Path(path)))
+    path = Path(path)
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path}: the file must be a saved fit (JSON), but {error}.") from None
+    if not isinstance(record, dict) or "format" not in record:
+        raise ValueError(f"{path}: the file must be a saved fit, but has no `format`.")
+    writer = record.get("versions", {}).get("jimpact", "an unknown version")
+    if record["format"] != FORMAT:
+        raise ValueError(
+            f"{path}: the file must be a fit saved in format {FORMAT}, but has format "
+            f"{record['format']} (written by jimpact {writer}; this is {jimpact.__version__})."
+        )
+    try:
+        result = {name: _decoded(value) for name, value in record["result"].items()}
+        result[_REBUILT] = _problem(record["problem"], result["value"])
+        return Fit(**result)
+    except (KeyError, AttributeError, ImportError, TypeError) as error:
+        raise ValueError(
+            f"{path}: the fit, saved by jimpact {writer}, cannot be read: {error!r}. A law of your "
+            "own must be imported before."
+        ) from error
 
 
 def versions() -> dict[str, str]:
@@ -469,31 +490,6 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:  # installed in a way that leaves no record
             continue
     return found | {"Python": f"{platform.python_version()}, {platform.system()}"}
-
-
-def _read_fit(path: Path) -> dict[str, Any]:
-    """The fields of a fit that `write_fit` has written."""
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path}: the file must be a saved fit (JSON), but {error}.") from None
-    if not isinstance(record, dict) or "format" not in record:
-        raise ValueError(f"{path}: the file must be a saved fit, but has no `format`.")
-    if record["format"] != FORMAT:
-        writer = record.get("versions", {}).get("jimpact", "an unknown version")
-        raise ValueError(
-            f"{path}: the file must be a fit saved in format {FORMAT}, but has format "
-            f"{record['format']} (written by jimpact {writer}; this is {jimpact.__version__})."
-        )
-    try:
-        result = {name: _decoded(value) for name, value in record["result"].items()}
-        return result | {_REBUILT: _problem(record["problem"], result["value"])}
-    except (KeyError, AttributeError, ImportError, TypeError) as error:
-        writer = record.get("versions", {}).get("jimpact")
-        raise ValueError(
-            f"{path}: the fit, saved by jimpact {writer}, cannot be read: {error!r}. A law of your "
-            "own must be imported before."
-        ) from error
 
 
 def _problem(parts: dict[str, Any], value: np.ndarray) -> FitProblem:
@@ -539,19 +535,15 @@ def _decoded(data: Any) -> Any:
     """What `_encoded` has encoded."""
     if not isinstance(data, dict):
         return data
-    if "array" in data:
-        array = np.array([_decoded(x) for x in data["array"]], data["dtype"])
-        array = array.reshape(data["shape"])
-        return jnp.asarray(array) if data["device"] else array
     if "class" in data:
         return _instance(data["class"], data["fields"])
-    (kind, content) = next(iter(data.items()))
-    if kind in ("static", "statics", "number"):
-        makers: dict[str, Any] = {"static": StaticNumber, "statics": StaticNumbers, "number": float}
-        return makers[kind](content)
+    if "array" in data:
+        array = np.array([_decoded(x) for x in data["array"]], data["dtype"]).reshape(data["shape"])
+        return jnp.asarray(array) if data["device"] else array
+    ((kind, content),) = data.items()
     if kind == "dict":
         return {key: _decoded(each) for key, each in content.items()}
-    return {"tuple": tuple, "list": list}[kind](_decoded(each) for each in content)
+    return _KINDS[kind](map(_decoded, content) if isinstance(content, list) else content)
 
 
 def _instance(place: str, fields: dict[str, Any]) -> Any:
