@@ -98,14 +98,12 @@ class LawFits(Tabular):
     def verdict(self) -> str:
         """Which law, in one sentence."""
         best = self.best
+        which = f"No law fits; the nearest is {best.name} ({best.verdict})"
         if best.adequate:
-            return f"The simplest law that fits is {best.name}: {best.fit.verdict}"
-        if best.tier == "lack of fit":
-            return (
-                f"No law fits; the simplest that predicts as well as any is {best.name}: "
-                f"{best.fit.verdict}"
-            )
-        return f"No law fits; the nearest is {best.name} ({best.verdict}): {best.fit.verdict}"
+            which = f"The simplest law that fits is {best.name}"
+        elif best.tier == "lack of fit":
+            which = f"No law fits; the simplest that predicts as well as any is {best.name}"
+        return f"{which}: {best.fit.verdict}"
 
     @property
     def table(self) -> Table:
@@ -153,11 +151,10 @@ class NestedTest(NamedTuple):
         return self.chance < WORSE
 
     def __str__(self) -> str:
-        word = "needed" if self.needed else "not needed"
-        kind = "chi^2" if self.degrees_of_freedom is None else "F"
-        rest = "" if self.degrees_of_freedom is None else f" and {self.degrees_of_freedom}"
+        needed, rest = "needed" if self.needed else "not needed", self.degrees_of_freedom
+        kind, freedom = ("chi^2", self.more) if rest is None else ("F", f"{self.more} and {rest}")
         return (
-            f"{', '.join(self.names)} {word}: {kind} = {self.statistic:.3g} with {self.more}{rest} "
+            f"{', '.join(self.names)} {needed}: {kind} = {self.statistic:.3g} with {freedom} "
             f"degrees of freedom, p-value {self.chance:.2g}."
         )
 
@@ -330,16 +327,16 @@ def _candidates(
             left_out["restitution_matrix"] = f"has no start: {error}"
     built, missing = registered_laws(values)
     left_out = missing | left_out
-    if laws is None and "compliant" in built and not any(map(_opens_and_closes, scenes)):
-        left_out["compliant"] = (
-            "differs from lzb only where contacts have gaps, or open and close again (as at a "
-            "wall): name it in `laws` to fit it, too"
-        )
-    if laws is None and "routh" in built:
-        left_out["routh"] = (
-            "is moreau with one restitution, unless contacts separate beforehand: name it in "
-            "`laws` to fit it, too"
-        )
+    alternatives = {
+        "compliant": "differs from lzb only where contacts have gaps, or open and close again (as "
+        "at a wall): name it in `laws` to fit it, too",
+        "routh": "is moreau with one restitution, unless contacts separate beforehand: name it in "
+        "`laws` to fit it, too",
+    }
+    if any(map(_opens_and_closes, scenes)):
+        del alternatives["compliant"]
+    if laws is None:
+        left_out |= {name: why for name, why in alternatives.items() if name in built}
     if "base" not in values:
         left_out.pop("velocity_dependent", None)  # an option of the others, see `speed`
     built = {name: law for name, law in built.items() if name not in left_out}
@@ -401,7 +398,7 @@ def _judged(fits: dict[str, Fit]) -> dict[str, LawFit]:
     """The laws with their verdicts, in order."""
     errors = {name: _errors_left_out(each) for name, each in fits.items()}
     against = {name: _against(each) for name, each in fits.items()}
-    squares = {name: _per_shot(fits[name], errors[name]) for name in fits}
+    squares = {name: _per_shot(each, errors[name]) for name, each in fits.items()}
     usable = [name for name in fits if against[name][0] != "fails"] or list(fits)
     many = all(np.isfinite(squares[name]).sum() >= _LEAST for name in usable)
     least = {name: np.nansum(squares[name]) if many else _variance(fits[name]) for name in usable}
@@ -423,20 +420,18 @@ def _judged(fits: dict[str, Fit]) -> dict[str, LawFit]:
 
 def _order(entry: LawFit) -> tuple[Any, ...]:
     """Adequate first, by parameters, then in the order of `advise`; the rest by error."""
-    tier = _TIERS.index(entry.tier)
-    base = entry.name.split(",")[0]
-    order = simplest_first()
+    tier, base, order = _TIERS.index(entry.tier), entry.name.split(",")[0], simplest_first()
     place = order.index(base) if base in order else len(order)
     error = entry.left_out_error if np.isfinite(entry.left_out_error) else entry.fit.rms
-    return (tier, entry.parameters, place) if tier < 2 else (tier, error, place)
+    return tier, entry.parameters if tier < 2 else error, place
 
 
 def _against(result: Fit) -> tuple[str, str]:
     """What is against a law by itself: (tier, in words)."""
-    codes = [code for code in result.status if STATUS[code].failure]
-    if codes:
-        names = ", ".join(dict.fromkeys(STATUS[code].name for code in codes))
-        return "fails", f"fails in {len(codes)} of {len(result.status)} shots: {names}"
+    failing = [STATUS[code].name for code in result.status if STATUS[code].failure]
+    if failing:
+        names = ", ".join(dict.fromkeys(failing))
+        return "fails", f"fails in {len(failing)} of {len(result.status)} shots: {names}"
     if not result.converged:
         return "fails", "does not converge"
     if result.shows_lack_of_fit:

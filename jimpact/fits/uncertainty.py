@@ -526,18 +526,15 @@ class Fit(Tabular, Generic[AnyLaw]):
         low, high = self.bounds[0][i], self.bounds[1][i]
         minima = [(self.value[i], self.standard_error[i], 0.0)]
         for minimum in self.starts[1:]:
-            if minimum.standard_error is not None:
-                more = minimum.sum_of_squares - self.starts[0].sum_of_squares
+            more = minimum.sum_of_squares - self.starts[0].sum_of_squares
+            if minimum.standard_error is not None and more < (q * self.noise) ** 2:
                 minima.append((minimum.value[i], minimum.standard_error[i], more))
-        pieces: list[tuple[float, float]] = []
+        pieces = []
         for value, error, more in minima:
-            if pieces and not more < (q * self.noise) ** 2:
-                continue
             half = error * np.sqrt(q**2 - (more / self.noise**2 if more else 0.0))
+            ends = value + np.array([-half, half])
             if self.problem.parameters.log[i]:
                 ends = value * np.exp(np.array([-half, half]) / value)
-            else:
-                ends = np.array([value - half, value + half])
             pieces.append(tuple(np.clip(ends, low, high)))
         return joined(pieces)
 
@@ -560,17 +557,10 @@ class Fit(Tabular, Generic[AnyLaw]):
             return True
         if not np.isfinite(self.noise):
             return False  # the errors are unknown
-        q = self.quantile(0.95)
-        for i in range(len(self.names)):
-            pieces = self.linearized_interval(i, q)
-            at_end = pieces[0][0] <= self.bounds[0][i] or pieces[-1][1] >= self.bounds[1][i]
-            wide = (
-                self.problem.parameters.log[i]
-                and self.standard_error[i] > HARDLY_SEEN * self.value[i]
-            )
-            if len(pieces) > 1 or at_end or wide:
-                return True
-        return False
+        wide = self.problem.parameters.log & (self.standard_error > HARDLY_SEEN * self.value)
+        low, high = self.confidence_interval().T
+        at_end = (low <= self.bounds[0]) | (high >= self.bounds[1])
+        return bool((wide | at_end).any()) or max(map(len, self.intervals())) > 1
 
 
 def check_squares(name: str, fit: Any) -> None:
