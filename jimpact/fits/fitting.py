@@ -36,6 +36,7 @@ from jimpact.fits.solve import (
     Solver,
     default_steps,
     minimize,
+    outcome_at,
     stacked,
 )
 from jimpact.fits.uncertainty import (
@@ -316,13 +317,8 @@ def _robust(
     psi = (share * error / scale)[here]
     noise = scale * np.sqrt(np.sum(psi**2)) / max(slope[here].mean(), LEAST_SLOPE)
     # weighted as in the problem, without the factors of the loss
-    minimum, size = found.minima[0], factor.size
-    residual = problem.independent(problem.measured - found.predicted)
-    residual = np.append(-residual, minimum.residual[size:])
-    slope = minimum.jacobian / np.append(factor, np.ones(len(residual) - size))[:, None]
-    squares = float(np.sum(residual**2))
-    minimum = FitMinimum(squares, found.value, 1, None, slope, residual)
-    return problem, found._replace(minima=[minimum]), float(noise)
+    minima = solution(problem, outcome_at(problem, found.value)).minima
+    return problem, found._replace(minima=minima), float(noise)
 
 
 # ---------------------------------------------------------------------------- many fits
