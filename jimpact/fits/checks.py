@@ -207,11 +207,12 @@ def _unknown_corrections(judged: _Judged) -> Iterator[Finding]:
     data = judged.problem.experiments
     if data is None or data.sigma_pre is None:
         return
-    kept = kept_by_corrections(data, judged.problem.scene)
-    unknown = [data.shots[k] for k, one in enumerate(kept) if data.lost[k] and one is None]
-    if unknown:
+    whole = kept_by_corrections(data, judged.problem.scene) == np.eye(data.pre.shape[1])
+    unknown = np.flatnonzero((np.array(data.lost) > 0) & whole.all(axis=(1, 2)))
+    if unknown.size:
         yield Finding(
-            f"The fit weighs shots {listed(unknown)} as if they were not corrected: they have "
+            f"The fit weighs shots {listed([data.shots[k] for k in unknown])} as if they were not "
+            "corrected: they have "
             "`lost_freedom`, but do not conserve momentum, so that the errors that `sigma_pre` "
             "leaves in them are unknown; chi^2 and standard errors are approximate."
         )

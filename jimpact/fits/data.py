@@ -350,16 +350,16 @@ def _smallest_change(data: Experiments, k: int, rows: np.ndarray) -> np.ndarray:
     return np.asarray(weighted @ np.linalg.inv(rows @ weighted))
 
 
-def kept_by_corrections(data: Experiments, scene: Scene | None) -> list[np.ndarray | None]:
-    """Of every shot the projector (n, n) by which its momentum was corrected; None: it was not.
+def kept_by_corrections(data: Experiments, scene: Scene | None) -> np.ndarray:
+    """(K, n, n) projectors by which the momentum of shots was corrected, identities if it was not.
 
     Equation: `I - S m^T (m S m^T)^-1 m` with m = C^T M and S = diag(sigma^2).
     """
-    kept: list[np.ndarray | None] = []
+    kept = np.tile(np.eye(data.pre.shape[1]), (len(data.shots), 1, 1))
     for k, (m, pre, post) in enumerate(data.balances(scene)):
         rounding = ROUNDING * np.abs(m) @ (np.abs(pre) + np.abs(post))
-        corrected = 0 < len(m) <= data.lost[k] and (np.abs(m @ (post - pre)) <= rounding).all()
-        kept.append(np.eye(len(pre)) - _smallest_change(data, k, m) @ m if corrected else None)
+        if 0 < len(m) <= data.lost[k] and (np.abs(m @ (post - pre)) <= rounding).all():
+            kept[k] -= _smallest_change(data, k, m) @ m
     return kept
 
 

@@ -351,12 +351,9 @@ def priors_of(
     chosen, fields = dict(priors or {}), parameters.of_fields
     for name in chosen:
         _check_name("priors", name, (*parameters.names, *fields))
-    found = []
-    for i, (name, field, low, high) in enumerate(zip(parameters.names, fields, *limits)):
-        pair = chosen.get(name, chosen.get(field))
-        if pair is not None:
-            found.append(Prior(i, *_mean_and_std(name, pair, low, high)))
-    return tuple(found)
+    pairs = [chosen.get(name, chosen.get(field)) for name, field in zip(parameters.names, fields)]
+    each = enumerate(zip(parameters.names, pairs, *limits))
+    return tuple(Prior(i, *_mean_and_std(*row)) for i, row in each if row[1] is not None)
 
 
 def _mean_and_std(name: str, pair: Any, low: float, high: float) -> tuple[float, float]:

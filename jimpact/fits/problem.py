@@ -301,9 +301,8 @@ class FitProblem:
         count, n = self.measured.shape
         slope = np.asarray(slopes[:count], float)
         slope = np.where(np.isfinite(slope).all(axis=(1, 2), keepdims=True), slope, np.eye(n))
-        for k, kept in enumerate(kept_by_corrections(data, self.scene)):
-            if kept is not None:  # a residual that conserves momentum shows that part of the errors
-                slope[k] = kept @ slope[k]
+        # a residual that conserves momentum shows that part of the errors
+        slope = kept_by_corrections(data, self.scene) @ slope
         here = ~np.isnan(self.measured)
         before = slope * np.asarray(data.sigma_pre, float)[:, None, :]
         variance = np.where(here, np.asarray(data.sigma, float), 1.0) ** 2

@@ -355,10 +355,9 @@ class Fit(Tabular, Generic[AnyLaw]):
             law = problem.law_in_scene(x)
             return jnp.concatenate([tied_value(law, tie) for tie in ties])
 
-        x = jnp.asarray(self.value, problem.precision)
+        x, names = jnp.asarray(self.value, problem.precision), tied_names(problem.law, ties)
         errors = self.errors_of(np.asarray(jax.jacfwd(values)(x), float))
-        pairs = zip(np.asarray(values(x), float).tolist(), errors.tolist())
-        return dict(zip(tied_names(problem.law, ties), pairs))
+        return dict(zip(names, zip(np.asarray(values(x), float).tolist(), errors.tolist())))
 
     def errors_of(self, slope: np.ndarray) -> np.ndarray:
         """Standard errors of what depends on the parameters.
@@ -400,9 +399,9 @@ class Fit(Tabular, Generic[AnyLaw]):
         quantile = self.quantile(level)
         if self.experiments is None:
             raise ValueError("Argument `fit` must be to shots.")
-        data, scenes, units = shots, None, self.experiments.units
+        data, scenes, units, sigma = shots, None, self.experiments.units, None
         if isinstance(shots, Experiments):
-            data, scenes, units = shots.pre, shots.scenes, shots.units
+            data, scenes, units, sigma = shots.pre, shots.scenes, shots.units, shots.sigma
         if np.ndim(data) != 2 or np.shape(data)[1] != len(units):
             raise ValueError(
                 f"Argument `shots` must have shape (K, {len(units)}), velocities of the bodies of "
@@ -422,7 +421,7 @@ class Fit(Tabular, Generic[AnyLaw]):
         there = solution(problem, outcome_at(problem, self.value))
         slope = problem.of_data(there.jacobian)
         error = self.errors_of(problem.errors_of(slope / problem.steps_at(self.value)))
-        value, noise = there.predicted, self._noise_of(shots)
+        value, noise = there.predicted, np.broadcast_to(self._noise_of(sigma), data.pre.shape)
         half = quantile * np.hypot(error, noise)
         return Predicted(value, error, np.asarray(there.status), noise, value - half, value + half)
 
@@ -440,15 +439,14 @@ class Fit(Tabular, Generic[AnyLaw]):
                 f"{scene.size} and {scene.contacts}."
             )
 
-    def _noise_of(self, shots: Any) -> np.ndarray:
-        """Standard errors (K, n) of measured velocities: of the shots, or as in the fit (rms)."""
-        if isinstance(shots, Experiments) and shots.sigma is not None:
+    def _noise_of(self, sigma: Any) -> np.ndarray:
+        """Standard errors of measured velocities: of these, or as in the fit (rms)."""
+        if sigma is not None:
             stretched = 1.0 if self.problem.sigma is None else self.noise
-            return stretched * np.asarray(shots.sigma, float)
-        pre = shots.pre if isinstance(shots, Experiments) else shots
+            return stretched * np.asarray(sigma, float)
         weight = np.ma.masked_equal(np.asarray(self.problem.weight, float), 0.0)
-        each = np.sqrt((1 / weight**2).mean(axis=0)).filled(np.nan)  # NaN: never measured
-        return np.broadcast_to(self.noise * each, np.shape(pre))
+        # NaN: never measured
+        return self.noise * np.sqrt((1 / weight**2).mean(axis=0)).filled(np.nan)
 
     @property
     def experiments(self) -> Experiments | None:
