@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 
 import jimpact as ji
-from jimpact.fits.fitting import LOSSES
+from jimpact.fits.search import LOSSES
 from jimpact.fits.solve import DEFAULT_STEPS
 from jimpact.methods.contenders import CONTENDERS
 from jimpact.motion.methods import METHODS as MOTION_METHODS

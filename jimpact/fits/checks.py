@@ -19,7 +19,7 @@ from jimpact.fits.data_checks import DATA_CHECKS, LISTED, DataBalances, Finding,
 from jimpact.fits.matrices import boundary, encloses
 from jimpact.fits.observables import UNUSABLE, Shots
 from jimpact.fits.problem import FitProblem
-from jimpact.fits.search import Solution
+from jimpact.fits.search import MEDIAN, Solution
 from jimpact.fits.solve import RANK_TOLERANCE
 from jimpact.fits.uncertainty import Uncertainty
 from jimpact.laws.kinematic import RestitutionMatrix
@@ -28,7 +28,6 @@ from jimpact.status import STATUS
 # ------------------------------------------------------------------ thresholds of the fit
 LEVEL = 0.01  # of each test: how often it flags data that the law itself made
 _LEAST = 3  # degrees of freedom of the noise too few to test against
-MEDIAN = 1.4826  # sigma of a normal distribution over the median of its absolute values
 # A median of absolute values is as uncertain as a standard deviation of this share of the values
 # (Huber, 1981). Ten times more would make honest shots of small sets suspicious.
 MEDIAN_FREEDOM = 0.37

@@ -10,7 +10,7 @@ import numpy as np
 
 from jimpact._checks import as_whole, check_choice, check_kind
 from jimpact.files.records import listed
-from jimpact.fits.checks import MEDIAN, fit_warnings, stretch, unusable, weighted
+from jimpact.fits.checks import fit_warnings, stretch, unusable, weighted
 from jimpact.fits.data import Experiments
 from jimpact.fits.observables import filled_count
 from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw
@@ -18,10 +18,12 @@ from jimpact.fits.problem import FitProblem, of_shots
 from jimpact.fits.profiles import LEVEL, PROFILE_STARTS, needs_profiles, profiles_of
 from jimpact.fits.search import (
     DEFAULT_SEARCH,
+    LOSSES,
     FitMinimum,
     Search,
     Solution,
     find_minima,
+    robust_minimum,
     settled,
     solution,
     start_points,
@@ -30,14 +32,10 @@ from jimpact.fits.solve import (
     DEFAULT_STEPS,
     FINE_OF_MANY,
     HARDLY_WORSE,
-    SETTLED,
     Ends,
     Method,
     Solver,
     default_steps,
-    minimize,
-    outcome_at,
-    stacked,
 )
 from jimpact.fits.uncertainty import (
     Fit,
@@ -49,11 +47,6 @@ from jimpact.fits.uncertainty import (
 )
 from jimpact.progress import progress_bar
 from jimpact.scene import Scene
-
-HUBER = 1.345  # sigmas up to which a residual counts squared: 95 % of the efficiency
-STUDENT = 4.0  # degrees of freedom of the tails
-ROUNDS = 50  # of weights
-LEAST_SLOPE = 1e-7  # mean psi' of residuals that all are outliers, in the place of 0
 
 
 def fit(
@@ -161,7 +154,7 @@ def fit(
             found = solution(problem, ends, counts, found.lost)
         robust = None
         if search.loss != "squares":
-            problem, found, robust = _robust(problem, found, search.loss, solver)
+            problem, found, robust = robust_minimum(problem, found, search.loss, solver)
     result = replace(as_fit(problem, found, method, robust), loss=search.loss, seed=seed)
     if profiles or (profiles is None and needs_profiles(result)):
         more = PROFILE_STARTS if profiles else 0
@@ -272,53 +265,6 @@ def _errors(
     elif problem.sigma is not None:
         noise = stretch(judged, weighted(problem, found), errors.rank)
     return errors if noise in (None, 1.0) else uncertainty(problem, best, noise)
-
-
-# ---------------------------------------------------------------------------- robust losses
-
-
-def _huber(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """psi(u) / u and psi'(u)."""
-    inside = np.abs(u) <= HUBER
-    return np.where(inside, 1.0, HUBER / np.where(inside, 1.0, np.abs(u))), inside.astype(float)
-
-
-def _student(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """psi(u) / u and psi'(u)."""
-    below = STUDENT + u**2
-    return (STUDENT + 1) / below, (STUDENT + 1) * (STUDENT - u**2) / below**2
-
-
-LOSSES = {"huber": _huber, "student": _student}
-
-
-def _robust(
-    problem: FitProblem, found: Solution, loss: str, solver: Solver
-) -> tuple[FitProblem, Solution, float]:
-    """Least squares again and again, with weights `psi(u) / u` of the last residuals u.
-
-    Equation: the covariance is `s^2 mean(psi^2) / mean(psi')^2 (J^T J)^-1` (Huber, 1981).
-    """
-    here = ~np.isnan(problem.measured)
-    for _ in range(ROUNDS):
-        problem = problem.with_errors_before(found.slopes)
-        error = problem.independent(problem.measured - found.predicted)
-        scale = 1.0
-        if problem.sigma is None:
-            scale = max(MEDIAN * float(np.median(np.abs(error[here]))), np.finfo(float).tiny)
-        share, slope = LOSSES[loss](error / scale)
-        factor, before = np.sqrt(share), problem.point(found.value)
-        weighed = problem.weighed(factor)
-        found = solution(weighed, minimize(stacked([weighed]), before[None], solver))
-        if np.abs(problem.point(found.value) - before).max() <= SETTLED:
-            break
-    else:
-        found = found._replace(converged=False)
-    psi = (share * error / scale)[here]
-    noise = scale * np.sqrt(np.sum(psi**2)) / max(slope[here].mean(), LEAST_SLOPE)
-    # weighted as in the problem, without the factors of the loss
-    minima = solution(problem, outcome_at(problem, found.value)).minima
-    return problem, found._replace(minima=minima), float(noise)
 
 
 # ---------------------------------------------------------------------------- many fits
