@@ -66,9 +66,8 @@ class Grid(NamedTuple):
 
     def neighbours(self, cell: Index) -> list[Index]:
         """Cells next to one, diagonal ones too."""
-        around = product(*(range(max(k - 1, 0), k + 2) for k in cell))
-        inside = [near for near in around if all(k < len(v) for k, v in zip(near, self.values))]
-        return [near for near in inside if near != cell]
+        sides = [range(max(k - 1, 0), min(k + 2, len(v))) for k, v in zip(cell, self.values)]
+        return [near for near in product(*sides) if near != cell]
 
 
 class Deviances:
@@ -166,7 +165,7 @@ class Deviances:
 
 
 def _check_profiled(fit: Fit, level: float, points: int) -> None:
-    """Raise an error unless this is a fit, of parameters that can be fixed, and so on."""
+    """Raise an error unless these are arguments of profiles or contours of a fit."""
     check_level(level)
     as_whole("points", points, 3)
     check_kind("fit", fit, Fit)

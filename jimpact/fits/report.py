@@ -217,17 +217,23 @@ def _quality(fit: "Fit") -> list[str]:
         lines.append(f"chi^2          {squares} (sigma given)")
         lines += _sigma_sources(fit)
         if fit.noise > 1 and fit.loss == "squares":
+            ratio = np.sqrt(fit.starts[0].sum_of_squares / max(fit.degrees_of_freedom, 1))
+            every = np.isclose(fit.noise, ratio, rtol=1e-3)
+            part = "" if every else " (the factor is that of the residuals that are not momentum)"
             lines.append(
                 f"errors         standard errors multiplied by {fit.noise:.3g}, because chi^2 "
-                f"contradicts the stated sigma{_of_what_part(fit)}"
+                f"contradicts the stated sigma{part}"
             )
     elif np.isfinite(fit.noise):
         lines.append(
             f"noise          {fit.noise:.4g}{unit} a {one}, estimated with "
             f"{degrees(fit.degrees_of_freedom)}"
         )
-    lines.append(f"determined     {_how_many_are_determined(fit)}")
+    total, bounded = len(fit.names), int(fit.determined.sum())
+    fewer = f"; the errors leave {total - bounded} unbounded" if bounded < fit.rank == total else ""
     state = "converged" if fit.converged else "NOT converged"
+    rank = f"{fit.rank} of {total} parameter{'s' * (total > 1)}"
+    lines.append(f"determined     {rank} (rank of the derivatives{fewer})")
     return [*lines, f"solver         {state}, at most {fit.steps} steps a start"]
 
 
@@ -241,33 +247,14 @@ def degrees(count: int) -> str:
     return f"{count} degree{'s' * (count != 1)} of freedom"
 
 
-def _how_many_are_determined(fit: "Fit") -> str:
-    """The rank of the derivatives, and whether intervals bound as many parameters."""
-    total, bounded = len(fit.names), int(fit.determined.sum())
-    text = f"{fit.rank} of {total} parameter{'s' * (total > 1)} (rank of the derivatives"
-    if bounded < fit.rank == total:
-        text += f"; the errors leave {total - bounded} unbounded"
-    return f"{text})"
-
-
-def _of_what_part(fit: "Fit") -> str:
-    """Which residuals the factor of the errors is that of, where these are not all."""
-    ratio = np.sqrt(fit.starts[0].sum_of_squares / max(fit.degrees_of_freedom, 1))
-    every = np.isclose(fit.noise, ratio, rtol=1e-3)
-    return "" if every else " (the factor is that of the residuals that are not momentum)"
-
-
 def _sigma_sources(fit: "Fit") -> list[str]:
     """What went into the stated errors besides sigma."""
-    data = fit.experiments
-    if data is None:
-        return []
-    lines = []
-    if data.resolution is not None:
+    data, lines = fit.experiments, []
+    if data is not None and data.resolution is not None:
         steps = np.unique(np.asarray(data.resolution)[data.measured])
         size = f"{steps[0]:.3g}" if len(steps) == 1 else f"{steps[0]:.3g} to {steps[-1]:.3g}"
         lines.append(f"               with that of readings in steps of {size}: step / sqrt(12)")
-    if data.sigma_pre is not None:
+    if data is not None and data.sigma_pre is not None:
         lines.append("               with those of the velocities before, passed on by the law")
     return lines
 
@@ -294,12 +281,6 @@ def _minima(fit: "Fit") -> list[str]:
     return lines + unfinished
 
 
-def _without_rounding(values: np.ndarray) -> np.ndarray:
-    """0 for what is rounding against the largest of the values (K, n) of its shot."""
-    largest = np.abs(values).max(axis=1, keepdims=True)
-    return np.where(np.abs(values) <= _ROUNDING * largest, 0.0, values)
-
-
 def _shots(fit: "Fit") -> list[str]:
     """The table of the first shots."""
     data = fit.experiments
@@ -310,7 +291,9 @@ def _shots(fit: "Fit") -> list[str]:
     head = f"{'shot':>8s} {'body':>5s} {'before':>12s} {'measured':>12s} {'fitted':>12s}"
     lines, (shots, bodies) = [head + common_unit], data.pre.shape
     before, measured = np.asarray(data.pre, float), np.asarray(data.post, float)
-    fitted, shown = _without_rounding(fit.predicted), max(1, _VELOCITIES_SHOWN // bodies)
+    largest = np.abs(fit.predicted).max(axis=1, keepdims=True)
+    fitted = np.where(np.abs(fit.predicted) <= _ROUNDING * largest, 0.0, fit.predicted)
+    shown = max(1, _VELOCITIES_SHOWN // bodies)
     for k, i in np.ndindex(*before[:shown].shape):
         label = data.shots[k] if i == 0 else ""
         status = STATUS[int(fit.status[k])].name if fit.status[k] and i == 0 else ""

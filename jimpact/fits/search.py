@@ -138,25 +138,19 @@ def solution(
     """The distinct minima among ends; counts: of the starts that an end is for."""
     counts = np.ones(len(ends.y), int) if counts is None else counts
     count, measured = len(problem.names), problem.measured
-    groups = _groups(problem, ends)
     # without what filled up, and parameters that have no prior
     first_prior = ends.residual.shape[1] - len(problem.low)
     own = [*range(measured.size), *(first_prior + prior.parameter for prior in problem.priors)]
-    best, y = groups[0][0], ends.y[:, :count]
-    # starts that did not converge have no minimum to report, unless they are the best there is
-    kept = [[i for i in group if ends.converged[i] or i == best] for group in groups]
-    minima = [
-        FitMinimum(
-            float(ends.squares[group[0]]),
-            problem.values_at(ends.y[group[0]]),
-            int(counts[group].sum()),
-            None,
-            ends.jacobian[group[0]][own, :count],
-            ends.residual[group[0]][own],
-        )
-        for group in kept
-        if group
-    ]
+    groups, y, minima = _groups(problem, ends), ends.y[:, :count], []
+    best = groups[0][0]
+    for group in groups:
+        # starts that did not converge have no minimum to report, unless they are the best there is
+        kept = [i for i in group if ends.converged[i] or i == best]
+        for i in kept[:1]:
+            squares, value = float(ends.squares[i]), problem.values_at(ends.y[i])
+            slope, residual = ends.jacobian[i][own, :count], ends.residual[i][own]
+            starts = int(counts[kept].sum())
+            minima.append(FitMinimum(squares, value, starts, None, slope, residual))
     rows = slice(len(measured)) if measured.ndim else ...
     low, high = (np.asarray(end)[:count] for end in (problem.low, problem.high))
     return Solution(

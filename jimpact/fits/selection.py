@@ -339,18 +339,16 @@ def _candidates(
         left_out |= {name: why for name, why in alternatives.items() if name in built}
     if "base" not in values:
         left_out.pop("velocity_dependent", None)  # an option of the others, see `speed`
-    built = {name: law for name, law in built.items() if name not in left_out}
-    if laws is not None:
-        wanted = tuple(laws)
-        for name in wanted:
-            check_choice("laws", name, tuple(REGISTRY))
-        built = {name: law for name, law in built.items() if name in wanted}
-        left_out = {name: why for name, why in left_out.items() if name in wanted}
-    candidates: dict[str, Candidate] = {}
-    for name, law in built.items():
-        for label, candidate in _variants(law, contacts, alike, more).items():
-            candidates[f"{name}{label}"] = candidate
-    return candidates, left_out
+    wanted = tuple(REGISTRY if laws is None else laws)
+    for name in wanted:
+        check_choice("laws", name, tuple(REGISTRY))
+    candidates = {
+        f"{name}{label}": candidate
+        for name, law in built.items()
+        if name in wanted and name not in left_out
+        for label, candidate in _variants(law, contacts, alike, more).items()
+    }
+    return candidates, {name: why for name, why in left_out.items() if name in wanted}
 
 
 def _opens_and_closes(scene: Scene) -> bool:
@@ -376,16 +374,14 @@ def _variants(law: Law, contacts: int, alike: bool, more: tuple[str, ...]) -> di
     for name in fields:
         each = jnp.broadcast_to(known[name].value, (contacts,))
         law = with_parameter(law, name, each)
-    one, each_own = np.ones(contacts, int), np.arange(1, contacts + 1)
-    coefficients = {"": one} | ({", e per contact": each_own} if alike else {})
-    ratios: dict[str, Any] = {"": np.zeros(contacts, int)}
+    each_own = np.arange(1, contacts + 1)
+    coefficients, ratios = {"": np.ones(contacts, int)}, {"": np.zeros(contacts, int)}
+    if alike:
+        coefficients[", e per contact"] = each_own
     if alike and law.only_stiffness_ratios:  # of others the stiffness is one in SI units
         ratios[", free stiffness ratios"] = each_own
     return {
-        f"{a}{b}": (
-            law,
-            {"restitution": e} | ({"stiffness": k} if "stiffness" in known else {}) | others,
-        )
+        f"{a}{b}": (law, dict(zip(fields, (e, k))) | others)
         for a, e in coefficients.items()
         for b, k in ratios.items()
     }
@@ -474,9 +470,8 @@ def _chance(squares: np.ndarray, best: np.ndarray) -> float:
     """
     both = np.isfinite(squares) & np.isfinite(best)
     some = both & (squares > 0) & (best > 0)
-    logs = np.log(squares[some]) - np.log(best[some])
     gain = _above_zero(squares[both] - best[both], best[both])
-    return min(gain, _above_zero(logs, 1.0))
+    return min(gain, _above_zero(np.log(squares[some]) - np.log(best[some]), 1.0))
 
 
 def _above_zero(more: np.ndarray, size: Any) -> float:
@@ -520,12 +515,10 @@ def _speed_test(
 ) -> NestedTest | None:
     """Whether e depends on the speed; None of a law without e, or of shots equally fast."""
     law, free = candidate
-    speeds = data.approach_speed(scene)
+    known, speeds = free_parameters_of(law), data.approach_speed(scene)
     speeds = speeds[speeds > 0]
-    known = free_parameters_of(law)
-    if "restitution" not in known or known.keys() & set(OF_SPEED):
-        return None
-    if len(speeds) < 2 or np.ptp(speeds) == 0:
+    constant_e = "restitution" in known and not known.keys() & set(OF_SPEED)
+    if not constant_e or len(speeds) < 2 or np.ptp(speeds) == 0:
         return None
     typical = float(np.exp(np.mean(np.log(speeds))))
     falling = VelocityDependent(law, speed_exponent=SPEED_EXPONENT, reference_speed=typical)
