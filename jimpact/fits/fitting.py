@@ -10,7 +10,7 @@ import numpy as np
 
 from jimpact._checks import as_whole, check_choice, check_kind
 from jimpact.files.records import listed
-from jimpact.fits.checks import fit_warnings, stretch, unusable, weighted
+from jimpact.fits.checks import Judged, fit_warnings, unusable
 from jimpact.fits.data import Experiments
 from jimpact.fits.observables import filled_count
 from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw
@@ -40,7 +40,6 @@ from jimpact.fits.solve import (
 from jimpact.fits.uncertainty import (
     Fit,
     Profile,
-    Uncertainty,
     check_level,
     check_squares,
     uncertainty,
@@ -216,10 +215,9 @@ def as_fit(
 
     `robust`: noise times the root of the degrees of freedom, of a loss that outliers move little.
     """
-    judged = replace(problem, scene=problem.to_scene(found.value))
-    errors = _errors(problem, judged, found, robust)
+    judged = Judged(replace(problem, scene=problem.to_scene(found.value)), found, robust)
+    errors, findings = judged.errors, fit_warnings(judged)
     residual = np.asarray(problem.measured, float) - found.predicted
-    findings = fit_warnings(judged, found, errors, robust is not None)
     numbers = errors._asdict()
     undetermined = numbers.pop("undetermined")
     slope = problem.of_data(found.jacobian)
@@ -250,21 +248,6 @@ def as_fit(
         problem=problem,
         jacobian=problem.errors_of(slope / problem.steps_at(found.value)),
     )
-
-
-def _errors(
-    problem: FitProblem, judged: FitProblem, found: Solution, robust: float | None
-) -> Uncertainty:
-    """Errors of the parameters; with known errors of the data wider where the law does not fit."""
-    best, noise = found.minima[0], None
-    errors = uncertainty(problem, best)
-    if robust is not None:
-        noise = np.nan if problem.sigma is None else 1.0
-        if errors.degrees_of_freedom > 0:
-            noise = robust / np.sqrt(errors.degrees_of_freedom)
-    elif problem.sigma is not None:
-        noise = stretch(judged, weighted(problem, found), errors.rank)
-    return errors if noise in (None, 1.0) else uncertainty(problem, best, noise)
 
 
 # ---------------------------------------------------------------------------- many fits
