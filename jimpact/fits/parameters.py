@@ -75,8 +75,7 @@ def places(argument: str, name: str, shape: tuple[int, ...]) -> list[int]:
 
 def value_of(law: Law, field: str) -> Any:
     """A parameter of a law, or of its parts (the force of a compliant one); None if it has none."""
-    known = parameters_of(law).get(field)
-    return None if known is None else known.value
+    return getattr(parameters_of(law).get(field), "value", None)
 
 
 def domain_of(law: Law, field: str) -> Domain:
@@ -481,9 +480,9 @@ def tied_names(law: Law, ties: Ties) -> list[str]:
     names = []
     for tie in ties:
         shape = np.shape(value_of(law, tie.field))
-        members = [np.array([np.unravel_index(i, shape)]) for i in tie.at]
         whole = tie.name == tie.field and shape
-        names += [_name(tie.field, each, 0) for each in members] if whole else [tie.name]
+        members = [np.array([np.unravel_index(i, shape)]) for i in tie.at] if whole else []
+        names += [_name(tie.field, each, 0) for each in members] or [tie.name]
     return names
 
 
@@ -591,7 +590,7 @@ def limits_with_scene(
     low, high = (end.copy() for end in limits)
     start = entries(law, parameters.fields)[parameters.first]
     for i, (name, field) in enumerate(zip(parameters.names, parameters.of_fields)):
-        if field not in OF_A_SCENE:
+        if field not in OF_A_SCENE or not isinstance(law, LawInScene):
             continue
         if i not in known:
             raise ValueError(

@@ -266,8 +266,8 @@ class FitProblem:
             data: shots of as many bodies.
             scene: of all; None: they have their own.
         """
-        values = _weighed_shots(data, scene)
-        arrays = {"observe": _impacts(data, scene, values["unit"])[0], "mixing": None} | values
+        observe, _, weights = _measured_shots(data, scene)
+        arrays = {"observe": observe, "mixing": None} | weights
         return replace(self, **_in(self.low.dtype, arrays), experiments=data, scene=scene)
 
     def weighed(self, factor: np.ndarray) -> "FitProblem":
@@ -278,8 +278,7 @@ class FitProblem:
         """
         used, mixing, weight = factor > 0, self.mixing, self.weight * factor
         if mixing is not None:  # which comes before the factors
-            weight = self.weight * used
-            mixing = np.where(used, factor, 1.0)[..., None] * mixing
+            weight, mixing = self.weight * used, np.where(used, factor, 1.0)[..., None] * mixing
         measured = np.where(used, self.measured, np.nan)
         return replace(self, **self._weights(weight, mixing), measured=measured)
 
@@ -577,12 +576,11 @@ def of_shots(
     check_concrete("law", law)
     check_concrete("scene", scene)
     law, of_tolerance = tolerated(law, scene, experiments)
-    values = _weighed_shots(experiments, scene)
-    observe, alike = _impacts(experiments, scene, values["unit"])
+    observe, alike, weights = _measured_shots(experiments, scene)
     law = with_parts_of_scene(law, scene, experiments.scenes is not None, free)
     masses = experiments.each(scene, dense_mass)
     energy = max(0.5 * v @ mass @ v for mass, v in zip(masses, np.asarray(experiments.pre))) or 1.0
-    problem = _build(law, observe, values, (free, *known), energy)
+    problem = _build(law, observe, weights, (free, *known), energy)
     problem = replace(
         problem,
         notes=(*problem.notes, *of_tolerance),
@@ -594,15 +592,20 @@ def of_shots(
     return problem.with_errors_before(np.tile(np.eye(n), (count, 1, 1)))
 
 
-def _impacts(data: Experiments, scene: Scene | None, unit: Any) -> tuple[Shots, list[Scene]]:
-    """The observable of shots, and their scenes, made alike; of a common one only this."""
-    count, n = data.pre.shape
+def _measured_shots(
+    data: Experiments, scene: Scene | None
+) -> tuple[Shots, list[Scene], dict[str, Any]]:
+    """The observable of shots; their scenes, made alike, of a common one only this; weights."""
+    (count, n), pre, post = data.pre.shape, np.asarray(data.pre), np.asarray(data.post)
+    sigma = None if data.sigma is None else np.asarray(data.sigma)
+    unit = max(np.abs(pre).max(), np.nanmax(np.abs(post)))
     own = data.each(scene, lambda s: s)
     alike, extra = stackable(own if data.scenes is not None else own[:1])
     each = np.arange(count) if len(alike) == count else np.zeros(count, int)
     scenes = jax.tree.map(lambda *x: np.stack(x)[each], *alike)
-    pre = np.pad(np.asarray(data.pre), ((0, 0), (0, extra)), constant_values=unit)
-    return Shots(scenes, pre, n), alike  # type: ignore[arg-type]
+    filled = np.pad(pre, ((0, 0), (0, extra)), constant_values=unit)
+    weights = _weighed(post, sigma, data.natural_errors(scene), unit)
+    return Shots(scenes, filled, n), alike, weights  # type: ignore[arg-type]
 
 
 def _in(dtype: Any, tree: Any) -> Any:
@@ -622,8 +625,7 @@ def _build(
     parameters, notes = free_parameters(law, free, getattr(observe, "absolute", False), ties)
     limits = bounds_of(parameters, law, bounds)
     priors = priors_of(parameters, limits, prior)
-    if isinstance(law, LawInScene):
-        limits = limits_with_scene(parameters, law, limits, priors)
+    limits = limits_with_scene(parameters, law, limits, priors)
     if priors and values["sigma"] is None:
         raise ValueError(
             "Argument `priors` must be left out where no `sigma` (or `resolution`) of the measured "
@@ -651,13 +653,6 @@ def _weighed(measured: np.ndarray, sigma: Any, errors: Any, unit: float) -> dict
     size = np.asarray(unit * np.linalg.norm(weight))
     arrays = {"measured": measured, "weight": weight, "unit": np.asarray(unit), "size": size}
     return arrays | {"sigma": sigma}
-
-
-def _weighed_shots(data: Experiments, scene: Scene | None) -> dict[str, Any]:
-    """The same of shots."""
-    post, sigma = np.asarray(data.post), None if data.sigma is None else np.asarray(data.sigma)
-    unit = max(np.abs(np.asarray(data.pre)).max(), np.nanmax(np.abs(post)))
-    return _weighed(post, sigma, data.natural_errors(scene), unit)
 
 
 def _of_parameters(

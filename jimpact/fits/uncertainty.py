@@ -338,10 +338,10 @@ class Fit(Tabular, Generic[AnyLaw]):
     @property
     def from_prior(self) -> np.ndarray:
         """(P,) which parameters are known from their priors alone: the data add hardly anything."""
-        alone = np.zeros(len(self.names), bool)
-        for i, _, std in self.problem.priors:
-            alone[i] = self.standard_error[i] > PRIOR_ALONE * self.noise * std
-        return alone
+        std = np.full(len(self.names), np.inf)
+        for prior in self.problem.priors:
+            std[prior.parameter] = prior.std
+        return self.standard_error > PRIOR_ALONE * self.noise * std
 
     @property
     def tied(self) -> dict[str, tuple[float, float]]:
