@@ -306,7 +306,7 @@ def fit_many(
     first = of_shots(law, scene, many[0], *choice)
     others = (first.with_shots(data) or of_shots(law, scene, data, *choice) for data in many[1:])
     problems = [first, *others]
-    each: list[Ends] = [None] * len(many)  # type: ignore[list-item]  # where its starts ended
+    each: dict[int, Ends] = {}  # where its starts ended
     with progress_bar(progress) as show:
         for members in _alike(many):
             first, solver = problems[members[0]], Solver(max_steps=max_steps, show=show)
@@ -327,11 +327,11 @@ def fit_many(
             return fit(problems[k], starts=starts, profiles=False, search=search)
         return as_fit(problems[k], found, "levenberg-marquardt")
 
-    best = [ends.rows(np.nanargmin(ends.squares)) for ends in each]
-    y, squares, converged = (
-        np.array([getattr(ends, name) for ends in best]) for name in ("y", "squares", "converged")
-    )
-    return Fits(problems[0].names, problems[0].values_at(y), squares, converged, made)
+    best = [each[k].rows(np.nanargmin(each[k].squares)) for k in range(len(many))]
+    value = problems[0].values_at(np.array([end.y for end in best]))
+    squares = np.array([end.squares for end in best])
+    converged = np.array([end.converged for end in best])
+    return Fits(problems[0].names, value, squares, converged, made)
 
 
 def _alike(many: Sequence[Experiments]) -> list[list[int]]:

@@ -305,11 +305,10 @@ class _Lines(Deviances):
         y, deviance = self.deviance(line)
         deviance = deviance - deviance.min()
         below = np.flatnonzero(deviance <= self.limit)
-        pieces = np.split(below, np.flatnonzero(np.diff(below) > 1) + 1)
         low, high = self.problem.domains[i].tolist()
         intervals = tuple(
             (self._end(i, y, deviance, piece[0], -1), self._end(i, y, deviance, piece[-1], 1))
-            for piece in pieces
+            for piece in np.split(below, np.flatnonzero(np.diff(below) > 1) + 1)
         )
         is_own = np.array_equal(self.best.y, self.problem.point(self.fit.value))
         return Profile(

@@ -3,10 +3,10 @@
 import dataclasses
 import json
 import platform
-import sys
 from collections.abc import Iterable, Sequence
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -132,14 +132,13 @@ def _with_error(fit: "Fit", i: int) -> str:
     value, error, name = fit.value[i], fit.standard_error[i], _full_name(fit, i)
     if np.isnan(error):
         return f"{name} = {value:.5g}, its error unknown"
-    text = f"{value:g}" if fit.at_bound[i] else with_error(value, error)
+    text = f"{name} = {value:g}" if fit.at_bound[i] else f"{name} = {with_error(value, error)}"
+    words = fit.profiles[i].words if fit.profiles else ""
     if fit.from_prior[i]:
-        return f"{name} = {text}, which is its prior"
-    if fit.profiles:
-        words = fit.profiles[i].words
-        if words.startswith("at ") or " or " in words:
-            return f"{name} = {text}, {words} ({100 * fit.profiles[i].level:g} %)"
-    return f"{name} = {text}{', the end of what is allowed' if fit.at_bound[i] else ''}"
+        return f"{text}, which is its prior"
+    if words.startswith("at ") or " or " in words:
+        return f"{text}, {words} ({100 * fit.profiles[i].level:g} %)"
+    return f"{text}{', the end of what is allowed' if fit.at_bound[i] else ''}"
 
 
 def _headline(fit: "Fit") -> str:
@@ -532,9 +531,7 @@ def _decoded(data: Any) -> Any:
 def _instance(place: str, fields: dict[str, Any]) -> Any:
     """An instance of the class at a place with these fields, which are all that it has."""
     module, _, name = place.partition(":")
-    found: Any = sys.modules.get(module) or import_module(module)
-    for part in name.split("."):
-        found = getattr(found, part)
+    found: Any = attrgetter(name)(import_module(module))
     if not dataclasses.is_dataclass(found):
         raise TypeError(f"{place} is no class of a law, scene or result")
     known = {field.name for field in dataclasses.fields(found)}

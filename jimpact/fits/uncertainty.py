@@ -70,12 +70,10 @@ def uncertainty(
     singular = np.pad(singular, (0, len(scale) - len(singular)))
     rank = int(np.sum(singular > RANK_TOLERANCE[problem.precision] * singular[0]))
     freedom = problem.values - rank
-    if noise is None and problem.sigma is not None:
-        noise = 1.0
-    elif noise is None and (freedom < 1 or minimum.sum_of_squares <= problem.exact_squares):
-        noise = np.nan
-    elif noise is None:
-        noise = float(np.sqrt(minimum.sum_of_squares / freedom))
+    if noise is None:
+        shown = freedom >= 1 and minimum.sum_of_squares > problem.exact_squares
+        estimated = float(np.sqrt(minimum.sum_of_squares / freedom)) if shown else np.nan
+        noise = estimated if problem.sigma is None else 1.0
     determined = directions[:rank] / singular[:rank, None]
     covariance = noise**2 * (determined.T @ determined) * np.outer(scale, scale)
     null = directions[rank:]
