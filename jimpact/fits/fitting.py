@@ -35,7 +35,7 @@ from jimpact.fits.solve import (
     Ends,
     Method,
     Solver,
-    default_steps,
+    step_limit,
 )
 from jimpact.fits.uncertainty import (
     Fit,
@@ -122,7 +122,7 @@ def fit(
     0.4
     """
     method, seed = search.method, search.seed
-    steps = default_steps(method) if search.max_steps is None else search.max_steps
+    steps = step_limit(method, search.max_steps)
     if starts is not None:
         as_whole("starts", starts, 1)
     for name, count, least in (("max_steps", steps, 1), ("seed", seed, 0)):

@@ -126,18 +126,18 @@ class SolverState(eqx.Module):
     stuck: jax.Array  # no step lowers the cost
 
 
-def default_steps(method: Any) -> int:
-    """Step limit where the user gives none; raises a ValueError for an unknown method."""
-    if isinstance(method, str) and method in DEFAULT_STEPS:
-        return DEFAULT_STEPS[method]
-    import optax
+def step_limit(method: Any, stated: int | None) -> int:
+    """The stated limit of steps, or that of the method; raises a ValueError for an unknown one."""
+    known = isinstance(method, str) and method in DEFAULT_STEPS
+    if not known:
+        import optax
 
-    if not isinstance(method, optax.GradientTransformation):
-        raise ValueError(
-            f"Argument `method` must be one of {', '.join(map(repr, DEFAULT_STEPS))} or an "
-            f"optax.GradientTransformation, but has value {method!r}."
-        )
-    return DEFAULT_STEPS["adam"]
+        if not isinstance(method, optax.GradientTransformation):
+            raise ValueError(
+                f"Argument `method` must be one of {', '.join(map(repr, DEFAULT_STEPS))} or an "
+                f"optax.GradientTransformation, but has value {method!r}."
+            )
+    return DEFAULT_STEPS[method if known else "adam"] if stated is None else stated
 
 
 def begin(problems: Any, y: Any, solver: "Solver") -> SolverState:
