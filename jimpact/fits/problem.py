@@ -257,7 +257,14 @@ class FitProblem:
         coarse = getattr(self.law, "rtol", None) == COARSE_RTOL
         if data.sigma_pre is not None or self.mixing is not None or coarse:
             return None
-        return self.of_other(data, self.scene)
+        observe: Any = self.observe
+        count, n = data.pre.shape
+        scenes = jax.tree.map(lambda x: np.repeat(x[:1], count, axis=0), observe.scenes)
+        before = np.repeat(observe.pre[:1], count, axis=0)
+        before[:, :n] = np.asarray(data.pre)
+        observe = replace(observe, scenes=scenes, pre=before)
+        weights = _in(self.low.dtype, _weighed_shots(data, self.scene))
+        return replace(self, observe=observe, experiments=data, **weights)
 
     def of_other(self, data: Experiments, scene: Scene | None) -> "FitProblem":
         """The same of other shots; errors of v- count as if there were none.
@@ -596,15 +603,12 @@ def _measured_shots(
     data: Experiments, scene: Scene | None
 ) -> tuple[Shots, list[Scene], dict[str, Any]]:
     """The observable of shots; their scenes, made alike, of a common one only this; weights."""
-    (count, n), pre, post = data.pre.shape, np.asarray(data.pre), np.asarray(data.post)
-    sigma = None if data.sigma is None else np.asarray(data.sigma)
-    unit = max(np.abs(pre).max(), np.nanmax(np.abs(post)))
+    (count, n), pre, weights = data.pre.shape, np.asarray(data.pre), _weighed_shots(data, scene)
     own = data.each(scene, lambda s: s)
     alike, extra = stackable(own if data.scenes is not None else own[:1])
     each = np.arange(count) if len(alike) == count else np.zeros(count, int)
     scenes = jax.tree.map(lambda *x: np.stack(x)[each], *alike)
-    filled = np.pad(pre, ((0, 0), (0, extra)), constant_values=unit)
-    weights = _weighed(post, sigma, data.natural_errors(scene), unit)
+    filled = np.pad(pre, ((0, 0), (0, extra)), constant_values=weights["unit"])
     return Shots(scenes, filled, n), alike, weights  # type: ignore[arg-type]
 
 
@@ -653,6 +657,13 @@ def _weighed(measured: np.ndarray, sigma: Any, errors: Any, unit: float) -> dict
     size = np.asarray(unit * np.linalg.norm(weight))
     arrays = {"measured": measured, "weight": weight, "unit": np.asarray(unit), "size": size}
     return arrays | {"sigma": sigma}
+
+
+def _weighed_shots(data: Experiments, scene: Scene | None) -> dict[str, Any]:
+    """The same of shots."""
+    post, sigma = np.asarray(data.post), None if data.sigma is None else np.asarray(data.sigma)
+    unit = max(np.abs(np.asarray(data.pre)).max(), np.nanmax(np.abs(post)))
+    return _weighed(post, sigma, data.natural_errors(scene), unit)
 
 
 def _of_parameters(
