@@ -232,7 +232,7 @@ class FitProblem:
         # a stiffness that the user names is one that the function sees
         own = isinstance(observe, eqx.Module)
         observable = observe if own else Observed(observe, free is not DEFAULT_FREE)
-        values = _weighed(post, sigma, 1.0, np.nanmax(np.abs(post)))
+        values = _weighed(post, sigma, 1.0 if sigma is None else sigma, np.nanmax(np.abs(post)))
         problem = _build(law, observable, values, (free, bounds, priors, ties))
         shape = eqx.filter_eval_shape(observable, law).value.shape
         if shape != post.shape:
@@ -651,8 +651,8 @@ def _build(
 
 
 def _weighed(measured: np.ndarray, sigma: Any, errors: Any, unit: float) -> dict[str, Any]:
-    """What was measured, its weights, and the sizes that follow; `errors`: without a sigma."""
-    here, errors, unit = ~np.isnan(measured), errors if sigma is None else sigma, float(unit) or 1.0
+    """What was measured, its weights, and the sizes that follow; `errors`: to weigh by."""
+    here, unit = ~np.isnan(measured), float(unit) or 1.0
     weight = np.where(here, 1 / np.where(here, errors, 1.0), 0.0)
     size = np.asarray(unit * np.linalg.norm(weight))
     arrays = {"measured": measured, "weight": weight, "unit": np.asarray(unit), "size": size}
@@ -663,7 +663,7 @@ def _weighed_shots(data: Experiments, scene: Scene | None) -> dict[str, Any]:
     """The same of shots."""
     post, sigma = np.asarray(data.post), None if data.sigma is None else np.asarray(data.sigma)
     unit = max(np.abs(np.asarray(data.pre)).max(), np.nanmax(np.abs(post)))
-    return _weighed(post, sigma, data.natural_errors(scene), unit)
+    return _weighed(post, sigma, data.natural_errors(scene) if sigma is None else sigma, unit)
 
 
 def _of_parameters(
