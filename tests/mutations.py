@@ -96,7 +96,7 @@ MUTATIONS = [
     Mutation("freedom counted with parameters, not rank", "uncertainty", "problem.values - rank", "problem.values - len(scale)", ("test_fit.py::test_one_shot_of_three_balls_determines_two_of_three",)),
     Mutation("rank tolerance too coarse", "", "{'float64': 1e-06, 'float32': 0.001}", "{'float64': 0.1, 'float32': 0.001}", ("test_fit.py::test_one_shot_of_three_balls_determines_two_of_three", "test_fit.py::test_what_is_seen_weakly_is_seen",)),
     Mutation("standard errors without noise", "uncertainty", "noise ** 2", "noise", ("test_fit.py::test_errors_from_the_residual_are_those_of_linear_regression",)),
-    Mutation("rounding taken for the noise", "uncertainty", "minimum.sum_of_squares <= problem.exact_squares", "False", ("test_fit.py::test_copies_of_a_shot_are_reported",)),
+    Mutation("rounding taken for the noise", "uncertainty", "minimum.sum_of_squares > problem.exact_squares", "True", ("test_fit.py::test_copies_of_a_shot_are_reported",)),
     Mutation("scaled copies are not seen", "_copies", "rows / np.where(size > 0, size, 1.0)", "rows", ("test_fit.py::test_copies_of_a_shot_are_reported",)),
     Mutation("repeated readings taken for noise of 0", "_noise", "(whole == whole[0]).all()", "False", ("test_fit.py::test_readings_that_repeat_hide_the_noise",)),
     Mutation("kilometres an hour", "", "1 / 3.6", "1 / 36", ("test_experiments.py",)),

@@ -1,34 +1,31 @@
-"""What is wrong with a fit: rows of a test and the sentence that it puts into the report.
+"""What is wrong with a fit: tests, each with the sentence that it puts into the report.
 
 Every law leaves a momentum unchanged that the contacts cannot change, and predicts the same for
 shots that began alike: residuals in these directions are noise. The other residuals are compared
 with it, or with the stated sigma.
 """
 
-import functools
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from collections.abc import Iterable, Iterator
+from typing import Any
 
 import numpy as np
 from scipy.special import chdtrc, fdtrc
 
 from jimpact.files.records import listed
 from jimpact.fits.data import ROUNDING, kept_by_corrections
-from jimpact.fits.data_checks import DATA_ROWS, LISTED, Check, DataBalances, Finding, findings
+from jimpact.fits.data_checks import DATA_CHECKS, LISTED, DataBalances, Finding, findings
 from jimpact.fits.matrices import boundary, encloses
 from jimpact.fits.observables import UNUSABLE, Shots
 from jimpact.fits.problem import FitProblem
-from jimpact.fits.search import Solution
+from jimpact.fits.search import MEDIAN, Solution
 from jimpact.fits.solve import RANK_TOLERANCE
-from jimpact.fits.uncertainty import Uncertainty
+from jimpact.fits.uncertainty import uncertainty
 from jimpact.laws.kinematic import RestitutionMatrix
 from jimpact.status import STATUS
 
 # ------------------------------------------------------------------ thresholds of the fit
 LEVEL = 0.01  # of each test: how often it flags data that the law itself made
 _LEAST = 3  # degrees of freedom of the noise too few to test against
-MEDIAN = 1.4826  # sigma of a normal distribution over the median of its absolute values
 # A median of absolute values is as uncertain as a standard deviation of this share of the values
 # (Huber, 1981). Ten times more would make honest shots of small sets suspicious.
 MEDIAN_FREEDOM = 0.37
@@ -44,37 +41,69 @@ NO_SHOT = -1  # the place of a shot where a value belongs to none: a prior
 # ------------------------------------------------------------------ what the residuals show
 
 
-class Weighted(NamedTuple):
-    """Residuals (R,) of the measured values in units of sigma, derivatives (R, P), shots (R,).
+class Judged:
+    """A fit before it is reported, with its residuals as the tests need them.
 
-    Those of the priors come last, their shot is `NO_SHOT`.
+    Attributes:
+        residual: (R,) of the measured values in units of sigma, those of the priors last.
+        jacobian: (R, P) derivatives.
+        shot: (R,) shots, `NO_SHOT` of priors; `shots`: those that have residuals.
+        squares: the sum of squared residuals.
+        stretch: by how much errors are larger than stated, 1 where chi^2 does not reject them.
+        errors: of the parameters; with known errors of the data wider where the law does not fit.
+        freedom: degrees of freedom.
     """
 
-    residual: np.ndarray
-    jacobian: np.ndarray
-    shot: np.ndarray
+    def __init__(self, problem: FitProblem, solution: Solution, loss_noise: float | None):
+        """`loss_noise`: noise times the root of the degrees of freedom, of a robust loss."""
+        self.problem, self.solution, self.robust = problem, solution, loss_noise is not None
+        minimum, here = solution.minima[0], ~np.isnan(problem.measured).ravel()
+        of_value = np.nonzero(~np.isnan(np.atleast_1d(problem.measured)))[0]
+        self.shot = np.append(of_value, np.full(len(problem.priors), NO_SHOT))
+        self.shots = np.unique(of_value)
+        used = np.append(here, np.ones(len(problem.priors), bool))
+        # where the law fails, what a search takes for the residual is no error
+        errors = problem.independent(problem.measured - solution.predicted)
+        self.residual = np.append(errors, -minimum.residual[errors.size :])[used]
+        self.jacobian = minimum.jacobian[used]
+        self.squares = float(self.residual @ self.residual)
+        self.errors = uncertainty(problem, minimum)
+        self.freedom = self.errors.degrees_of_freedom
+        self.stretch = 1.0 if problem.sigma is None else self._stretch()
+        noise = self.stretch
+        if loss_noise is not None:
+            unknown = np.nan if problem.sigma is None else 1.0
+            noise = loss_noise / np.sqrt(self.freedom) if self.freedom > 0 else unknown
+        if noise != 1:
+            self.errors = uncertainty(problem, minimum, noise)
+
+    def _stretch(self) -> float:
+        """`stretch` of known errors.
+
+        Equation: `sqrt(chi^2 / freedom)`, of all residuals, or of those that are not momentum if
+        that is more: the errors of a law or its parameters are in these.
+        """
+        squares, freedom, data = self.squares, self.freedom, self.problem.experiments
+        tests = [(squares, freedom)]
+        if data is not None and not data.lost_freedom:
+            for k, basis in enumerate(_conserved(self.problem)):
+                if basis.shape[1]:
+                    squares -= float(np.sum((basis.T @ self.residual[self.shot == k]) ** 2))
+                    freedom -= basis.shape[1]
+            tests.append((max(squares, 0.0), freedom))
+        rejected = [s / f for s, f in tests if f > 0 and chdtrc(f, s) < LEVEL]
+        return float(np.sqrt(max(rejected, default=1.0)))
 
     @property
-    def squares(self) -> float:
-        """The sum of squared residuals."""
-        return float(self.residual @ self.residual)
+    def inexact(self) -> bool:
+        """Whether there are residuals to test."""
+        return self.freedom >= 1 and self.squares > self.problem.exact_squares
 
     @property
-    def shots(self) -> np.ndarray:
-        """The shots that have residuals."""
-        return np.unique(self.shot[self.shot != NO_SHOT])
-
-
-def weighted(problem: FitProblem, solution: Solution) -> Weighted:
-    """Residuals and derivatives as the tests need them."""
-    minimum, here = solution.minima[0], ~np.isnan(problem.measured).ravel()
-    of_value = np.nonzero(~np.isnan(np.atleast_1d(problem.measured)))[0]
-    shot = np.append(of_value, np.full(len(problem.priors), NO_SHOT))
-    used = np.append(here, np.ones(len(problem.priors), bool))
-    # where the law fails, what a search takes for the residual is no error
-    errors = problem.independent(problem.measured - solution.predicted)
-    residual = np.append(errors, -minimum.residual[errors.size :])
-    return Weighted(residual[used], minimum.jacobian[used], shot)
+    def shows_noise(self) -> bool:
+        """Whether residuals have to show the noise: those of shots without sigma."""
+        problem = self.problem
+        return self.inexact and problem.sigma is None and problem.experiments is not None
 
 
 def unusable(problem: FitProblem, solution: Solution) -> np.ndarray:
@@ -86,24 +115,6 @@ def unusable(problem: FitProblem, solution: Solution) -> np.ndarray:
     fails = [STATUS[code].name in UNUSABLE for code in solution.status]
     used = ~np.isnan(problem.measured).all(axis=1)
     return used & (np.array(fails) | ~(slope <= allowed).all(axis=(1, 2)))
-
-
-def stretch(problem: FitProblem, data: Weighted, rank: int) -> float:
-    """By how much errors are larger than stated, 1 where chi^2 does not reject them.
-
-    Equation: `sqrt(chi^2 / freedom)`, of all residuals, or of those that are not momentum if that
-    is more: the errors of a law or its parameters are in these.
-    """
-    squares, freedom = data.squares, problem.values - rank
-    tests = [(squares, freedom)]
-    if problem.experiments is not None and not problem.experiments.lost_freedom:
-        for k, basis in enumerate(_conserved(problem)):
-            if basis.shape[1]:
-                squares -= float(np.sum((basis.T @ data.residual[data.shot == k]) ** 2))
-                freedom -= basis.shape[1]
-        tests.append((max(squares, 0.0), freedom))
-    rejected = [s / f for s, f in tests if f > 0 and chdtrc(f, s) < LEVEL]
-    return float(np.sqrt(max(rejected, default=1.0)))
 
 
 def _conserved(problem: FitProblem) -> list[np.ndarray]:
@@ -119,9 +130,9 @@ def _conserved(problem: FitProblem) -> list[np.ndarray]:
     return bases
 
 
-def _noise(problem: FitProblem, data: Weighted) -> tuple[float, int]:
+def _noise(judged: Judged) -> tuple[float, int]:
     """Sum of squares that no law can change, and its degrees of freedom."""
-    experiments = problem.experiments
+    problem, experiments = judged.problem, judged.problem.experiments
     assert experiments is not None
     groups: dict[Any, list[int]] = {}
     for k, pre in enumerate(np.asarray(experiments.pre)):
@@ -130,7 +141,7 @@ def _noise(problem: FitProblem, data: Weighted) -> tuple[float, int]:
     conserved, bodies = _conserved(problem), problem.measured.shape[1]
     squares, count = 0.0, 0
     for shots in groups.values():
-        blocks = [data.residual[data.shot == k] for k in shots]
+        blocks = [judged.residual[judged.shot == k] for k in shots]
         whole = np.array([block for block in blocks if len(block) == bodies])
         if len(whole) == 0:
             continue
@@ -165,118 +176,117 @@ def _range(problem: FitProblem, matrix: np.ndarray, size: float | None = None) -
 # ------------------------------------------------------------------ what is wrong with the fit
 
 
-@dataclass(frozen=True)
-class _Judged:
-    """A fit before it is reported."""
-
-    problem: FitProblem
-    solution: Solution
-    errors: Uncertainty
-    robust: bool
-
-    @functools.cached_property
-    def residuals(self) -> Weighted:
-        """As the tests need them."""
-        return weighted(self.problem, self.solution)
-
-    @property
-    def freedom(self) -> int:
-        """Degrees of freedom."""
-        return self.errors.degrees_of_freedom
-
-    @property
-    def inexact(self) -> bool:
-        """Whether there are residuals to test."""
-        return self.freedom >= 1 and self.residuals.squares > self.problem.exact_squares
-
-    @property
-    def shows_noise(self) -> bool:
-        """Whether residuals have to show the noise: those of shots without sigma."""
-        problem = self.problem
-        return self.inexact and problem.sigma is None and problem.experiments is not None
-
-
-def _left_out(judged: _Judged) -> Iterable[dict[str, Any]]:
+def _left_out(judged: Judged) -> Iterator[Finding]:
     """Shots that were left out."""
     for line in judged.problem.left_out:
-        yield {"line": line, "count": line.removeprefix("Left out: ").split(" (")[0]}
+        yield Finding(line, line.removeprefix("Left out: ").split(" (")[0] + " are left out")
 
 
-def _unknown_corrections(judged: _Judged) -> Iterable[dict[str, Any]]:
+def _unknown_corrections(judged: Judged) -> Iterator[Finding]:
     """Shots with `sigma_pre` and a correction that is not that of momentum."""
     data = judged.problem.experiments
     if data is None or data.sigma_pre is None:
         return
-    kept = kept_by_corrections(data, judged.problem.scene)
-    unknown = [data.shots[k] for k, one in enumerate(kept) if data.lost[k] and one is None]
-    if unknown:
-        yield {"shots": listed(unknown)}
+    whole = kept_by_corrections(data, judged.problem.scene) == np.eye(data.pre.shape[1])
+    unknown = np.flatnonzero((np.array(data.lost) > 0) & whole.all(axis=(1, 2)))
+    if unknown.size:
+        yield Finding(
+            f"The fit weighs shots {listed([data.shots[k] for k in unknown])} as if they were not "
+            "corrected: they have `lost_freedom`, but do not conserve momentum, so that the errors "
+            "that `sigma_pre` leaves in them are unknown; chi^2 and standard errors are "
+            "approximate."
+        )
 
 
-def _statuses(judged: _Judged) -> Iterable[dict[str, Any]]:
+def _search(judged: Judged) -> Iterator[Finding]:
+    """A kink for a minimum; a search that has not ended."""
+    if judged.solution.stuck:
+        yield Finding(
+            "The minimum is a kink of the law (the sequence of contacts changes there, or its "
+            "derivatives are wrong): standard errors do not hold."
+        )
+    if not judged.solution.converged:
+        yield Finding(
+            "The fit has not converged: allow more `max_steps`, `starts` or time (`limit`)."
+        )
+
+
+def _statuses(judged: Judged) -> Iterator[Finding]:
     """The shots in which the fitted law fails."""
     data, status = judged.problem.experiments, judged.solution.status
     for code in np.unique(status) if data is not None else ():
         if STATUS[code].failure:
             labels = [data.shots[k] for k in np.flatnonzero(status == code)]  # type: ignore[union-attr]
             count = f"{len(labels)} of {len(status)} shots ({listed(labels)})"
-            yield {"count": count, "name": STATUS[code].name, "message": STATUS[code].message}
+            name, message = STATUS[code].name, STATUS[code].message
+            yield Finding(f"The fitted law fails in {count}: {name}, {message}.")
 
 
-def _edges(judged: _Judged) -> Iterable[dict[str, Any]]:
-    """Conditions on a restitution matrix that it ends at."""
-    problem = judged.problem
-    edges = boundary(problem.matrix, problem.point(judged.solution.value))
-    return [{"edges": "; ".join(edges)}] if edges else []
-
-
-def _unbound_matrix(judged: _Judged) -> Iterable[dict[str, Any]]:
-    """A restitution matrix that need not be consistent."""
-    law, data = judged.problem.law, judged.problem.experiments
+def _matrix(judged: Judged) -> Iterator[Finding]:
+    """Conditions on a restitution matrix that it ends at, or that it need not satisfy."""
+    problem, law, data = judged.problem, judged.problem.law, judged.problem.experiments
+    if edges := boundary(problem.matrix, problem.point(judged.solution.value)):
+        yield Finding(
+            f"The matrix ends at the edge of the admissible ones ({'; '.join(edges)}): the errors "
+            "hold for the side inside."
+        )
     if data is None or not isinstance(law, RestitutionMatrix):
-        return []
-    contacts = data.largest_scene(judged.problem.scene).contacts
-    return [] if encloses(law, contacts) else [{}]
+        return
+    if not encloses(law, data.largest_scene(problem.scene).contacts):
+        yield Finding(
+            "Nothing keeps this matrix consistent for other approach velocities than the measured: "
+            "the conditions are for (m, m) matrices with admissible=True."
+        )
 
 
-def _not_finite(judged: _Judged) -> Iterable[dict[str, Any]]:
+def _not_finite(judged: Judged) -> Iterator[Finding]:
     """Which values of a user's own function are not finite at the fitted parameters."""
     problem = judged.problem
     lost = np.isfinite(problem.measured) & ~np.isfinite(judged.solution.predicted)
     if problem.experiments is None and lost.any():
         which, values = np.flatnonzero(lost), problem.values - len(problem.priors)
-        yield {"count": len(which), "total": values, "which": listed([str(i + 1) for i in which])}
+        yield Finding(
+            f"The fitted law fails in {len(which)} of {values} values "
+            f"({listed([str(i + 1) for i in which])}): they are not finite there and count as "
+            "large errors."
+        )
 
 
-def _beyond_sigma(judged: _Judged) -> Iterable[dict[str, Any]]:
+def _beyond_sigma(judged: Judged) -> Iterator[Finding]:
     """Residuals larger than sigma allows."""
     if not judged.inexact or judged.problem.sigma is None:
         return
-    times = stretch(judged.problem, judged.residuals, judged.errors.rank)
-    if times > 1:
+    if judged.stretch > 1:
         how = "are those of the loss" if judged.robust else "are stretched by that"
-        squares, freedom = judged.residuals.squares, judged.freedom
-        yield {"times": times, "squares": squares, "freedom": freedom, "how": how}
+        yield Finding(
+            f"Lack of fit: the residuals are {judged.stretch:.2g} times what sigma allows (chi^2 = "
+            f"{judged.squares:.4g} with {judged.freedom} degrees of freedom): the law or "
+            f"the stated errors are wrong, or the parameters scatter; the standard errors {how}."
+        )
 
 
-def _beyond_noise(judged: _Judged) -> Iterable[dict[str, Any]]:
+def _beyond_noise(judged: Judged) -> Iterator[Finding]:
     """What the law leaves over, against the noise of momentum and of repeated shots."""
-    problem, data = judged.problem, judged.residuals
+    problem = judged.problem
     if not judged.shows_noise:
         return
-    noise, count = _noise(problem, data)
+    noise, count = _noise(judged)
     rest = judged.freedom - count
     if count < _LEAST or rest < 1:
         return
-    left = max(data.squares - noise, 0.0)
+    left = max(judged.squares - noise, 0.0)
     ratio = left / rest / max(noise / count, _reading_variance(problem))
     if fdtrc(rest, count, ratio) < LEVEL:
-        yield {"times": np.sqrt(ratio), "rest": rest, "count": count}
+        yield Finding(
+            f"Lack of fit: the residuals are {np.sqrt(ratio):.2g} times the noise that momentum "
+            f"and repeated shots show ({rest} and {count} degrees of freedom): the law does not "
+            "fit, and the standard errors mean little."
+        )
 
 
-def _pattern(judged: _Judged) -> Iterable[dict[str, Any]]:
+def _pattern(judged: Judged) -> Iterator[Finding]:
     """Whether the residuals are proportional to the velocities before: by an F test."""
-    problem, data, rest = judged.problem, judged.residuals, judged.freedom
+    problem, rest = judged.problem, judged.freedom
     if not judged.shows_noise or list(_beyond_noise(judged)):  # which says enough
         return
     assert problem.experiments is not None
@@ -285,11 +295,11 @@ def _pattern(judged: _Judged) -> Iterable[dict[str, Any]]:
     basis = u[:, singular > ROUNDING * singular[0]]
     body = np.broadcast_to(np.arange(pre.shape[1]), problem.measured.shape)
     body = body[~np.isnan(problem.measured)]
-    more = np.hstack([basis[data.shot] * (body == i)[:, None] for i in range(pre.shape[1])])
-    residual, known = data.residual.copy(), _range(problem, data.jacobian)
+    more = np.hstack([basis[judged.shot] * (body == i)[:, None] for i in range(pre.shape[1])])
+    residual, known = judged.residual.copy(), _range(problem, judged.jacobian)
     for k, momentum in enumerate(_conserved(problem)):  # no law explains that part
         if momentum.shape[1]:
-            rows = data.shot == k
+            rows = judged.shot == k
             more[rows] -= momentum @ (momentum.T @ more[rows])
             residual[rows] -= momentum @ (momentum.T @ residual[rows])
             rest -= 0 if problem.experiments.lost_freedom else momentum.shape[1]
@@ -302,30 +312,37 @@ def _pattern(judged: _Judged) -> Iterable[dict[str, Any]]:
         return
     ratio = explained / count / (left / rest)
     if fdtrc(count, rest, ratio) < LEVEL:
-        yield {"ratio": ratio, "count": count, "rest": rest}
+        yield Finding(
+            f"Lack of fit: the residuals follow the velocities before the impact (F = {ratio:.3g} "
+            f"with {count} and {rest} degrees of freedom): the law does not fit."
+        )
 
 
-def _contradicted_priors(judged: _Judged) -> Iterable[dict[str, Any]]:
+def _contradicted_priors(judged: Judged) -> Iterator[Finding]:
     """Priors that the data, fitted without them, would not expect: each against N(0, 1)."""
-    problem, data = judged.problem, judged.residuals
+    problem = judged.problem
     if not judged.inexact:
         return
-    known = _range(problem, data.jacobian)
-    for row, prior in zip(np.flatnonzero(data.shot == NO_SHOT), problem.priors):
+    known = _range(problem, judged.jacobian)
+    for row, prior in zip(np.flatnonzero(judged.shot == NO_SHOT), problem.priors):
         left = 1 - float(known[row] @ known[row])  # variance of the residual; 0: the prior decides
         if left <= RANK_TOLERANCE[problem.precision]:
             continue
-        far = float(abs(data.residual[row]) / np.sqrt(left))
+        far = float(abs(judged.residual[row]) / np.sqrt(left))
         if chdtrc(1, far**2) < LEVEL / len(problem.priors):
             name = problem.names[prior.parameter]
-            yield {"name": name, "mean": prior.mean, "std": prior.std, "far": far}
+            yield Finding(
+                f"The data contradict the prior {name} = {prior.mean:g} ± {prior.std:g}: what they "
+                f"say without it is {far:.2g} standard errors off.",
+                f"the prior of {name} contradicts the data",
+            )
 
 
-def _suspicious(judged: _Judged) -> Iterable[dict[str, Any]]:
+def _suspicious(judged: Judged) -> Iterator[Finding]:
     """Shots that the others, fitted without them, would not expect."""
     if not judged.inexact or judged.problem.experiments is None:
         return
-    labels, count = judged.problem.experiments.shots, len(judged.residuals.shots)
+    labels, count = judged.problem.experiments.shots, len(judged.shots)
     suspects = [
         (squares, labels[k])
         for k, squares, chance in _against_others(judged)
@@ -335,181 +352,112 @@ def _suspicious(judged: _Judged) -> Iterable[dict[str, Any]]:
         return
     worst = ", ".join(label for _, label in sorted(suspects, reverse=True)[:LISTED])
     worst += f" and {len(suspects) - LISTED} more" if len(suspects) > LISTED else ""
-    several = len(suspects) > 1
-    yield {
-        "shots": f"shot{'s' * several} {worst}",
-        "are": "are" if several else "is",
-        "count": count,
-        "advice": "" if judged.robust else ", or fit with loss='huber'",
-    }
+    shots, are = (f"shots {worst}", "are") if len(suspects) > 1 else (f"shot {worst}", "is")
+    advice = "" if judged.robust else ", or fit with loss='huber'"
+    yield Finding(
+        f"Suspicious: {shots}, which the others do not expect (of {count}); look there for "
+        f"errors{advice}.",
+        f"{shots} {are} suspicious",
+    )
 
 
-def _against_others(judged: _Judged) -> Iterable[tuple[int, float, float]]:
+def _against_others(judged: Judged) -> Iterable[tuple[int, float, float]]:
     """Every shot, its sum of squares, how often the noise of the others is as large: F tests.
 
     The others are fitted without it; after a robust loss their noise is that of the median
     residual, which many outliers together do not hide in. `sigma`, if known, is the least noise.
     """
-    problem, data, freedom = judged.problem, judged.residuals, judged.freedom
-    known, reading = _range(problem, data.jacobian), _reading_variance(problem)
-    median = MEDIAN * float(np.median(np.abs(data.residual)))
-    for k in data.shots:
-        rows = data.shot == k
-        r, q, n = data.residual[rows], known[rows], int(rows.sum())
+    problem, freedom = judged.problem, judged.freedom
+    known, reading = _range(problem, judged.jacobian), _reading_variance(problem)
+    median = MEDIAN * float(np.median(np.abs(judged.residual)))
+    for k in judged.shots:
+        rows = judged.shot == k
+        r, q, n = judged.residual[rows], known[rows], int(rows.sum())
         rest = MEDIAN_FREEDOM * freedom if judged.robust else freedom - n
         if rest < _LEAST:
             continue
         if judged.robust:
-            squares, noise = float(r @ r), median**2 * len(data.residual) / freedom
+            squares, noise = float(r @ r), median**2 * len(judged.residual) / freedom
         else:
             squares = float(r @ np.linalg.lstsq(np.eye(n) - q @ q.T, r, rcond=1e-9)[0])
-            noise = max(data.squares - squares, 0.0) / rest
+            noise = max(judged.squares - squares, 0.0) / rest
         noise = max(noise + reading, 0.0 if problem.sigma is None else 1.0)
         yield int(k), squares, float(fdtrc(n, rest, squares / n / noise)) if noise else 0.0
 
 
-def _at_bounds(judged: _Judged) -> Iterable[dict[str, Any]]:
+def _units(judged: Judged) -> Iterator[Finding]:
+    """How velocities of different units are weighed without sigma."""
+    data = judged.problem.experiments
+    if data is not None and data.sigma is None and len(set(data.units)) > 1:
+        yield Finding(
+            "Without sigma, velocities in rad/s weigh like those in m/s of the same kinetic energy."
+        )
+
+
+def _at_bounds(judged: Judged) -> Iterator[Finding]:
     """Parameters at a bound."""
     for i in np.flatnonzero(judged.solution.at_bound):
-        value = judged.solution.value[i]
+        name, value = judged.problem.names[i], judged.solution.value[i]
         upper = value >= judged.problem.domains[i, 1]
         end, towards = ("upper", "smaller") if upper else ("lower", "larger")
-        yield {"name": judged.problem.names[i], "end": end, "value": value, "towards": towards}
+        yield Finding(
+            f"{name} is at its {end} bound {value:g}; its standard error only holds towards "
+            f"{towards} values."
+        )
 
 
-def _undetermined(judged: _Judged) -> Iterable[dict[str, Any]]:
-    """Fewer parameters determined than fitted."""
+def _choices(judged: Judged) -> Iterator[Finding]:
+    """Fewer parameters determined than fitted, or several minima that fit as well as the best."""
     rank, count = judged.errors.rank, len(judged.problem.names)
-    return [{"rank": rank, "count": count}] if rank < count else []
-
-
-def _equally_good(judged: _Judged) -> Iterable[dict[str, Any]]:
-    """Several minima that fit as well as the best."""
-    problem, minima = judged.problem, judged.solution.minima
-    noise = judged.errors.noise if np.isfinite(judged.errors.noise) else 0.0
-    more = max(EQUALLY_GOOD * noise**2, problem.exact_squares)
+    minima, noise = judged.solution.minima, np.nan_to_num(judged.errors.noise)
+    more = max(EQUALLY_GOOD * noise**2, judged.problem.exact_squares)
     several = sum(end.sum_of_squares <= minima[0].sum_of_squares + more for end in minima)
-    return [{"several": several}] if several > 1 and not _undetermined(judged) else []
+    if rank < count:
+        yield Finding(
+            f"The data determine {rank} of {count} parameters (rank {rank} of {count}); the values "
+            "given are one choice of many."
+        )
+    elif several > 1:
+        yield Finding(f"{several} different minima fit equally well: see the starts.")
 
 
-def _when(condition: Callable[[_Judged], Any]) -> Callable[[_Judged], Iterable[dict[str, Any]]]:
-    """A test that yields no numbers."""
-    return lambda judged: [{}] if condition(judged) else []
+def _unknown_errors(judged: Judged) -> Iterator[Finding]:
+    """Data without sigma that do not show their noise."""
+    if judged.problem.sigma is not None:
+        return
+    if judged.freedom < 1:
+        yield Finding(
+            "No degree of freedom is left to estimate the noise: errors are unknown without sigma."
+        )
+    elif judged.solution.minima[0].sum_of_squares <= judged.problem.exact_squares:
+        yield Finding(
+            "The data are reproduced to the last digit and do not show their noise: errors are "
+            "unknown without `sigma` or `resolution`."
+        )
 
 
-FIT_ROWS = (
-    Check(
-        _unknown_corrections,
-        "The fit weighs shots {shots} as if they were not corrected: they have `lost_freedom`, but "
-        "do not conserve momentum, so that the errors that `sigma_pre` leaves in them are unknown; "
-        "chi^2 and standard errors are approximate.",
-    ),
-    Check(
-        _when(lambda judged: judged.solution.stuck),
-        "The minimum is a kink of the law (the sequence of contacts changes there, or its "
-        "derivatives are wrong): standard errors do not hold.",
-    ),
-    Check(
-        _when(lambda judged: not judged.solution.converged),
-        "The fit has not converged: allow more `max_steps`, `starts` or time (`limit`).",
-    ),
-    Check(_statuses, "The fitted law fails in {count}: {name}, {message}."),
-    Check(
-        _edges,
-        "The matrix ends at the edge of the admissible ones ({edges}): the errors hold for the "
-        "side inside.",
-    ),
-    Check(
-        _unbound_matrix,
-        "Nothing keeps this matrix consistent for other approach velocities than the measured: the "
-        "conditions are for (m, m) matrices with admissible=True.",
-    ),
-    Check(
-        _not_finite,
-        "The fitted law fails in {count} of {total} values ({which}): they are not finite there "
-        "and count as large errors.",
-    ),
-    Check(
-        _beyond_sigma,
-        "Lack of fit: the residuals are {times:.2g} times what sigma allows (chi^2 = {squares:.4g} "
-        "with {freedom} degrees of freedom): the law or the stated errors are wrong, or the "
-        "parameters scatter; the standard errors {how}.",
-    ),
-    Check(
-        _beyond_noise,
-        "Lack of fit: the residuals are {times:.2g} times the noise that momentum and repeated "
-        "shots show ({rest} and {count} degrees of freedom): the law does not fit, and the "
-        "standard errors mean little.",
-    ),
-    Check(
-        _pattern,
-        "Lack of fit: the residuals follow the velocities before the impact (F = {ratio:.3g} with "
-        "{count} and {rest} degrees of freedom): the law does not fit.",
-    ),
-    Check(
-        _contradicted_priors,
-        "The data contradict the prior {name} = {mean:g} ± {std:g}: what they say without it is "
-        "{far:.2g} standard errors off.",
-        "the prior of {name} contradicts the data",
-    ),
-    Check(
-        _suspicious,
-        "Suspicious: {shots}, which the others do not expect (of {count}); look there for "
-        "errors{advice}.",
-        "{shots} {are} suspicious",
-    ),
-    Check(
-        _when(
-            lambda judged: (
-                judged.problem.experiments is not None
-                and judged.problem.sigma is None
-                and len(set(judged.problem.experiments.units)) > 1
-            )
-        ),
-        "Without sigma, velocities in rad/s weigh like those in m/s of the same kinetic energy.",
-    ),
-    Check(
-        _at_bounds,
-        "{name} is at its {end} bound {value:g}; its standard error only holds towards {towards} "
-        "values.",
-    ),
-    Check(
-        _undetermined,
-        "The data determine {rank} of {count} parameters (rank {rank} of {count}); the values "
-        "given are one choice of many.",
-    ),
-    Check(_equally_good, "{several} different minima fit equally well: see the starts."),
-    Check(
-        _when(lambda judged: judged.freedom < 1 and judged.problem.sigma is None),
-        "No degree of freedom is left to estimate the noise: errors are unknown without sigma.",
-    ),
-    Check(
-        _when(
-            lambda judged: (
-                judged.freedom >= 1
-                and judged.problem.sigma is None
-                and judged.solution.minima[0].sum_of_squares <= judged.problem.exact_squares
-            )
-        ),
-        "The data are reproduced to the last digit and do not show their noise: errors are unknown "
-        "without `sigma` or `resolution`.",
-    ),
-    Check(
-        _when(lambda judged: judged.problem.precision == "float32"),
-        "Computed in float32: values are good to about 1e-3, and the rank is judged coarsely. "
-        'jax.config.update("jax_enable_x64", True) gives float64.',
-    ),
+def _precision(judged: Judged) -> Iterator[Finding]:
+    """Fits in single precision."""
+    if judged.problem.precision == "float32":
+        yield Finding(
+            "Computed in float32: values are good to about 1e-3, and the rank is judged coarsely. "
+            'jax.config.update("jax_enable_x64", True) gives float64.'
+        )
+
+
+FIT_CHECKS = (
+    *(_unknown_corrections, _search, _statuses, _matrix, _not_finite),
+    *(_beyond_sigma, _beyond_noise, _pattern, _contradicted_priors, _suspicious),
+    *(_units, _at_bounds, _choices, _unknown_errors, _precision),
 )
 
 
-def fit_warnings(
-    problem: FitProblem, solution: Solution, errors: Uncertainty, robust: bool
-) -> list[Finding]:
+def fit_warnings(judged: Judged) -> list[Finding]:
     """All warnings, those about the data first."""
-    judged, data = _Judged(problem, solution, errors, robust), problem.experiments
-    found = findings([Check(_left_out, "{line}", "{count} are left out")], judged)
+    problem, data = judged.problem, judged.problem.experiments
+    found = list(_left_out(judged))
     if data is not None:
         contacts = data.largest_scene(problem.scene).contacts
         stored = float(np.sum(np.broadcast_to(np.asarray(problem.law.stored), contacts)))
-        found += findings(DATA_ROWS, DataBalances(data, problem.scene, stored))
-    return found + findings(FIT_ROWS, judged)
+        found += findings(DATA_CHECKS, DataBalances(data, problem.scene, stored))
+    return found + findings(FIT_CHECKS, judged)

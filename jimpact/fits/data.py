@@ -87,20 +87,17 @@ class Experiments(eqx.Module):
         measured = ~np.isnan(np.asarray(self.post))
         if not measured.any():
             raise ValueError("Argument `post` must hold a measured value, but all are missing.")
-        self.sigma = None if sigma is None else _as_sigma("sigma", sigma, measured)
-        self.resolution = None
-        if resolution is not None:
-            self.resolution = _as_sigma("resolution", resolution, measured)
+        self.sigma = _as_sigma("sigma", sigma, measured)
+        self.resolution = _as_sigma("resolution", resolution, measured)
+        self.sigma_pre = _as_sigma("sigma_pre", sigma_pre, measured | True, zero=True)
+        if self.resolution is not None:
             rounding = self.resolution / np.sqrt(12)
             self.sigma = rounding if self.sigma is None else jnp.hypot(self.sigma, rounding)
-        self.sigma_pre = None
-        if sigma_pre is not None:
-            self.sigma_pre = _as_sigma("sigma_pre", sigma_pre, measured | True, 0.0)
-            if self.sigma is None:
-                raise ValueError(
-                    "Argument `sigma` must be given where `sigma_pre` is, but is None: the errors "
-                    "before and after the impact weigh against each other."
-                )
+        if self.sigma_pre is not None and self.sigma is None:
+            raise ValueError(
+                "Argument `sigma` must be given where `sigma_pre` is, but is None: the errors "
+                "before and after the impact weigh against each other."
+            )
         self.scenes = None if scenes is None else _as_scenes(scenes, self.pre.shape)
         labels = shots if shots is not None else range(1, len(measured) + 1)
         self.shots = tuple(str(label) for label in labels)
@@ -122,18 +119,17 @@ class Experiments(eqx.Module):
     def __str__(self) -> str:
         """How many shots, what is known of their errors, and the first of them."""
         count, n = self.pre.shape
-        missing = int((~self.measured).sum())
+        missing, sigma = int((~self.measured).sum()), self.sigma
         units = ", ".join(dict.fromkeys(self.units))
         lines = [f"{count} shot{'s' * (count > 1)} of {n} velocities [{units}]"]
         if missing:
             lines.append(f"{missing} of {self.post.size} velocities after were not measured")
-        if self.sigma is None:
-            lines.append("sigma    not known")
-        else:
-            lines.append(f"sigma    {np.nanmin(self.sigma):.3g} to {np.nanmax(self.sigma):.3g}")
-        for k in range(min(count, _PRINTED)):
-            before, after = in_numbers(self.pre[k]), in_numbers(self.post[k])
-            lines.append(f"shot {self.shots[k]}: {before} -> {after}")
+        known = (
+            "not known" if sigma is None else f"{np.nanmin(sigma):.3g} to {np.nanmax(sigma):.3g}"
+        )
+        lines.append(f"sigma    {known}")
+        for label, before, after in zip(self.shots[:_PRINTED], self.pre, self.post):
+            lines.append(f"shot {label}: {in_numbers(before)} -> {in_numbers(after)}")
         if count > _PRINTED:
             lines.append(f"... and {count - _PRINTED} more")
         return "\n".join(lines)
@@ -173,9 +169,9 @@ class Experiments(eqx.Module):
     def momentum_ratio(self, scene: Scene | None = None) -> np.ndarray:
         """Conserved momentum after over before in a scene (K, c); inf or NaN where none was."""
         rows = []
-        for m, pre, post in self.balances(scene):
-            before, rounding = m @ pre, 1e-12 * np.abs(m) @ np.abs(pre)
-            with np.errstate(divide="ignore", invalid="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            for m, pre, post in self.balances(scene):
+                before, rounding = m @ pre, 1e-12 * np.abs(m) @ np.abs(pre)
                 rows.append((m @ post) / np.where(np.abs(before) > rounding, before, 0.0))
         return _filled(rows)
 
@@ -214,19 +210,20 @@ class Experiments(eqx.Module):
     def _with(self, **changed: Any) -> "Experiments":
         """A copy with other fields."""
         fields = self._of_each_shot() | {"units": self.units} | changed
-        for name in _VALUES:
-            fields[name] = None if fields[name] is None else np.asarray(fields[name])
         resolution = fields.pop("resolution")
         # what it adds to sigma is there already
         return eqx.tree_at(
-            _RESOLUTION, Experiments(**fields), resolution, is_leaf=lambda x: x is None
+            _RESOLUTION,
+            Experiments(**fields),
+            None if resolution is None else np.asarray(resolution),
+            is_leaf=lambda x: x is None,
         )
 
     def _of_each_shot(self) -> dict[str, Any]:
         """What each shot has, by the name of its argument; None: no shot has it."""
-        names = (*_VALUES, "scenes", "shots")
-        fields = {"lost_freedom": self.lost} | {name: getattr(self, name) for name in names}
-        return {name: np.asarray(x) if eqx.is_array(x) else x for name, x in fields.items()}
+        values = {name: getattr(self, name) for name in _VALUES}
+        fields = {name: None if x is None else np.asarray(x) for name, x in values.items()}
+        return fields | {"scenes": self.scenes, "shots": self.shots, "lost_freedom": self.lost}
 
     def with_contacts(self, contacts: int | Sequence[int]) -> "Experiments":
         """The shots on such numbers of `contacts`."""
@@ -353,16 +350,16 @@ def _smallest_change(data: Experiments, k: int, rows: np.ndarray) -> np.ndarray:
     return np.asarray(weighted @ np.linalg.inv(rows @ weighted))
 
 
-def kept_by_corrections(data: Experiments, scene: Scene | None) -> list[np.ndarray | None]:
-    """Of every shot the projector (n, n) by which its momentum was corrected; None: it was not.
+def kept_by_corrections(data: Experiments, scene: Scene | None) -> np.ndarray:
+    """(K, n, n) projectors by which the momentum of shots was corrected, identities if it was not.
 
     Equation: `I - S m^T (m S m^T)^-1 m` with m = C^T M and S = diag(sigma^2).
     """
-    kept: list[np.ndarray | None] = []
+    kept = np.tile(np.eye(data.pre.shape[1]), (len(data.shots), 1, 1))
     for k, (m, pre, post) in enumerate(data.balances(scene)):
         rounding = ROUNDING * np.abs(m) @ (np.abs(pre) + np.abs(post))
-        corrected = 0 < len(m) <= data.lost[k] and (np.abs(m @ (post - pre)) <= rounding).all()
-        kept.append(np.eye(len(pre)) - _smallest_change(data, k, m) @ m if corrected else None)
+        if 0 < len(m) <= data.lost[k] and (np.abs(m @ (post - pre)) <= rounding).all():
+            kept[k] -= _smallest_change(data, k, m) @ m
     return kept
 
 
@@ -403,8 +400,10 @@ def _as_rows(name: str, value: Any) -> jax.Array:
     return array
 
 
-def _as_sigma(name: str, value: Any, measured: np.ndarray, least: float | None = None) -> jax.Array:
-    """Standard errors as (K, n), NaN where no value was measured; `least` 0.0: 0 is allowed."""
+def _as_sigma(name: str, value: Any, measured: np.ndarray, zero: bool = False) -> jax.Array | None:
+    """Standard errors as (K, n), NaN where no value was measured; `zero`: whether 0 is allowed."""
+    if value is None:
+        return None
     sigma = as_float_array(name, value)
     check_concrete(name, sigma)
     if sigma.shape == measured.shape[1:] and len(measured) == 1:
@@ -414,10 +413,8 @@ def _as_sigma(name: str, value: Any, measured: np.ndarray, least: float | None =
             f"Argument `{name}` must be a scalar or have shape {measured.shape} like `post`, "
             f"but has shape {tuple(sigma.shape)}."
         )
-    sigma = jnp.broadcast_to(sigma, measured.shape)
     # the error of a value that was not measured does not matter
-    of_measured = np.where(measured, np.asarray(sigma), 1.0)
-    check_values(name, of_measured, low=0.0, open_low=least is None)
+    check_values(name, np.where(measured, np.asarray(sigma), 1.0), low=0.0, open_low=not zero)
     return jnp.where(measured, sigma, jnp.nan)
 
 

@@ -1,6 +1,6 @@
-"""What is wrong with measured shots: rows of a test and the sentence that the report has for it."""
+"""What is wrong with measured shots: tests, each with the sentence that the report has for it."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -37,21 +37,9 @@ class Finding(NamedTuple):
     reservation: str = ""
 
 
-class Check(NamedTuple):
-    """A row: its test yields the numbers of each finding, for the sentences to format."""
-
-    test: Callable[[Any], Iterable[dict[str, Any]]]
-    sentence: str
-    reservation: str = ""
-
-
-def findings(rows: Sequence[Check], judged: Any) -> list[Finding]:
-    """What the tests of these rows find, in words."""
-    return [
-        Finding(row.sentence.format(**each), row.reservation.format(**each))
-        for row in rows
-        for each in row.test(judged)
-    ]
+def findings(checks: Sequence[Callable[[Any], Iterator[Finding]]], judged: Any) -> list[Finding]:
+    """What these checks find, one after the other."""
+    return [found for check in checks for found in check(judged)]
 
 
 def share(count: int, total: int) -> str:
@@ -70,67 +58,88 @@ def share(count: int, total: int) -> str:
 
 
 class _Defect(NamedTuple):
-    """By how much a balance of the k-th shot fails, its scale, the momentum or energy before,
-    derivatives in v+ (and v-), their errors, a ratio."""
+    """By how much a balance of the k-th shot fails, its scale, the momentum or energy before, a
+    ratio, the standard error of the excess (with a sigma of 1 where it is not known)."""
 
     k: int
     excess: float
     scale: float
     before: float
-    slope: np.ndarray
-    sigma: np.ndarray | None
     ratio: float
+    error: float
 
 
 class DataBalances:
-    """Measured shots with the balances of each."""
+    """Measured shots with the balances of each; those with missing values are not judged.
+
+    Momentum is reported as `1 + excess / sum |m v-|`, the excess in the direction of the momentum
+    before: after over before where all bodies move one way. Without `sigma` the shots show their
+    noise: a defect is one that they have in common, the same excess or the same share of the
+    momentum before, whichever way that points (t tests), or one of half of the momentum in half of
+    the shots; of a single shot any above a tenth of a percent.
+
+    Args:
+        experiments: the shots.
+        scene: the common scene, None where the shots carry their own.
+        stored_energy: what the law may add to the energy (precompression) [J].
+    """
 
     def __init__(self, experiments: Experiments, scene: Scene | None, stored_energy: float):
-        self.experiments, self.scene, self.stored_energy = experiments, scene, stored_energy
+        self.experiments, self.scene = experiments, scene
         self.total = len(experiments.shots)
         self.momenta: dict[int, list[_Defect]] = {}  # by the momentum that is conserved
         self.energies: list[_Defect] = []
         self.resting: list[int] = []  # shots in which no contact approaches
-        errors = None if experiments.sigma is None else np.asarray(experiments.sigma, float)
-        if errors is not None and experiments.sigma_pre is not None:
-            errors = np.hstack([errors, np.asarray(experiments.sigma_pre, float)])
+        known, unknown = (experiments.sigma, experiments.sigma_pre), np.ones(experiments.pre.shape)
+        errors = [np.asarray(x, float) for x in known if x is not None] or [unknown]
         normals, masses = (experiments.each(scene, f) for f in (closed_normals, dense_mass))
-        for k, (rows, pre, post) in enumerate(experiments.balances(scene)):
-            slowest = -ROUNDING * np.abs(normals[k]).T @ np.abs(pre)
-            if stored_energy == 0 and (normals[k].T @ pre >= slowest).all():
+        balances = zip(experiments.balances(scene), normals, masses, np.hstack(errors))
+        for k, ((rows, pre, post), normal, mass, sigma) in enumerate(balances):
+            slowest = -ROUNDING * np.abs(normal).T @ np.abs(pre)
+            if stored_energy == 0 and (normal.T @ pre >= slowest).all():
                 self.resting.append(k)
-            if not np.isnan(post).any():
-                self._judge(k, rows, pre, post, masses[k], None if errors is None else errors[k])
+            if np.isnan(post).any():
+                continue
+            for j, row in enumerate(rows):
+                excess, scale, before = row @ (post - pre), np.abs(row) @ np.abs(pre), row @ pre
+                back = before < -ROUNDING * scale
+                ratio = 1 + (-excess if back else excess) / scale if scale else np.inf
+                error = np.linalg.norm(np.append(row, -row)[: len(sigma)] * sigma)
+                defect = _Defect(k, excess, scale, before, ratio, float(error))
+                self.momenta.setdefault(j, []).append(defect)
+            t_minus, t_plus = 0.5 * pre @ mass @ pre, 0.5 * post @ mass @ post
+            gain, ratio = t_plus - t_minus - stored_energy, t_plus / t_minus if t_minus else np.nan
+            error = np.linalg.norm(np.append(mass @ post, -mass @ pre)[: len(sigma)] * sigma)
+            self.energies.append(_Defect(k, gain, t_minus, t_minus, ratio, float(error)))
 
-    def _judge(
-        self, k: int, rows: Any, pre: Any, post: Any, mass: np.ndarray, sigma: np.ndarray | None
-    ) -> None:
-        """Momentum and energy of a shot before and after."""
-        used = slice(len(post) if sigma is None else len(sigma))
-        for j, row in enumerate(rows):
-            excess, scale, before = row @ (post - pre), np.abs(row) @ np.abs(pre), row @ pre
-            back = before < -ROUNDING * scale
-            ratio = 1 + (-excess if back else excess) / scale if scale else np.inf
-            slope = np.append(row, -row)[used]
-            defect = _Defect(k, excess, scale, before, slope, sigma, ratio)
-            self.momenta.setdefault(j, []).append(defect)
-        t_minus, t_plus = 0.5 * pre @ mass @ pre, 0.5 * post @ mass @ post
-        gain = t_plus - t_minus - self.stored_energy
-        slope = np.append(mass @ post, -mass @ pre)[used]
-        ratio = t_plus / t_minus if t_minus > 0 else np.nan
-        self.energies.append(_Defect(k, gain, t_minus, t_minus, slope, sigma, ratio))
-
-    def listed(self, ratios: dict[int, float]) -> dict[str, Any]:
+    def listed(self, ratios: dict[int, float]) -> str:
         """Shots with their ratios, or the range of the ratios of many."""
-        shots = self.experiments.shots
-        text = ", ".join(f"shot {shots[k]}: {r:.4f}" for k, r in ratios.items())
-        if len(ratios) > LISTED:
-            values = list(ratios.values())
-            text = f"{len(values)} of {self.total} shots, {min(values):.4f} to {max(values):.4f}"
-        return {"shots": text, "share": share(len(ratios), self.total)}
+        if len(ratios) <= LISTED:
+            shots = self.experiments.shots
+            return ", ".join(f"shot {shots[k]}: {r:.4f}" for k, r in ratios.items())
+        values = ratios.values()
+        return f"{len(ratios)} of {self.total} shots, {min(values):.4f} to {max(values):.4f}"
+
+    def beyond(
+        self, defects: list[_Defect], level: float, gains: bool = False
+    ) -> list[tuple[int, float]]:
+        """Shots whose balance fails by more than their noise, with ratios; gains: upwards only."""
+        _, excess, scale, before, _, error = np.array(defects).reshape(-1, 6).T
+        size, ratios = excess if gains else np.abs(excess), [(d.k, d.ratio) for d in defects]
+        if self.experiments.sigma is not None:
+            sigmas = max(DEFECT_SIGMAS, float(ndtri(1 - 0.5 * level / max(len(defects), 1))))
+            return [row for row, far in zip(ratios, size > sigmas * error) if far]
+        flagged = [row for row, far in zip(ratios, size > DEFECT_TOLERANCE * scale) if far]
+        if len(defects) < 2 or not flagged or np.mean(size > GROSS * scale) >= 0.5:
+            return flagged
+        some = error > 0
+        weight, chances = 1 / error[some], []
+        for shape in (np.sign(weight), weight * before[some]):
+            chances.append(_chance(weight * excess[some], shape, gains))
+        return flagged if min(chances) < level / len(chances) else []
 
 
-def _units(data: DataBalances) -> Iterable[dict[str, Any]]:
+def _units(data: DataBalances) -> Iterator[Finding]:
     """Whether velocities after are those before but for a factor that a wrong unit leaves.
 
     By the momentum that is conserved; where none is, by the energy where it grows.
@@ -144,14 +153,18 @@ def _units(data: DataBalances) -> Iterable[dict[str, Any]]:
     for factor, unit in UNIT_FACTORS.items():
         near = (factor, 1 / factor) if what == "momentum" else (factor,)
         if any(abs(ratio / value - 1) < UNIT_NEAR for value in near):
-            yield {"what": what, "ratio": ratio, "unit": unit}
+            yield Finding(
+                f"Units? The {what} after is {ratio:.3g} times that before: {unit} in one of the "
+                "columns?",
+                "the units are suspect",
+            )
             return
 
 
-def _momentum(data: DataBalances) -> Iterable[dict[str, Any]]:
+def _momentum(data: DataBalances) -> Iterator[Finding]:
     """Shots that break a momentum beyond their noise, and the rms that this alone leaves."""
     level = DEFECT_LEVEL / max(len(data.momenta), 1)
-    ratios = {k: r for each in data.momenta.values() for k, r in _beyond(each, level).items()}
+    ratios = {k: r for each in data.momenta.values() for k, r in data.beyond(each, level)}
     if not ratios:
         return
     floor, experiments = "", data.experiments
@@ -159,25 +172,34 @@ def _momentum(data: DataBalances) -> Iterable[dict[str, Any]]:
         corrected = experiments.momentum_corrected(data.scene)
         change = np.asarray(experiments.post) - np.asarray(corrected.post)
         floor = f" (rms {np.sqrt(np.nanmean(change**2)):.3g} m/s)"
-    yield data.listed(ratios) | {"floor": floor}
+    yield Finding(
+        f"The data violate conservation of momentum (1 = conserved): {data.listed(ratios)}; no law "
+        f"can reproduce that part{floor}.",
+        f"the data violate conservation of momentum in {share(len(ratios), data.total)}",
+    )
 
 
-def _energy(data: DataBalances) -> Iterable[dict[str, Any]]:
+def _energy(data: DataBalances) -> Iterator[Finding]:
     """Shots that gain energy beyond their noise."""
-    ratios = _beyond(data.energies, DEFECT_LEVEL, gains=True)
-    return [data.listed(ratios)] if ratios else []
+    if ratios := dict(data.beyond(data.energies, DEFECT_LEVEL, gains=True)):
+        yield Finding(
+            f"The data gain energy (1 = conserved): {data.listed(ratios)}.",
+            f"kinetic energy grows in {share(len(ratios), data.total)}",
+        )
 
 
-def _resting(data: DataBalances) -> Iterable[dict[str, Any]]:
+def _resting(data: DataBalances) -> Iterator[Finding]:
     """Shots in which no contact approaches."""
-    count = len(data.resting)
-    if count:
+    if count := len(data.resting):
         labels = listed([data.experiments.shots[k] for k in data.resting])
-        which = share(count, data.total)
-        yield {"count": count, "total": data.total, "labels": labels, "share": which}
+        yield Finding(
+            f"No contact approaches in {count} of {data.total} shots ({labels}): are pre and post "
+            "swapped, or is a sign wrong?",
+            f"no contact approaches in {share(count, data.total)}",
+        )
 
 
-def _copies(data: DataBalances) -> Iterable[dict[str, Any]]:
+def _copies(data: DataBalances) -> Iterator[Finding]:
     """Whether most shots of a scene are one, several times or scaled, with no sigma."""
     experiments = data.experiments
     if experiments.scenes is not None or experiments.sigma is not None:
@@ -189,86 +211,16 @@ def _copies(data: DataBalances) -> Iterable[dict[str, Any]]:
     same = np.isclose(unit, np.median(unit, axis=0), rtol=0, atol=ROUNDING).all(axis=1)
     count, total = int(same.sum()), data.total
     if 2 * count > total > 1:
-        which, some = f"All {total}", "the"
-        if count < total:
-            which, some = f"{count} of {total}", f"{count} of"
-        yield {"which": which, "some": some, "total": total}
+        every = count == total
+        yield Finding(
+            f"{f'All {total}' if every else f'{count} of {total}'} shots are equal to the last "
+            "digit, but for a factor: they carry no more information than one of them, and none "
+            "on the noise; without `sigma` or `resolution` the errors are meaningless.",
+            f"{'the' if every else f'{count} of'} {total} shots are copies of one",
+        )
 
 
-DATA_ROWS = (
-    Check(
-        _units,
-        "Units? The {what} after is {ratio:.3g} times that before: {unit} in one of the columns?",
-        "the units are suspect",
-    ),
-    Check(
-        _momentum,
-        "The data violate conservation of momentum (1 = conserved): {shots}; no law can reproduce "
-        "that part{floor}.",
-        "the data violate conservation of momentum in {share}",
-    ),
-    Check(
-        _energy,
-        "The data gain energy (1 = conserved): {shots}.",
-        "kinetic energy grows in {share}",
-    ),
-    Check(
-        _resting,
-        "No contact approaches in {count} of {total} shots ({labels}): are pre and post swapped, "
-        "or is a sign wrong?",
-        "no contact approaches in {share}",
-    ),
-    Check(
-        _copies,
-        "{which} shots are equal to the last digit, but for a factor: they carry no more "
-        "information than one of them, and none on the noise; without `sigma` or `resolution` the "
-        "errors are meaningless.",
-        "{some} {total} shots are copies of one",
-    ),
-)
-
-
-def data_defects(
-    experiments: Experiments, scene: Scene | None = None, stored_energy: float = 0.0
-) -> list[str]:
-    """What the data break beyond their error, a line each: momentum, energy, approach; copies.
-
-    Momentum is reported as `1 + excess / sum |m v-|`, the excess in the direction of the momentum
-    before: after over before where all bodies move one way. Without `sigma` the shots show their
-    noise: a defect is one that they have in common, the same excess or the same share of the
-    momentum before, whichever way that points (t tests), or one of half of the momentum in half of
-    the shots; of a single shot any above a tenth of a percent.
-
-    Args:
-        experiments: the shots; those with missing values are not judged.
-        scene: the common scene, None where the shots carry their own.
-        stored_energy: what the law may add to the energy (precompression) [J].
-
-    >>> import jimpact as ji
-    >>> from jimpact.fits.data_checks import data_defects
-    >>> data_defects(ji.Experiments([1.0, 0.0], [0.0, 1.2]), ji.chain([1.0, 1.0]))[1]
-    'The data gain energy (1 = conserved): shot 1: 1.4400.'
-    """
-    data = DataBalances(experiments, scene, stored_energy)
-    return [found.line for found in findings(DATA_ROWS, data)]
-
-
-def _beyond(defects: list[_Defect], level: float, gains: bool = False) -> dict[int, float]:
-    """Ratios of the shots whose balance fails by more than their noise; gains: upwards only."""
-    size = np.array([d.excess if gains else abs(d.excess) for d in defects])
-    if any(d.sigma is not None for d in defects):
-        sigmas = max(DEFECT_SIGMAS, float(ndtri(1 - 0.5 * level / len(defects))))
-        limit = [np.linalg.norm(d.slope * d.sigma) for d in defects]
-        return {d.k: d.ratio for d, x, y in zip(defects, size, limit) if x > sigmas * y}
-    scale = np.array([d.scale for d in defects])
-    flagged = {d.k: d.ratio for d, x in zip(defects, size > DEFECT_TOLERANCE * scale) if x}
-    if len(defects) < 2 or not flagged or np.mean(size > GROSS * scale) >= 0.5:
-        return flagged
-    weight = np.array([1 / np.linalg.norm(d.slope) if d.slope.any() else 0.0 for d in defects])
-    excess = weight * [d.excess for d in defects]
-    shapes = [np.sign(weight), weight * [d.before for d in defects]]
-    chances = [_chance(excess[weight > 0], shape[weight > 0], gains) for shape in shapes]
-    return flagged if min(chances) < level / len(shapes) else {}
+DATA_CHECKS = (_units, _momentum, _energy, _resting, _copies)
 
 
 def _chance(excess: np.ndarray, shape: np.ndarray, gains: bool) -> float:

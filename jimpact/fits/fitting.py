@@ -10,7 +10,7 @@ import numpy as np
 
 from jimpact._checks import as_whole, check_choice, check_kind
 from jimpact.files.records import listed
-from jimpact.fits.checks import MEDIAN, fit_warnings, stretch, unusable, weighted
+from jimpact.fits.checks import Judged, fit_warnings, unusable
 from jimpact.fits.data import Experiments
 from jimpact.fits.observables import filled_count
 from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw
@@ -18,10 +18,12 @@ from jimpact.fits.problem import FitProblem, of_shots
 from jimpact.fits.profiles import LEVEL, PROFILE_STARTS, needs_profiles, profiles_of
 from jimpact.fits.search import (
     DEFAULT_SEARCH,
+    LOSSES,
     FitMinimum,
     Search,
     Solution,
     find_minima,
+    robust_minimum,
     settled,
     solution,
     start_points,
@@ -30,29 +32,20 @@ from jimpact.fits.solve import (
     DEFAULT_STEPS,
     FINE_OF_MANY,
     HARDLY_WORSE,
-    SETTLED,
     Ends,
     Method,
     Solver,
-    default_steps,
-    minimize,
-    stacked,
+    step_limit,
 )
 from jimpact.fits.uncertainty import (
     Fit,
     Profile,
-    Uncertainty,
     check_level,
     check_squares,
     uncertainty,
 )
 from jimpact.progress import progress_bar
 from jimpact.scene import Scene
-
-HUBER = 1.345  # sigmas up to which a residual counts squared: 95 % of the efficiency
-STUDENT = 4.0  # degrees of freedom of the tails
-ROUNDS = 50  # of weights
-LEAST_SLOPE = 1e-7  # mean psi' of residuals that all are outliers, in the place of 0
 
 
 def fit(
@@ -129,7 +122,7 @@ def fit(
     0.4
     """
     method, seed = search.method, search.seed
-    steps = default_steps(method) if search.max_steps is None else search.max_steps
+    steps = step_limit(method, search.max_steps)
     if starts is not None:
         as_whole("starts", starts, 1)
     for name, count, least in (("max_steps", steps, 1), ("seed", seed, 0)):
@@ -160,7 +153,7 @@ def fit(
             found = solution(problem, ends, counts, found.lost)
         robust = None
         if search.loss != "squares":
-            problem, found, robust = _robust(problem, found, search.loss, solver)
+            problem, found, robust = robust_minimum(problem, found, search.loss, solver)
     result = replace(as_fit(problem, found, method, robust), loss=search.loss, seed=seed)
     if profiles or (profiles is None and needs_profiles(result)):
         more = PROFILE_STARTS if profiles else 0
@@ -222,10 +215,9 @@ def as_fit(
 
     `robust`: noise times the root of the degrees of freedom, of a loss that outliers move little.
     """
-    judged = replace(problem, scene=problem.to_scene(found.value))
-    errors = _errors(problem, judged, found, robust)
+    judged = Judged(replace(problem, scene=problem.to_scene(found.value)), found, robust)
+    errors, findings = judged.errors, fit_warnings(judged)
     residual = np.asarray(problem.measured, float) - found.predicted
-    findings = fit_warnings(judged, found, errors, robust is not None)
     numbers = errors._asdict()
     undetermined = numbers.pop("undetermined")
     slope = problem.of_data(found.jacobian)
@@ -256,73 +248,6 @@ def as_fit(
         problem=problem,
         jacobian=problem.errors_of(slope / problem.steps_at(found.value)),
     )
-
-
-def _errors(
-    problem: FitProblem, judged: FitProblem, found: Solution, robust: float | None
-) -> Uncertainty:
-    """Errors of the parameters; with known errors of the data wider where the law does not fit."""
-    best, noise = found.minima[0], None
-    errors = uncertainty(problem, best)
-    if robust is not None:
-        noise = np.nan if problem.sigma is None else 1.0
-        if errors.degrees_of_freedom > 0:
-            noise = robust / np.sqrt(errors.degrees_of_freedom)
-    elif problem.sigma is not None:
-        noise = stretch(judged, weighted(problem, found), errors.rank)
-    return errors if noise in (None, 1.0) else uncertainty(problem, best, noise)
-
-
-# ---------------------------------------------------------------------------- robust losses
-
-
-def _huber(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """psi(u) / u and psi'(u)."""
-    inside = np.abs(u) <= HUBER
-    return np.where(inside, 1.0, HUBER / np.where(inside, 1.0, np.abs(u))), inside.astype(float)
-
-
-def _student(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """psi(u) / u and psi'(u)."""
-    below = STUDENT + u**2
-    return (STUDENT + 1) / below, (STUDENT + 1) * (STUDENT - u**2) / below**2
-
-
-LOSSES = {"huber": _huber, "student": _student}
-
-
-def _robust(
-    problem: FitProblem, found: Solution, loss: str, solver: Solver
-) -> tuple[FitProblem, Solution, float]:
-    """Least squares again and again, with weights `psi(u) / u` of the last residuals u.
-
-    Equation: the covariance is `s^2 mean(psi^2) / mean(psi')^2 (J^T J)^-1` (Huber, 1981).
-    """
-    here = ~np.isnan(problem.measured)
-    for _ in range(ROUNDS):
-        problem = problem.with_errors_before(found.slopes)
-        error = problem.independent(problem.measured - found.predicted)
-        scale = 1.0
-        if problem.sigma is None:
-            scale = max(MEDIAN * float(np.median(np.abs(error[here]))), np.finfo(float).tiny)
-        share, slope = LOSSES[loss](error / scale)
-        factor, before = np.sqrt(share), problem.point(found.value)
-        weighed = problem.weighed(factor)
-        found = solution(weighed, minimize(stacked([weighed]), before[None], solver))
-        if np.abs(problem.point(found.value) - before).max() <= SETTLED:
-            break
-    else:
-        found = found._replace(converged=False)
-    psi = (share * error / scale)[here]
-    noise = scale * np.sqrt(np.sum(psi**2)) / max(slope[here].mean(), LEAST_SLOPE)
-    # weighted as in the problem, without the factors of the loss
-    minimum, size = found.minima[0], factor.size
-    residual = problem.independent(problem.measured - found.predicted)
-    residual = np.append(-residual, minimum.residual[size:])
-    slope = minimum.jacobian / np.append(factor, np.ones(len(residual) - size))[:, None]
-    squares = float(np.sum(residual**2))
-    minimum = FitMinimum(squares, found.value, 1, None, slope, residual)
-    return problem, found._replace(minima=[minimum]), float(noise)
 
 
 # ---------------------------------------------------------------------------- many fits
@@ -381,7 +306,7 @@ def fit_many(
     first = of_shots(law, scene, many[0], *choice)
     others = (first.with_shots(data) or of_shots(law, scene, data, *choice) for data in many[1:])
     problems = [first, *others]
-    each: list[Ends] = [None] * len(many)  # type: ignore[list-item]  # where its starts ended
+    each: dict[int, Ends] = {}  # where its starts ended
     with progress_bar(progress) as show:
         for members in _alike(many):
             first, solver = problems[members[0]], Solver(max_steps=max_steps, show=show)
@@ -402,11 +327,11 @@ def fit_many(
             return fit(problems[k], starts=starts, profiles=False, search=search)
         return as_fit(problems[k], found, "levenberg-marquardt")
 
-    best = [ends.rows(np.nanargmin(ends.squares)) for ends in each]
-    y, squares, converged = (
-        np.array([getattr(ends, name) for ends in best]) for name in ("y", "squares", "converged")
-    )
-    return Fits(problems[0].names, problems[0].values_at(y), squares, converged, made)
+    best = [each[k].rows(np.nanargmin(each[k].squares)) for k in range(len(many))]
+    value = problems[0].values_at(np.array([end.y for end in best]))
+    squares = np.array([end.squares for end in best])
+    converged = np.array([end.converged for end in best])
+    return Fits(problems[0].names, value, squares, converged, made)
 
 
 def _alike(many: Sequence[Experiments]) -> list[list[int]]:

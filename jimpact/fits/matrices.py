@@ -43,6 +43,7 @@ _WORST = 2  # new cuts of each scene and contact
 _FACES = ("E >= 0", "G^-1 (I + E) >= 0", "G^-1 - E^T G^-1 E copositive (energy)")
 
 
+_Share = tuple[jax.Array, jax.Array, jax.Array]  # of the way, whether it fell, passes
 # z, slacks at y and derivatives of the cuts that hold it, whether to go on, steps
 _Nearest = tuple[jax.Array, tuple[jax.Array, jax.Array], jax.Array, jax.Array]
 
@@ -155,9 +156,7 @@ class AdmissibleMatrices(eqx.Module):
         crossed = (target < 0) & (target < slack)  # others, y does not change
         share = jnp.where(crossed, slack / jnp.where(crossed, slack - target, 1.0), 1.0).min()
 
-        def closer(
-            state: tuple[jax.Array, jax.Array, jax.Array],
-        ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        def closer(state: _Share) -> _Share:
             """The share after one more look at the worst approaches."""
             share, _, passes = state
             x = self.worst(self.center + share * (y - self.center))
@@ -184,9 +183,8 @@ class AdmissibleMatrices(eqx.Module):
 
         def slacks(y: jax.Array) -> tuple[jax.Array, jax.Array]:
             """Slacks, to be differentiated, and once more as they are."""
-            value = jnp.concatenate(
-                [self.elementwise(y), _square(self._dissipation(y), x).reshape(-1)]
-            )
+            lost = _square(self._dissipation(y), x)
+            value = jnp.concatenate([self.elementwise(y), lost.reshape(-1)])
             return value, value
 
         rows, slack = jax.jacfwd(slacks, has_aux=True)(y)
@@ -224,7 +222,7 @@ def matrix_region(problem: "FitProblem", scenes: list[Scene]) -> AdmissibleMatri
     law, owner = problem.law, problem.owner
     if not encloses(law, scenes[0].contacts):
         return None
-    if any(name.split("[")[0] == "matrix" for name, _ in problem.ties):
+    if any(tie.field == "matrix" for tie in problem.ties):
         raise ValueError("Argument `ties` must not tie a `matrix` that has to stay admissible.")
     moves = np.where(owner[:, None] == np.arange(len(owner)), problem.scale, 0.0)
     origin, start = np.where(owner < 0, problem.fixed, 0.0), problem.point(problem.start)
@@ -232,7 +230,14 @@ def matrix_region(problem: "FitProblem", scenes: list[Scene]) -> AdmissibleMatri
     is_bounded = np.isfinite(bounds[:, np.any(moves != 0, axis=0)]).any()
     dtype = problem.low.dtype
     region = _region(scenes, dtype, origin, moves, bounds if is_bounded else None, start)
-    _check_start(region, _host_conditions(region, start)[0])
+    slack, _ = _host_conditions(region, start)
+    for name, kind in zip(_FACES, _kinds(region)):
+        if slack[kind].min() < -_rounding(region):
+            raise ValueError(
+                "Argument `law` must start from an admissible matrix, consistent for all approach "
+                f"velocities, but {name} fails by {-slack[kind].min():.3g}. "
+                "RestitutionMatrix(matrix, admissible=False) is fitted without that."
+            )
     center = _inner_point(region, start)
     if center is None:
         raise ValueError(
@@ -256,9 +261,8 @@ def admissible_start(scenes: list[Scene]) -> np.ndarray:
     [[0.5, 0.0], [0.0, 0.5]]
     """
     m = scenes[0].contacts
-    dtype = scenes[0].mass.dtype
     half = 0.5 * np.eye(m).ravel()
-    region = _region(scenes, dtype, np.zeros(m * m), np.eye(m * m), None, half)
+    region = _region(scenes, scenes[0].mass.dtype, np.zeros(m * m), np.eye(m * m), None, half)
     will_do = _host_conditions(region, half)[0].min() >= -_rounding(region)
     e = half if will_do else _inner_point(region, half)
     if e is None:
@@ -275,22 +279,9 @@ def _region(
     origin: np.ndarray,
     mix: np.ndarray,
     bounds: np.ndarray | None,
-    center: Any,
+    center: np.ndarray,
 ) -> AdmissibleMatrices:
-    """The region of these scenes."""
-    inverse, closed = _inverses(scenes)
-    return AdmissibleMatrices(
-        origin=jnp.asarray(origin, dtype),
-        map=jnp.asarray(mix, dtype),
-        inverse=jnp.asarray(inverse, dtype),
-        closed=jnp.asarray(closed, dtype),
-        bounds=None if bounds is None else jnp.asarray(bounds, dtype),
-        center=jnp.asarray(center, dtype),
-    )
-
-
-def _inverses(scenes: list[Scene]) -> tuple[np.ndarray, np.ndarray]:
-    """G^-1 (S, m, m) and closed contacts (S, m) of different scenes."""
+    """The region of these scenes; the conditions of equal ones count once."""
     m = scenes[0].contacts
     if m > LARGEST:
         raise ValueError(
@@ -298,7 +289,8 @@ def _inverses(scenes: list[Scene]) -> tuple[np.ndarray, np.ndarray]:
             f"but has {m}. RestitutionMatrix(matrix, admissible=False) is fitted without that."
         )
     distinct = np.unique([_inverse(scene) for scene in scenes], axis=0)
-    return distinct[:, :m], distinct[:, m]
+    arrays: Any = (origin, mix, distinct[:, :m], distinct[:, m], bounds, center)
+    return AdmissibleMatrices(*jax.tree.map(lambda x: jnp.asarray(x, dtype), arrays))
 
 
 def encloses(law: Law, contacts: int) -> bool:
@@ -320,15 +312,12 @@ def _inverse(scene: Scene) -> np.ndarray:
     return np.vstack([np.linalg.inv(g), np.asarray(scene.closed, g.dtype)])
 
 
-@quick_jit
-def _all_conditions(region: AdmissibleMatrices, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Compiled `AdmissibleMatrices.conditions`."""
-    return region.conditions(y)
+_conditions = quick_jit(AdmissibleMatrices.conditions)
 
 
 def _host_conditions(region: AdmissibleMatrices, y: Any) -> tuple[np.ndarray, np.ndarray]:
     """Slacks and their derivatives on the host."""
-    slack, rows = _all_conditions(region, jnp.asarray(y, region.center.dtype))
+    slack, rows = _conditions(region, jnp.asarray(y, region.center.dtype))
     return np.asarray(slack, float), np.asarray(rows, float)
 
 
@@ -342,17 +331,6 @@ def _kinds(region: AdmissibleMatrices) -> tuple[slice, slice, slice]:
 def _rounding(region: AdmissibleMatrices) -> float:
     """By how much rounding may break a condition."""
     return _ROUNDING[str(region.center.dtype)] * float(np.abs(np.asarray(region.inverse)).max())
-
-
-def _check_start(region: AdmissibleMatrices, slack: np.ndarray) -> None:
-    """Raise a ValueError that names the condition the start matrix breaks."""
-    for name, kind in zip(_FACES, _kinds(region)):
-        if slack[kind].min() < -_rounding(region):
-            raise ValueError(
-                "Argument `law` must start from an admissible matrix, consistent for all approach "
-                f"velocities, but {name} fails by {-slack[kind].min():.3g}. "
-                "RestitutionMatrix(matrix, admissible=False) is fitted without that."
-            )
 
 
 def _inner_point(region: AdmissibleMatrices, start: np.ndarray) -> np.ndarray | None:

@@ -10,12 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.compiling import quick_jit
 from jimpact.contact import contact_of
 from jimpact.fits.data import Experiments
 from jimpact.fits.parameters import placed
 from jimpact.impacts import impact
-from jimpact.law import AnyLaw, Law, forward_only
+from jimpact.law import AnyLaw, Law
 from jimpact.scene import Scene
 from jimpact.status import CODE, sign_tolerance
 
@@ -76,18 +75,6 @@ class Observed(eqx.Module):
 def filled_count(count: int) -> int:
     """How many shots a program has that serves so many."""
     return FEWEST if count <= FEWEST else 2 ** math.ceil(math.log2(count))
-
-
-@quick_jit
-def slopes_before(law: Law, shots: Shots) -> jax.Array:
-    """Compiled `dv+/dv-` of every shot."""
-    law, scenes = placed(forward_only(law), shots.scenes)
-
-    def after(v: jax.Array, scene: Scene) -> jax.Array:
-        """v+ of v-."""
-        return impact(law, scene, v).velocity
-
-    return jax.vmap(jax.jacfwd(after))(shots.pre, scenes)
 
 
 def tolerated(

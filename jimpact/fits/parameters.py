@@ -2,7 +2,7 @@
 
 import dataclasses
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
@@ -28,7 +28,6 @@ from jimpact.laws.kinematic import RestitutionMatrix
 from jimpact.scene import Scene, with_gaps
 
 AnyLaw = TypeVar("AnyLaw", bound=Law)  # what goes in as LZB comes out as LZB
-Ties = tuple[tuple[str, Callable[["Values"], Any]], ...]  # names, and what they follow from
 Limits = tuple[np.ndarray, np.ndarray]  # lowest and highest values (P,)
 DEFAULT_FREE = ("restitution", "stiffness")  # or a matrix, or what else a law has
 OF_SPEED = ("speed_exponent", "yield_speed")  # a law has them only if requested
@@ -77,8 +76,7 @@ def places(argument: str, name: str, shape: tuple[int, ...]) -> list[int]:
 
 def value_of(law: Law, field: str) -> Any:
     """A parameter of a law, or of its parts (the force of a compliant one); None if it has none."""
-    known = parameters_of(law).get(field)
-    return None if known is None else known.value
+    return getattr(parameters_of(law).get(field), "value", None)
 
 
 def domain_of(law: Law, field: str) -> Domain:
@@ -143,7 +141,7 @@ class Parameters:
 
 
 def free_parameters(
-    law: Law, free: Any, absolute: bool = False, ties: Ties = ()
+    law: Law, free: Any, absolute: bool = False, ties: "Ties" = ()
 ) -> tuple[Parameters, list[str]]:
     """The parameters that `free` names, but for what is tied, and notes on what was fixed instead.
 
@@ -166,10 +164,9 @@ def free_parameters(
             )
         labels["stiffness"][shared] = 0
         fixed = "stiffness[1]"
-    for name, at in tied_places(law, ties).items():
-        field, _ = entry_of(name)
-        if field in labels:
-            labels[field].flat[at] = 0
+    for tie in ties:
+        if tie.field in labels:
+            labels[tie.field].flat[list(tie.at)] = 0
     names, groups, start = [], [], 0
     for field, label in labels.items():
         for value in dict.fromkeys(label[label > 0].tolist()):
@@ -360,12 +357,9 @@ def priors_of(
     chosen, fields = dict(priors or {}), parameters.of_fields
     for name in chosen:
         _check_name("priors", name, (*parameters.names, *fields))
-    found = []
-    for i, (name, field, low, high) in enumerate(zip(parameters.names, fields, *limits)):
-        pair = chosen.get(name, chosen.get(field))
-        if pair is not None:
-            found.append(Prior(i, *_mean_and_std(name, pair, low, high)))
-    return tuple(found)
+    pairs = [chosen.get(name, chosen.get(field)) for name, field in zip(parameters.names, fields)]
+    each = enumerate(zip(parameters.names, pairs, *limits))
+    return tuple(Prior(i, *_mean_and_std(*row)) for i, row in each if row[1] is not None)
 
 
 def _mean_and_std(name: str, pair: Any, low: float, high: float) -> tuple[float, float]:
@@ -393,12 +387,27 @@ def _mean_and_std(name: str, pair: Any, low: float, high: float) -> tuple[float,
 # ---------------------------------------------------------------------------- ties
 
 
+class Tie(NamedTuple):
+    """What follows from other values, by a function: the entries `at` of a flattened field."""
+
+    name: str
+    field: str
+    at: tuple[int, ...]
+    function: Callable[["Values"], Any]
+
+    def overlaps(self, field: str, at: Iterable[int]) -> bool:
+        """Whether it ties some of these entries."""
+        return self.field == field and not set(at).isdisjoint(self.at)
+
+
+Ties = tuple[Tie, ...]
+
+
 class Values:
     """What a tie's function is given: values of a law by name, those that are tied included."""
 
     def __init__(self, law: Law, ties: Ties):
-        self.law, self.functions = law, dict(ties)
-        self.places = tied_places(law, ties)
+        self.law, self.ties = law, ties
         self.waiting: list[str] = []  # ties that have begun, each needed by the one before
 
     def __getitem__(self, name: str) -> Any:
@@ -406,26 +415,26 @@ class Values:
         field, entry = entry_of(name)
         value = _value(self.law, name)
         at, flat = places("ties", name, value.shape), value.ravel()
-        for other, tied in self.places.items():
-            if entry_of(other)[0] == field and set(at) & set(tied):
-                flat = flat.at[np.array(tied)].set(self._follow(other))
+        for tie in self.ties:
+            if tie.overlaps(field, at):
+                flat = flat.at[np.array(tie.at)].set(self._follow(tie))
         return flat.reshape(value.shape) if entry is None else flat[at[0]]
 
-    def _follow(self, name: str) -> Any:
+    def _follow(self, tie: Tie) -> Any:
         """The value of what is tied, by its function."""
-        if name in self.waiting:
-            circle = [*self.waiting[self.waiting.index(name) :], name]
+        if tie.name in self.waiting:
+            circle = [*self.waiting[self.waiting.index(tie.name) :], tie.name]
             way = f"{circle[0]} needs {', which needs '.join(circle[1:])}"
             raise ValueError(f"Argument `ties` must not go in a circle, but {way}.")
-        self.waiting.append(name)
-        old = _value(self.law, name)
-        value = jnp.asarray(self.functions[name](self)).astype(old.dtype)
+        self.waiting.append(tie.name)
+        old = _value(self.law, tie.name)
+        value = jnp.asarray(tie.function(self)).astype(old.dtype)
         self.waiting.pop()
-        allowed = {(), old.shape if entry_of(name)[1] is None else ()}
+        allowed = {(), old.shape if tie.name == tie.field else ()}
         if value.shape not in allowed:
             or_shape = f" or shape {old.shape}" if len(allowed) > 1 else ""
             raise ValueError(
-                f"Argument `ties` must give one number for `{name}`{or_shape}, "
+                f"Argument `ties` must give one number for `{tie.name}`{or_shape}, "
                 f"but its function gives shape {value.shape}."
             )
         return value.ravel() if value.ndim else value
@@ -434,57 +443,54 @@ class Values:
 def tied(law: AnyLaw, ties: Ties) -> AnyLaw:
     """The law with the tied entries as their functions say."""
     values = Values(law, ties)
-    for field in dict.fromkeys(entry_of(name)[0] for name, _ in ties):
+    for field in dict.fromkeys(tie.field for tie in ties):
         law = with_parameter(law, field, values[field])
     return law
 
 
 def checked_ties(law: Law, ties: Mapping[str, Any] | None) -> Ties:
     """The user's ties, tried at the law's own values."""
-    pairs = tuple((ties or {}).items())
-    owner: dict[tuple[str, int], str] = {}
-    for name, function in pairs:
+    found: Ties = ()
+    for name, function in (ties or {}).items():
         if not callable(function):
             raise ValueError(
                 f"Argument `ties` must map `{name}` to a function of the other values, as in "
                 f"lambda p: 2 * p['restitution'], but has {function!r}."
             )
-        for place in places("ties", name, _value(law, name).shape):
-            other = owner.setdefault((entry_of(name)[0], place), name)
-            if other != name:
+        at = tuple(places("ties", name, _value(law, name).shape))
+        tie = Tie(name, entry_of(name)[0], at, function)
+        for other in found:
+            if other.overlaps(tie.field, at):
                 raise ValueError(
-                    f"Argument `ties` must tie an entry once, but {other} and {name} overlap."
+                    f"Argument `ties` must tie an entry once, but {other.name} and {name} overlap."
                 )
-    start = tied(law, pairs)
-    for name, at in tied_places(law, pairs).items():
-        value = np.asarray(_value(start, name)).ravel()[at]
-        domain = domain_of(start, entry_of(name)[0])
-        if not bool(np.asarray(domain.holds(jnp.asarray(value)))):
+        found = (*found, tie)
+    start = tied(law, found)
+    for tie in found:
+        value, domain = tied_value(start, tie), domain_of(start, tie.field)
+        if not bool(np.asarray(domain.holds(value))):
             low, high = domain.bounds
             raise ValueError(
-                f"Argument `ties` must keep `{name}` in [{low:g}, {high:g}], but its function "
+                f"Argument `ties` must keep `{tie.name}` in [{low:g}, {high:g}], but its function "
                 f"gives {value.tolist()} at the start."
             )
-    return pairs
+    return found
+
+
+def tied_value(law: Law, tie: Tie) -> jax.Array:
+    """The tied entries of a law."""
+    return jnp.ravel(value_of(law, tie.field))[np.array(tie.at)]
 
 
 def tied_names(law: Law, ties: Ties) -> list[str]:
     """Names of the tied entries, one by one."""
     names = []
-    for name, at in tied_places(law, ties).items():
-        field, entry = entry_of(name)
-        shape = _value(law, name).shape
-        if entry is None and shape:
-            members = [np.array([np.unravel_index(i, shape)]) for i in at]
-            names += [_name(field, each, len(at) + 1) for each in members]
-        else:
-            names.append(name)
+    for tie in ties:
+        shape = np.shape(value_of(law, tie.field))
+        whole = tie.name == tie.field and shape
+        members = [np.array([np.unravel_index(i, shape)]) for i in tie.at] if whole else []
+        names += [_name(tie.field, each, 0) for each in members] or [tie.name]
     return names
-
-
-def tied_places(law: Law, ties: Ties) -> dict[str, list[int]]:
-    """Where in their flattened fields the tied entries are, by name."""
-    return {name: places("ties", name, _value(law, name).shape) for name, _ in ties}
 
 
 def _value(law: Law, name: str) -> Any:
@@ -591,7 +597,7 @@ def limits_with_scene(
     low, high = (end.copy() for end in limits)
     start = entries(law, parameters.fields)[parameters.first]
     for i, (name, field) in enumerate(zip(parameters.names, parameters.of_fields)):
-        if field not in OF_A_SCENE:
+        if field not in OF_A_SCENE or not isinstance(law, LawInScene):
             continue
         if i not in known:
             raise ValueError(

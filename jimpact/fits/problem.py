@@ -26,7 +26,6 @@ from jimpact.fits.observables import (
     Prediction,
     Shots,
     filled_count,
-    slopes_before,
     tolerated,
 )
 from jimpact.fits.parameters import (
@@ -50,7 +49,7 @@ from jimpact.fits.parameters import (
     with_entries,
     with_parts_of_scene,
 )
-from jimpact.fits.solve import EXACT
+from jimpact.fits.solve import EXACT, outcome_at
 from jimpact.law import Law, forward_only
 from jimpact.scene import Scene, dense_mass, stackable
 
@@ -233,9 +232,8 @@ class FitProblem:
         # a stiffness that the user names is one that the function sees
         own = isinstance(observe, eqx.Module)
         observable = observe if own else Observed(observe, free is not DEFAULT_FREE)
-        errors = np.ones(()) if sigma is None else sigma
-        choice = (free, bounds, priors, ties)
-        problem = _build(law, observable, post, sigma, errors, np.nanmax(np.abs(post)), choice)
+        values = _weighed(post, sigma, 1.0 if sigma is None else sigma, np.nanmax(np.abs(post)))
+        problem = _build(law, observable, values, (free, bounds, priors, ties))
         shape = eqx.filter_eval_shape(observable, law).value.shape
         if shape != post.shape:
             raise ValueError(
@@ -264,15 +262,20 @@ class FitProblem:
         scenes = jax.tree.map(lambda x: np.repeat(x[:1], count, axis=0), observe.scenes)
         before = np.repeat(observe.pre[:1], count, axis=0)
         before[:, :n] = np.asarray(data.pre)
-        sigma, errors, unit = _errors_and_unit(data, self.scene)
-        arrays = _weighed_values(np.asarray(data.post), errors, unit)
-        return replace(
-            self,
-            observe=replace(observe, scenes=scenes, pre=before),
-            **_in(self.low.dtype, arrays),
-            sigma=sigma,
-            experiments=data,
-        )
+        observe = replace(observe, scenes=scenes, pre=before)
+        weights = _in(self.low.dtype, _weighed_shots(data, self.scene))
+        return replace(self, observe=observe, experiments=data, **weights)
+
+    def of_other(self, data: Experiments, scene: Scene | None) -> "FitProblem":
+        """The same of other shots; errors of v- count as if there were none.
+
+        Args:
+            data: shots of as many bodies.
+            scene: of all; None: they have their own.
+        """
+        observe, _, weights = _measured_shots(data, scene)
+        arrays = {"observe": observe, "mixing": None} | weights
+        return replace(self, **_in(self.low.dtype, arrays), experiments=data, scene=scene)
 
     def weighed(self, factor: np.ndarray) -> "FitProblem":
         """With factors on the independent errors.
@@ -282,8 +285,7 @@ class FitProblem:
         """
         used, mixing, weight = factor > 0, self.mixing, self.weight * factor
         if mixing is not None:  # which comes before the factors
-            weight = self.weight * used
-            mixing = np.where(used, factor, 1.0)[..., None] * mixing
+            weight, mixing = self.weight * used, np.where(used, factor, 1.0)[..., None] * mixing
         measured = np.where(used, self.measured, np.nan)
         return replace(self, **self._weights(weight, mixing), measured=measured)
 
@@ -305,9 +307,8 @@ class FitProblem:
         count, n = self.measured.shape
         slope = np.asarray(slopes[:count], float)
         slope = np.where(np.isfinite(slope).all(axis=(1, 2), keepdims=True), slope, np.eye(n))
-        for k, kept in enumerate(kept_by_corrections(data, self.scene)):
-            if kept is not None:  # a residual that conserves momentum shows that part of the errors
-                slope[k] = kept @ slope[k]
+        # a residual that conserves momentum shows that part of the errors
+        slope = kept_by_corrections(data, self.scene) @ slope
         here = ~np.isnan(self.measured)
         before = slope * np.asarray(data.sigma_pre, float)[:, None, :]
         variance = np.where(here, np.asarray(data.sigma, float), 1.0) ** 2
@@ -324,10 +325,7 @@ class FitProblem:
         """With errors of v-, if there are any, passed on as the law of x (P,) does."""
         if self.mixing is None:
             return self
-        shots: Any = self.program().observe
-        law = _in(self.low.dtype, self.law_in_scene(x))
-        slopes = np.asarray(slopes_before(law, shots), float)
-        return self.with_errors_before(slopes[:, : shots.bodies, : shots.bodies])
+        return self.with_errors_before(outcome_at(self, x).slopes[0])
 
     def program(self) -> "FitProblem":
         """As compiled functions take it: without what differs between fits of one program.
@@ -453,11 +451,8 @@ class FitProblem:
 
         def outcome(both: jax.Array) -> tuple[tuple[jax.Array, jax.Array], Any]:
             """Residual and prediction of y and a change of v-, and all not differentiated."""
-            x = self._values(both[:count])
             moved = self._shifted(both[count:]) if passed else self
-            data, prediction = moved._errors(forward_only(self.law_in_scene(x)))
-            of_priors = (x - self.prior_mean) * self.prior_weight
-            residual = jnp.concatenate([data, of_priors]) / self.size
+            residual, prediction = moved._scaled_residual(both[:count])
             out = residual, prediction.value
             return out, (*out, prediction.status)
 
@@ -469,10 +464,14 @@ class FitProblem:
 
     def squares(self, y: jax.Array) -> jax.Array:
         """The sum of squares of the residual at `y` (Q,), see `evaluate`; without derivatives."""
+        return jnp.sum(self._scaled_residual(y)[0] ** 2)
+
+    def _scaled_residual(self, y: jax.Array) -> tuple[jax.Array, Prediction]:
+        """Residual (R + Q,) over `size`, of the priors last, and what the law predicts."""
         x = self._values(y)
-        data, _ = self._errors(self.law_in_scene(x))
+        data, prediction = self._errors(forward_only(self.law_in_scene(x)))
         of_priors = (x - self.prior_mean) * self.prior_weight
-        return (jnp.sum(data**2) + jnp.sum(of_priors**2)) / self.size**2
+        return jnp.concatenate([data, of_priors]) / self.size, prediction
 
     def blank(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, Any]:
         """Zeros shaped like what `evaluate` gives of S such problems at y (S, Q), on the host."""
@@ -535,7 +534,7 @@ class FitProblem:
         if self.experiments is not None:
             return self.experiments.shots
         rows = self.measured.shape[0] if self.measured.ndim else 1
-        return getattr(self.observe, "labels", None) or tuple(str(k + 1) for k in range(rows))
+        return tuple(str(k + 1) for k in range(rows))
 
     def of_data(self, rows: np.ndarray) -> np.ndarray:
         """Those of rows (R, ...), as of a residual, that are of what was measured, in its shape."""
@@ -585,22 +584,11 @@ def of_shots(
     check_concrete("law", law)
     check_concrete("scene", scene)
     law, of_tolerance = tolerated(law, scene, experiments)
-    scenes = experiments.each(scene, lambda s: s)
-    same = experiments.scenes is None
-    law = with_parts_of_scene(law, scene, not same, free)
-    alike, extra = stackable(scenes[:1] if same else scenes)
-    pre, post = np.asarray(experiments.pre), np.asarray(experiments.post)
-    sigma, errors, unit = _errors_and_unit(experiments, scene)
-    count, n = pre.shape
+    observe, alike, weights = _measured_shots(experiments, scene)
+    law = with_parts_of_scene(law, scene, experiments.scenes is not None, free)
     masses = experiments.each(scene, dense_mass)
-    energy = max(0.5 * v @ mass @ v for mass, v in zip(masses, pre)) or 1.0
-    stacked = jax.tree.map(
-        lambda *x: np.repeat(np.stack(x), count, axis=0) if same else np.stack(x), *alike
-    )
-    filled = np.pad(pre, ((0, 0), (0, extra)), constant_values=unit)
-    observe = Shots(stacked, filled, n)  # type: ignore[arg-type]
-    choice = (free, *known)
-    problem = _build(law, observe, post, sigma, errors, unit, choice, energy)
+    energy = max(0.5 * v @ mass @ v for mass, v in zip(masses, np.asarray(experiments.pre))) or 1.0
+    problem = _build(law, observe, weights, (free, *known), energy)
     problem = replace(
         problem,
         notes=(*problem.notes, *of_tolerance),
@@ -608,7 +596,21 @@ def of_shots(
         scene=scene,
         matrix=matrix_region(problem, alike),
     )
+    count, n = experiments.pre.shape
     return problem.with_errors_before(np.tile(np.eye(n), (count, 1, 1)))
+
+
+def _measured_shots(
+    data: Experiments, scene: Scene | None
+) -> tuple[Shots, list[Scene], dict[str, Any]]:
+    """The observable of shots; their scenes, made alike, of a common one only this; weights."""
+    (count, n), pre, weights = data.pre.shape, np.asarray(data.pre), _weighed_shots(data, scene)
+    own = data.each(scene, lambda s: s)
+    alike, extra = stackable(own if data.scenes is not None else own[:1])
+    each = np.arange(count) if len(alike) == count else np.zeros(count, int)
+    scenes = jax.tree.map(lambda *x: np.stack(x)[each], *alike)
+    filled = np.pad(pre, ((0, 0), (0, extra)), constant_values=weights["unit"])
+    return Shots(scenes, filled, n), alike, weights  # type: ignore[arg-type]
 
 
 def _in(dtype: Any, tree: Any) -> Any:
@@ -617,33 +619,24 @@ def _in(dtype: Any, tree: Any) -> Any:
 
 
 def _build(
-    law: Law,
-    observe: Any,
-    measured: np.ndarray,
-    sigma: np.ndarray | None,
-    errors: np.ndarray,
-    unit: float,
-    choice: tuple[Any, ...],
-    energy: float = 1.0,
+    law: Law, observe: Any, values: dict[str, Any], choice: tuple[Any, ...], energy: float = 1.0
 ) -> FitProblem:
-    """Arrays, weights and natural scales of a fit; `choice`: free, bounds, priors, ties."""
-    leaves = [x for x in jax.tree.leaves((law, observe, measured)) if eqx.is_inexact_array(x)]
-    dtype = np.result_type(*(x.dtype for x in leaves))
+    """The problem of weighed values; `choice`: free, bounds, priors, ties."""
+    leaves = jax.tree.leaves((law, observe, values["measured"]))
+    dtype = np.result_type(*(x.dtype for x in leaves if eqx.is_inexact_array(x)))
     free, bounds, prior, tie = (*choice, *[None] * 4)[:4]
     ties = checked_ties(law, tie)
     law = tied(law, ties)
     parameters, notes = free_parameters(law, free, getattr(observe, "absolute", False), ties)
     limits = bounds_of(parameters, law, bounds)
     priors = priors_of(parameters, limits, prior)
-    if isinstance(law, LawInScene):
-        limits = limits_with_scene(parameters, law, limits, priors)
-    if priors and sigma is None:
+    limits = limits_with_scene(parameters, law, limits, priors)
+    if priors and values["sigma"] is None:
         raise ValueError(
             "Argument `priors` must be left out where no `sigma` (or `resolution`) of the measured "
             "values is known: priors and data weigh against each other by their errors."
         )
-    arrays = _of_parameters(law, parameters, limits, priors, energy)
-    arrays |= _weighed_values(measured, errors, unit)
+    arrays = _of_parameters(law, parameters, limits, priors, energy) | values
     return FitProblem(
         law=_in(dtype, law),
         observe=_in(dtype, observe),
@@ -653,28 +646,25 @@ def _build(
         ties=ties,
         parameters=parameters,
         domains=np.stack(limits, axis=1),
-        sigma=sigma,
         priors=priors,
         notes=tuple(notes),
     )
 
 
-def _weighed_values(measured: np.ndarray, errors: np.ndarray, unit: float) -> dict[str, Any]:
-    """What was measured, its weights, and the sizes that follow."""
-    here, unit = ~np.isnan(measured), unit or 1.0
+def _weighed(measured: np.ndarray, sigma: Any, errors: Any, unit: float) -> dict[str, Any]:
+    """What was measured, its weights, and the sizes that follow; `errors`: to weigh by."""
+    here, unit = ~np.isnan(measured), float(unit) or 1.0
     weight = np.where(here, 1 / np.where(here, errors, 1.0), 0.0)
     size = np.asarray(unit * np.linalg.norm(weight))
-    return {"measured": measured, "weight": weight, "unit": np.asarray(unit), "size": size}
+    arrays = {"measured": measured, "weight": weight, "unit": np.asarray(unit), "size": size}
+    return arrays | {"sigma": sigma}
 
 
-def _errors_and_unit(
-    data: Experiments, scene: Scene | None
-) -> tuple[np.ndarray | None, np.ndarray, float]:
-    """Stated errors, those to weigh by, and the largest velocity."""
-    sigma = None if data.sigma is None else np.asarray(data.sigma)
-    errors = data.natural_errors(scene) if sigma is None else sigma
-    unit = max(np.abs(np.asarray(data.pre)).max(), np.nanmax(np.abs(np.asarray(data.post))))
-    return sigma, errors, float(unit)
+def _weighed_shots(data: Experiments, scene: Scene | None) -> dict[str, Any]:
+    """The same of shots."""
+    post, sigma = np.asarray(data.post), None if data.sigma is None else np.asarray(data.sigma)
+    unit = max(np.abs(np.asarray(data.pre)).max(), np.nanmax(np.abs(post)))
+    return _weighed(post, sigma, data.natural_errors(scene) if sigma is None else sigma, unit)
 
 
 def _of_parameters(

@@ -66,9 +66,8 @@ class Grid(NamedTuple):
 
     def neighbours(self, cell: Index) -> list[Index]:
         """Cells next to one, diagonal ones too."""
-        around = product(*(range(max(k - 1, 0), k + 2) for k in cell))
-        inside = [near for near in around if all(k < len(v) for k, v in zip(near, self.values))]
-        return [near for near in inside if near != cell]
+        sides = [range(max(k - 1, 0), min(k + 2, len(v))) for k, v in zip(cell, self.values)]
+        return [near for near in product(*sides) if near != cell]
 
 
 class Deviances:
@@ -86,16 +85,14 @@ class Deviances:
 
     def add_starts(self, minima: Sequence[FitMinimum]) -> None:
         """Start from these minima, too: the lowest, and others near it that are apart."""
-        starts = [Lowest(end.sum_of_squares, self.problem.point(end.value)) for end in minima]
-        self.best = [*self.starts, *starts][0]
-        for start, end in zip(starts, minima):
+        new = [Lowest(end.sum_of_squares, self.problem.point(end.value)) for end in minima]
+        starts = [*self.starts, *new]
+        self.best, least = starts[0], RANK_TOLERANCE[self.problem.precision]
+        for start, end in zip(new, minima):
             if self._is_below(start.squares, self.best.squares):
-                self.best = start
-                self.in_a_valley = np.linalg.matrix_rank(
-                    end.jacobian, rtol=RANK_TOLERANCE[self.problem.precision]
-                ) < len(self.fit.names)
-        starts, self.starts = [*self.starts, *starts], []
-        self.lowest = self.best
+                rank = np.linalg.matrix_rank(end.jacobian, rtol=least)
+                self.best, self.in_a_valley = start, rank < len(self.fit.names)
+        self.lowest, self.starts = self.best, []
         for start in (self.best, *starts):
             apart = all(np.abs(start.y - other.y).max() > SAME_VALUE for other in self.starts)
             if apart and self.of(start.squares) <= self.limit:
@@ -106,11 +103,9 @@ class Deviances:
     def minimize(self, trials: Sequence[tuple[Index, Sequence[float], np.ndarray]]) -> Ends:
         """Minima with some parameters fixed at values, from y (Q,) each, all side by side."""
         points = np.array([y for _, _, y in trials])
-        fixed = np.zeros(points.shape, bool)
-        fixed[:, len(self.fit.names) :] = True
+        fixed = np.arange(points.shape[1]) >= np.full((len(points), 1), len(self.fit.names))
         for k, (which, values, _) in enumerate(trials):
-            points[k, list(which)] = values
-            fixed[k, list(which)] = True
+            points[k, which], fixed[k, which] = values, True
         solver = Solver(max_steps=PASSES, show=self.show, damping=NEAR)
         many = stacked([self.problem], len(points))
         ends = minimize(many, points, solver, _STOP, what="fixed values", fixed=fixed)
@@ -169,8 +164,10 @@ class Deviances:
         return known
 
 
-def _check_profiled(fit: Fit) -> None:
-    """Raise an error unless this is a fit, of parameters that can be fixed."""
+def _check_profiled(fit: Fit, level: float, points: int) -> None:
+    """Raise an error unless these are arguments of profiles or contours of a fit."""
+    check_level(level)
+    as_whole("points", points, 3)
     check_kind("fit", fit, Fit)
     if not fit.can_be_profiled:
         raise ValueError(
@@ -220,9 +217,7 @@ def profile(
     >>> print(*ji.profile(result))
     restitution: at least 0.97321 (95 %)
     """
-    check_level(level)
-    as_whole("points", points, 3)
-    _check_profiled(fit)
+    _check_profiled(fit, level, points)
     wanted = fit.names if names is None else (names,) if isinstance(names, str) else tuple(names)
     for name in wanted:
         check_choice("names", name, fit.names)
@@ -264,17 +259,16 @@ class _Lines(Deviances):
         return Grid((i,), (np.unique([*centres, low, high, *near]),))
 
     def profiles(self, which: Sequence[int], level: float) -> tuple[Profile, ...]:
-        """The profiles of these parameters."""
+        """The profiles of these parameters.
+
+        Where deviances pass the limit is found by regula falsi in their roots, all ends side by
+        side.
+        """
         grids = [self.grid(i) for i in which]
         lines = [
             {float(grid.values[0][k]): cell for (k,), cell in cells.items()}
             for grid, cells in zip(grids, self.fill(grids))
         ]
-        self.find_ends(which, lines)
-        return tuple(self.profile(i, line, level) for i, line in zip(which, lines))
-
-    def find_ends(self, which: Sequence[int], lines: Sequence[dict[float, Lowest]]) -> None:
-        """Where deviances pass the limit: regula falsi in their roots, all ends side by side."""
         for turn in range(ROUNDS):
             trials = []
             for n, line in enumerate(lines):
@@ -282,10 +276,11 @@ class _Lines(Deviances):
                     share = np.clip(p / (p - q), 0.02, 0.98) if turn % 3 < 2 else 0.5
                     trials.append((n, inside + share * (outside - inside), line[inside].y))
             if not trials:
-                return
+                break
             ends = self.minimize([((which[n],), (value,), y) for n, value, y in trials])
             for (n, value, _), squares, y in zip(trials, ends.squares.tolist(), ends.y):
                 lines[n][float(value)] = Lowest(squares, y)
+        return tuple(self.profile(i, line, level) for i, line in zip(which, lines))
 
     def _crossings(self, line: dict[float, Lowest]) -> Iterator[tuple[float, float, float, float]]:
         """Ends that are not settled: values inside and outside, and by how much they pass.
@@ -310,11 +305,10 @@ class _Lines(Deviances):
         y, deviance = self.deviance(line)
         deviance = deviance - deviance.min()
         below = np.flatnonzero(deviance <= self.limit)
-        pieces = np.split(below, np.flatnonzero(np.diff(below) > 1) + 1)
-        low, high = self.problem.domains[i]
+        low, high = self.problem.domains[i].tolist()
         intervals = tuple(
             (self._end(i, y, deviance, piece[0], -1), self._end(i, y, deviance, piece[-1], 1))
-            for piece in pieces
+            for piece in np.split(below, np.flatnonzero(np.diff(below) > 1) + 1)
         )
         is_own = np.array_equal(self.best.y, self.problem.point(self.fit.value))
         return Profile(
@@ -324,7 +318,7 @@ class _Lines(Deviances):
             limit=self.limit,
             level=level,
             intervals=intervals,
-            domain=(float(low), float(high)),
+            domain=(low, high),
             better=None if is_own else self.problem.values_at(self.best.y),
         )
 
@@ -412,11 +406,9 @@ def contour(
     >>> region.deviance.shape, round(region.limit, 2)
     ((5, 5), 5.99)
     """
-    check_level(level)
-    as_whole("points", points, 3)
-    _check_profiled(fit)
-    for argument, name in (("first", first), ("second", second)):
-        check_choice(argument, name, fit.names)
+    _check_profiled(fit, level, points)
+    check_choice("first", first, fit.names)
+    check_choice("second", second, fit.names)
     if first == second:
         raise ValueError(f"Arguments `first` and `second` must differ, but both are {first!r}.")
     freedom, pair = fit.degrees_of_freedom, (fit.names.index(first), fit.names.index(second))

@@ -3,10 +3,10 @@
 import dataclasses
 import json
 import platform
-import sys
 from collections.abc import Iterable, Sequence
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,6 +36,13 @@ UNSEEN = "start value; not determined by the data"  # note on a value in bracket
 FORMAT = 1  # of the file; it changes where older files could not be read any more
 _PACKAGES = ("jax", "jaxlib", "equinox", "numpy", "scipy")
 _REBUILT = "problem"  # the field of a fit that is made again from its parts
+_KINDS: dict[str, Any] = {  # of values in the file that are not arrays, mappings or classes
+    "static": StaticNumber,
+    "statics": StaticNumbers,
+    "number": float,
+    "tuple": tuple,
+    "list": list,
+}
 
 
 def joined_words(parts: Sequence[str]) -> str:
@@ -52,21 +59,18 @@ def _values_in_words(fit: "Fit") -> str:
     """Values with their errors, what they assume, and what the data do not determine."""
     seen, data = fit.determined, _data_name(fit)
     determined = np.flatnonzero(seen)
-    others = [_full_name(fit, int(i)) for i in np.flatnonzero(~seen)]
+    others = " and ".join(_full_name(fit, int(i)) for i in np.flatnonzero(~seen))
     parts = [_with_error(fit, int(i)) for i in determined]
-    if len(determined) > _PARAMETERS_NAMED:
-        worst = determined[int(np.argmax(np.nan_to_num(fit.standard_error[determined])))]
-        least_certain = _with_error(fit, int(worst))
-        parts = [f"{len(determined)} parameters are fitted, the least certain {least_certain}"]
-    assumed = _assumptions(fit) + [
-        f"the {prior} of {name}"
-        for i, name in enumerate(fit.names)
-        if (prior := _prior(fit, i)) and not fit.from_prior[i]
-    ]
+    if len(parts) > _PARAMETERS_NAMED:
+        worst = int(np.argmax(np.nan_to_num(fit.standard_error[determined])))
+        parts = [f"{len(parts)} parameters are fitted, the least certain {parts[worst]}"]
+    priors = {name: _prior(fit, i) for i, name in enumerate(fit.names) if not fit.from_prior[i]}
+    assumed = _assumptions(fit)
+    assumed += [f"the {prior} of {name}" for name, prior in priors.items() if prior]
     if parts and assumed:
         parts[-1] += f", assuming {joined_words(assumed)}"
     if others:
-        parts.append(f"{' and '.join(others)} cannot be determined from {data}")
+        parts.append(f"{others} cannot be determined from {data}")
     if any("different minima fit equally well" in line for line in fit.warnings):
         parts.append("other values fit equally well")
     return "; ".join(parts)
@@ -128,14 +132,13 @@ def _with_error(fit: "Fit", i: int) -> str:
     value, error, name = fit.value[i], fit.standard_error[i], _full_name(fit, i)
     if np.isnan(error):
         return f"{name} = {value:.5g}, its error unknown"
-    text = f"{value:g}" if fit.at_bound[i] else with_error(value, error)
+    text = f"{name} = {value:g}" if fit.at_bound[i] else f"{name} = {with_error(value, error)}"
+    words = fit.profiles[i].words if fit.profiles else ""
     if fit.from_prior[i]:
-        return f"{name} = {text}, which is its prior"
-    if fit.profiles:
-        words = fit.profiles[i].words
-        if words.startswith("at ") or " or " in words:
-            return f"{name} = {text}, {words} ({100 * fit.profiles[i].level:g} %)"
-    return f"{name} = {text}{', the end of what is allowed' if fit.at_bound[i] else ''}"
+        return f"{text}, which is its prior"
+    if words.startswith("at ") or " or " in words:
+        return f"{text}, {words} ({100 * fit.profiles[i].level:g} %)"
+    return f"{text}{', the end of what is allowed' if fit.at_bound[i] else ''}"
 
 
 def _headline(fit: "Fit") -> str:
@@ -213,17 +216,23 @@ def _quality(fit: "Fit") -> list[str]:
         lines.append(f"chi^2          {squares} (sigma given)")
         lines += _sigma_sources(fit)
         if fit.noise > 1 and fit.loss == "squares":
+            ratio = np.sqrt(fit.starts[0].sum_of_squares / max(fit.degrees_of_freedom, 1))
+            every = np.isclose(fit.noise, ratio, rtol=1e-3)
+            part = "" if every else " (the factor is that of the residuals that are not momentum)"
             lines.append(
                 f"errors         standard errors multiplied by {fit.noise:.3g}, because chi^2 "
-                f"contradicts the stated sigma{_of_what_part(fit)}"
+                f"contradicts the stated sigma{part}"
             )
     elif np.isfinite(fit.noise):
         lines.append(
             f"noise          {fit.noise:.4g}{unit} a {one}, estimated with "
             f"{degrees(fit.degrees_of_freedom)}"
         )
-    lines.append(f"determined     {_how_many_are_determined(fit)}")
+    total, bounded = len(fit.names), int(fit.determined.sum())
+    fewer = f"; the errors leave {total - bounded} unbounded" if bounded < fit.rank == total else ""
     state = "converged" if fit.converged else "NOT converged"
+    rank = f"{fit.rank} of {total} parameter{'s' * (total > 1)}"
+    lines.append(f"determined     {rank} (rank of the derivatives{fewer})")
     return [*lines, f"solver         {state}, at most {fit.steps} steps a start"]
 
 
@@ -237,33 +246,14 @@ def degrees(count: int) -> str:
     return f"{count} degree{'s' * (count != 1)} of freedom"
 
 
-def _how_many_are_determined(fit: "Fit") -> str:
-    """The rank of the derivatives, and whether intervals bound as many parameters."""
-    total, bounded = len(fit.names), int(fit.determined.sum())
-    text = f"{fit.rank} of {total} parameter{'s' * (total > 1)} (rank of the derivatives"
-    if bounded < fit.rank == total:
-        text += f"; the errors leave {total - bounded} unbounded"
-    return f"{text})"
-
-
-def _of_what_part(fit: "Fit") -> str:
-    """Which residuals the factor of the errors is that of, where these are not all."""
-    ratio = np.sqrt(fit.starts[0].sum_of_squares / max(fit.degrees_of_freedom, 1))
-    every = np.isclose(fit.noise, ratio, rtol=1e-3)
-    return "" if every else " (the factor is that of the residuals that are not momentum)"
-
-
 def _sigma_sources(fit: "Fit") -> list[str]:
     """What went into the stated errors besides sigma."""
-    data = fit.experiments
-    if data is None:
-        return []
-    lines = []
-    if data.resolution is not None:
+    data, lines = fit.experiments, []
+    if data is not None and data.resolution is not None:
         steps = np.unique(np.asarray(data.resolution)[data.measured])
         size = f"{steps[0]:.3g}" if len(steps) == 1 else f"{steps[0]:.3g} to {steps[-1]:.3g}"
         lines.append(f"               with that of readings in steps of {size}: step / sqrt(12)")
-    if data.sigma_pre is not None:
+    if data is not None and data.sigma_pre is not None:
         lines.append("               with those of the velocities before, passed on by the law")
     return lines
 
@@ -275,27 +265,19 @@ def _section(title: str, lines: tuple[str, ...]) -> list[str]:
 
 def _minima(fit: "Fit") -> list[str]:
     """Where the starts ended."""
-    total, lost = fit.start_count, fit.lost_starts
-    unfinished = f"{lost} of {total} starts were given up." if lost else ""
-    if len(fit.starts) == 1:
-        one = f"{total - lost} of {total} starts ended in this minimum. {unfinished}"
-        return [one.rstrip()] if total > 1 else []
-    where = f"{len(fit.starts)} minima"
-    if fit.rank < len(fit.names):
-        where = f"{len(fit.starts)} points of one valley"
+    total, lost, count = fit.start_count, fit.lost_starts, len(fit.starts)
+    unfinished = [f"{lost} of {total} starts were given up."] if lost else []
+    if count == 1:
+        ended = f"{total - lost} of {total} starts ended in this minimum."
+        return [" ".join([ended, *unfinished])] if total > 1 else []
+    where = f"{count} minima" if fit.rank == len(fit.names) else f"{count} points of one valley"
     lines = [f"{total} starts ended in {where}:  sum of squares, number of starts, values"]
     for minimum in fit.starts[:_MINIMA_SHOWN]:
         values = named_values(fit, minimum.value)
         lines.append(f"  {minimum.sum_of_squares:12.5g} {minimum.count:4d}   {values}")
-    if len(fit.starts) > _MINIMA_SHOWN:
-        lines.append(f"  ... and {len(fit.starts) - _MINIMA_SHOWN} more")
-    return [*lines, unfinished] if unfinished else lines
-
-
-def _without_rounding(values: np.ndarray) -> np.ndarray:
-    """0 for what is rounding against the largest of the values (K, n) of its shot."""
-    largest = np.abs(values).max(axis=1, keepdims=True)
-    return np.where(np.abs(values) <= _ROUNDING * largest, 0.0, values)
+    if count > _MINIMA_SHOWN:
+        lines.append(f"  ... and {count - _MINIMA_SHOWN} more")
+    return lines + unfinished
 
 
 def _shots(fit: "Fit") -> list[str]:
@@ -308,7 +290,9 @@ def _shots(fit: "Fit") -> list[str]:
     head = f"{'shot':>8s} {'body':>5s} {'before':>12s} {'measured':>12s} {'fitted':>12s}"
     lines, (shots, bodies) = [head + common_unit], data.pre.shape
     before, measured = np.asarray(data.pre, float), np.asarray(data.post, float)
-    fitted, shown = _without_rounding(fit.predicted), max(1, _VELOCITIES_SHOWN // bodies)
+    largest = np.abs(fit.predicted).max(axis=1, keepdims=True)
+    fitted = np.where(np.abs(fit.predicted) <= _ROUNDING * largest, 0.0, fit.predicted)
+    shown = max(1, _VELOCITIES_SHOWN // bodies)
     for k, i in np.ndindex(*before[:shown].shape):
         label = data.shots[k] if i == 0 else ""
         status = STATUS[int(fit.status[k])].name if fit.status[k] and i == 0 else ""
@@ -388,13 +372,11 @@ def as_record(fit: "Fit") -> dict[str, Any]:
         }
         for i, (name, ends) in enumerate(zip(fit.names, fit.confidence_interval()))
     ]
+    of_minimum = ("sum_of_squares", "value", "count")
     record = {
         "law": type(fit.law).__name__,
         "parameters": parameters,
-        "starts": [
-            {"sum_of_squares": s.sum_of_squares, "value": s.value, "count": s.count}
-            for s in fit.starts
-        ],
+        "starts": [{name: getattr(each, name) for name in of_minimum} for each in fit.starts],
         "shots": [] if fit.experiments is None else fit.experiments.shots,
         "status": [STATUS[code].name for code in fit.status],
     }
@@ -457,7 +439,28 @@ def load_fit(path: str | Path) -> "Fit":
     """
     from jimpact.fits.uncertainty import Fit  # which imports this module
 
-    return Fit(**_read_fit(Path(path)))
+    path = Path(path)
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path}: the file must be a saved fit (JSON), but {error}.") from None
+    if not isinstance(record, dict) or "format" not in record:
+        raise ValueError(f"{path}: the file must be a saved fit, but has no `format`.")
+    writer = record.get("versions", {}).get("jimpact", "an unknown version")
+    if record["format"] != FORMAT:
+        raise ValueError(
+            f"{path}: the file must be a fit saved in format {FORMAT}, but has format "
+            f"{record['format']} (written by jimpact {writer}; this is {jimpact.__version__})."
+        )
+    try:
+        result = {name: _decoded(value) for name, value in record["result"].items()}
+        result[_REBUILT] = _problem(record["problem"], result["value"])
+        return Fit(**result)
+    except (KeyError, AttributeError, ImportError, TypeError) as error:
+        raise ValueError(
+            f"{path}: the fit, saved by jimpact {writer}, cannot be read: {error!r}. A law of your "
+            "own must be imported before."
+        ) from error
 
 
 def versions() -> dict[str, str]:
@@ -469,31 +472,6 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:  # installed in a way that leaves no record
             continue
     return found | {"Python": f"{platform.python_version()}, {platform.system()}"}
-
-
-def _read_fit(path: Path) -> dict[str, Any]:
-    """The fields of a fit that `write_fit` has written."""
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path}: the file must be a saved fit (JSON), but {error}.") from None
-    if not isinstance(record, dict) or "format" not in record:
-        raise ValueError(f"{path}: the file must be a saved fit, but has no `format`.")
-    if record["format"] != FORMAT:
-        writer = record.get("versions", {}).get("jimpact", "an unknown version")
-        raise ValueError(
-            f"{path}: the file must be a fit saved in format {FORMAT}, but has format "
-            f"{record['format']} (written by jimpact {writer}; this is {jimpact.__version__})."
-        )
-    try:
-        result = {name: _decoded(value) for name, value in record["result"].items()}
-        return result | {_REBUILT: _problem(record["problem"], result["value"])}
-    except (KeyError, AttributeError, ImportError, TypeError) as error:
-        writer = record.get("versions", {}).get("jimpact")
-        raise ValueError(
-            f"{path}: the fit, saved by jimpact {writer}, cannot be read: {error!r}. A law of your "
-            "own must be imported before."
-        ) from error
 
 
 def _problem(parts: dict[str, Any], value: np.ndarray) -> FitProblem:
@@ -539,27 +517,21 @@ def _decoded(data: Any) -> Any:
     """What `_encoded` has encoded."""
     if not isinstance(data, dict):
         return data
-    if "array" in data:
-        array = np.array([_decoded(x) for x in data["array"]], data["dtype"])
-        array = array.reshape(data["shape"])
-        return jnp.asarray(array) if data["device"] else array
     if "class" in data:
         return _instance(data["class"], data["fields"])
-    (kind, content) = next(iter(data.items()))
-    if kind in ("static", "statics", "number"):
-        makers: dict[str, Any] = {"static": StaticNumber, "statics": StaticNumbers, "number": float}
-        return makers[kind](content)
+    if "array" in data:
+        array = np.array([_decoded(x) for x in data["array"]], data["dtype"]).reshape(data["shape"])
+        return jnp.asarray(array) if data["device"] else array
+    ((kind, content),) = data.items()
     if kind == "dict":
         return {key: _decoded(each) for key, each in content.items()}
-    return {"tuple": tuple, "list": list}[kind](_decoded(each) for each in content)
+    return _KINDS[kind](map(_decoded, content) if isinstance(content, list) else content)
 
 
 def _instance(place: str, fields: dict[str, Any]) -> Any:
     """An instance of the class at a place with these fields, which are all that it has."""
     module, _, name = place.partition(":")
-    found: Any = sys.modules.get(module) or import_module(module)
-    for part in name.split("."):
-        found = getattr(found, part)
+    found: Any = attrgetter(name)(import_module(module))
     if not dataclasses.is_dataclass(found):
         raise TypeError(f"{place} is no class of a law, scene or result")
     known = {field.name for field in dataclasses.fields(found)}

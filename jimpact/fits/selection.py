@@ -98,14 +98,12 @@ class LawFits(Tabular):
     def verdict(self) -> str:
         """Which law, in one sentence."""
         best = self.best
+        which = f"No law fits; the nearest is {best.name} ({best.verdict})"
         if best.adequate:
-            return f"The simplest law that fits is {best.name}: {best.fit.verdict}"
-        if best.tier == "lack of fit":
-            return (
-                f"No law fits; the simplest that predicts as well as any is {best.name}: "
-                f"{best.fit.verdict}"
-            )
-        return f"No law fits; the nearest is {best.name} ({best.verdict}): {best.fit.verdict}"
+            which = f"The simplest law that fits is {best.name}"
+        elif best.tier == "lack of fit":
+            which = f"No law fits; the simplest that predicts as well as any is {best.name}"
+        return f"{which}: {best.fit.verdict}"
 
     @property
     def table(self) -> Table:
@@ -153,11 +151,10 @@ class NestedTest(NamedTuple):
         return self.chance < WORSE
 
     def __str__(self) -> str:
-        word = "needed" if self.needed else "not needed"
-        kind = "chi^2" if self.degrees_of_freedom is None else "F"
-        rest = "" if self.degrees_of_freedom is None else f" and {self.degrees_of_freedom}"
+        needed, rest = "needed" if self.needed else "not needed", self.degrees_of_freedom
+        kind, freedom = ("chi^2", self.more) if rest is None else ("F", f"{self.more} and {rest}")
         return (
-            f"{', '.join(self.names)} {word}: {kind} = {self.statistic:.3g} with {self.more}{rest} "
+            f"{', '.join(self.names)} {needed}: {kind} = {self.statistic:.3g} with {freedom} "
             f"degrees of freedom, p-value {self.chance:.2g}."
         )
 
@@ -330,30 +327,28 @@ def _candidates(
             left_out["restitution_matrix"] = f"has no start: {error}"
     built, missing = registered_laws(values)
     left_out = missing | left_out
-    if laws is None and "compliant" in built and not any(map(_opens_and_closes, scenes)):
-        left_out["compliant"] = (
-            "differs from lzb only where contacts have gaps, or open and close again (as at a "
-            "wall): name it in `laws` to fit it, too"
-        )
-    if laws is None and "routh" in built:
-        left_out["routh"] = (
-            "is moreau with one restitution, unless contacts separate beforehand: name it in "
-            "`laws` to fit it, too"
-        )
+    alternatives = {
+        "compliant": "differs from lzb only where contacts have gaps, or open and close again (as "
+        "at a wall): name it in `laws` to fit it, too",
+        "routh": "is moreau with one restitution, unless contacts separate beforehand: name it in "
+        "`laws` to fit it, too",
+    }
+    if any(map(_opens_and_closes, scenes)):
+        del alternatives["compliant"]
+    if laws is None:
+        left_out |= {name: why for name, why in alternatives.items() if name in built}
     if "base" not in values:
         left_out.pop("velocity_dependent", None)  # an option of the others, see `speed`
-    built = {name: law for name, law in built.items() if name not in left_out}
-    if laws is not None:
-        wanted = tuple(laws)
-        for name in wanted:
-            check_choice("laws", name, tuple(REGISTRY))
-        built = {name: law for name, law in built.items() if name in wanted}
-        left_out = {name: why for name, why in left_out.items() if name in wanted}
-    candidates: dict[str, Candidate] = {}
-    for name, law in built.items():
-        for label, candidate in _variants(law, contacts, alike, more).items():
-            candidates[f"{name}{label}"] = candidate
-    return candidates, left_out
+    wanted = tuple(REGISTRY if laws is None else laws)
+    for name in wanted:
+        check_choice("laws", name, tuple(REGISTRY))
+    candidates = {
+        f"{name}{label}": candidate
+        for name, law in built.items()
+        if name in wanted and name not in left_out
+        for label, candidate in _variants(law, contacts, alike, more).items()
+    }
+    return candidates, {name: why for name, why in left_out.items() if name in wanted}
 
 
 def _opens_and_closes(scene: Scene) -> bool:
@@ -379,16 +374,14 @@ def _variants(law: Law, contacts: int, alike: bool, more: tuple[str, ...]) -> di
     for name in fields:
         each = jnp.broadcast_to(known[name].value, (contacts,))
         law = with_parameter(law, name, each)
-    one, each_own = np.ones(contacts, int), np.arange(1, contacts + 1)
-    coefficients = {"": one} | ({", e per contact": each_own} if alike else {})
-    ratios: dict[str, Any] = {"": np.zeros(contacts, int)}
+    each_own = np.arange(1, contacts + 1)
+    coefficients, ratios = {"": np.ones(contacts, int)}, {"": np.zeros(contacts, int)}
+    if alike:
+        coefficients[", e per contact"] = each_own
     if alike and law.only_stiffness_ratios:  # of others the stiffness is one in SI units
         ratios[", free stiffness ratios"] = each_own
     return {
-        f"{a}{b}": (
-            law,
-            {"restitution": e} | ({"stiffness": k} if "stiffness" in known else {}) | others,
-        )
+        f"{a}{b}": (law, dict(zip(fields, (e, k))) | others)
         for a, e in coefficients.items()
         for b, k in ratios.items()
     }
@@ -401,7 +394,7 @@ def _judged(fits: dict[str, Fit]) -> dict[str, LawFit]:
     """The laws with their verdicts, in order."""
     errors = {name: _errors_left_out(each) for name, each in fits.items()}
     against = {name: _against(each) for name, each in fits.items()}
-    squares = {name: _per_shot(fits[name], errors[name]) for name in fits}
+    squares = {name: _per_shot(each, errors[name]) for name, each in fits.items()}
     usable = [name for name in fits if against[name][0] != "fails"] or list(fits)
     many = all(np.isfinite(squares[name]).sum() >= _LEAST for name in usable)
     least = {name: np.nansum(squares[name]) if many else _variance(fits[name]) for name in usable}
@@ -423,20 +416,18 @@ def _judged(fits: dict[str, Fit]) -> dict[str, LawFit]:
 
 def _order(entry: LawFit) -> tuple[Any, ...]:
     """Adequate first, by parameters, then in the order of `advise`; the rest by error."""
-    tier = _TIERS.index(entry.tier)
-    base = entry.name.split(",")[0]
-    order = simplest_first()
+    tier, base, order = _TIERS.index(entry.tier), entry.name.split(",")[0], simplest_first()
     place = order.index(base) if base in order else len(order)
     error = entry.left_out_error if np.isfinite(entry.left_out_error) else entry.fit.rms
-    return (tier, entry.parameters, place) if tier < 2 else (tier, error, place)
+    return tier, entry.parameters if tier < 2 else error, place
 
 
 def _against(result: Fit) -> tuple[str, str]:
     """What is against a law by itself: (tier, in words)."""
-    codes = [code for code in result.status if STATUS[code].failure]
-    if codes:
-        names = ", ".join(dict.fromkeys(STATUS[code].name for code in codes))
-        return "fails", f"fails in {len(codes)} of {len(result.status)} shots: {names}"
+    failing = [STATUS[code].name for code in result.status if STATUS[code].failure]
+    if failing:
+        names = ", ".join(dict.fromkeys(failing))
+        return "fails", f"fails in {len(failing)} of {len(result.status)} shots: {names}"
     if not result.converged:
         return "fails", "does not converge"
     if result.shows_lack_of_fit:
@@ -479,9 +470,8 @@ def _chance(squares: np.ndarray, best: np.ndarray) -> float:
     """
     both = np.isfinite(squares) & np.isfinite(best)
     some = both & (squares > 0) & (best > 0)
-    logs = np.log(squares[some]) - np.log(best[some])
     gain = _above_zero(squares[both] - best[both], best[both])
-    return min(gain, _above_zero(logs, 1.0))
+    return min(gain, _above_zero(np.log(squares[some]) - np.log(best[some]), 1.0))
 
 
 def _above_zero(more: np.ndarray, size: Any) -> float:
@@ -525,12 +515,10 @@ def _speed_test(
 ) -> NestedTest | None:
     """Whether e depends on the speed; None of a law without e, or of shots equally fast."""
     law, free = candidate
-    speeds = data.approach_speed(scene)
+    known, speeds = free_parameters_of(law), data.approach_speed(scene)
     speeds = speeds[speeds > 0]
-    known = free_parameters_of(law)
-    if "restitution" not in known or known.keys() & set(OF_SPEED):
-        return None
-    if len(speeds) < 2 or np.ptp(speeds) == 0:
+    constant_e = "restitution" in known and not known.keys() & set(OF_SPEED)
+    if not constant_e or len(speeds) < 2 or np.ptp(speeds) == 0:
         return None
     typical = float(np.exp(np.mean(np.log(speeds))))
     falling = VelocityDependent(law, speed_exponent=SPEED_EXPONENT, reference_speed=typical)

@@ -127,19 +127,19 @@ class SolverState(eqx.Module):
     stuck: jax.Array  # no step lowers the cost
 
 
-def default_steps(method: Any) -> int:
-    """Step limit where the user gives none; raises a ValueError for an unknown method."""
-    if isinstance(method, str) and method in DEFAULT_STEPS:
-        return DEFAULT_STEPS[method]
-    import optax
+def step_limit(method: Any, stated: int | None) -> int:
+    """The stated limit of steps, or that of the method; raises a ValueError for an unknown one."""
+    known = isinstance(method, str) and method in DEFAULT_STEPS
+    if not known:
+        import optax
 
-    if not isinstance(method, optax.GradientTransformation):
-        raise ValueError(
-            f"Argument `method` must be one of {', '.join(map(repr, DEFAULT_STEPS))} or an "
-            f"optax.GradientTransformation, but has value {method!r}."
-            f"{suggestion(method, DEFAULT_STEPS)}"
-        )
-    return DEFAULT_STEPS["adam"]
+        if not isinstance(method, optax.GradientTransformation):
+            raise ValueError(
+                f"Argument `method` must be one of {', '.join(map(repr, DEFAULT_STEPS))} or an "
+                f"optax.GradientTransformation, but has value {method!r}."
+                f"{suggestion(method, DEFAULT_STEPS)}"
+            )
+    return DEFAULT_STEPS[method if known else "adam"] if stated is None else stated
 
 
 def begin(problems: Any, y: Any, solver: "Solver") -> SolverState:
@@ -280,7 +280,7 @@ class Ends(NamedTuple):
     jacobian: np.ndarray  # (S, R, Q)
     predicted: np.ndarray
     status: np.ndarray
-    slopes: np.ndarray | None  # `dv+/dv-` of the shots, where errors of v- are passed on
+    slopes: Any  # `dv+/dv-` of the shots, where errors of v- are passed on, else None
     converged: np.ndarray  # (S,) whether so close to a minimum that it stands
     stuck: np.ndarray  # (S,) no step lowers the sum of squares, although derivatives promise it
     steps: np.ndarray
@@ -341,6 +341,13 @@ def minimize(
         steps=np.asarray(steps),
         exact=EXACT[dtype] * size**2,
     )
+
+
+def outcome_at(problem: "FitProblem", x: Any) -> Ends:
+    """Residual, derivatives and predictions at x (P,), by the program that searches."""
+    point = problem.point(np.asarray(x))[None]
+    once, every = Solver(max_steps=1), np.ones(point.shape, bool)
+    return minimize(stacked([problem]), point, once, fixed=every)
 
 
 def in_lanes(

@@ -13,18 +13,11 @@ from scipy.special import ndtri, stdtrit
 from jimpact._checks import check_choice, check_kind, check_values
 from jimpact.files.records import Column, Table, Tabular
 from jimpact.fits.data import Experiments
-from jimpact.fits.parameters import (
-    AnyLaw,
-    LawInScene,
-    entry_of,
-    tied_names,
-    tied_places,
-    value_of,
-)
+from jimpact.fits.parameters import AnyLaw, LawInScene, tied_names, tied_value
 from jimpact.fits.problem import FitProblem
 from jimpact.fits.report import as_record, pieces_in_words, report, save_fit, verdict
 from jimpact.fits.search import FitMinimum, solution
-from jimpact.fits.solve import RANK_TOLERANCE, Solver, minimize, stacked
+from jimpact.fits.solve import RANK_TOLERANCE, outcome_at
 from jimpact.law import parameters_of
 from jimpact.scene import Scene
 
@@ -77,12 +70,10 @@ def uncertainty(
     singular = np.pad(singular, (0, len(scale) - len(singular)))
     rank = int(np.sum(singular > RANK_TOLERANCE[problem.precision] * singular[0]))
     freedom = problem.values - rank
-    if noise is None and problem.sigma is not None:
-        noise = 1.0
-    elif noise is None and (freedom < 1 or minimum.sum_of_squares <= problem.exact_squares):
-        noise = np.nan
-    elif noise is None:
-        noise = float(np.sqrt(minimum.sum_of_squares / freedom))
+    if noise is None:
+        shown = freedom >= 1 and minimum.sum_of_squares > problem.exact_squares
+        estimated = float(np.sqrt(minimum.sum_of_squares / freedom)) if shown else np.nan
+        noise = estimated if problem.sigma is None else 1.0
     determined = directions[:rank] / singular[:rank, None]
     covariance = noise**2 * (determined.T @ determined) * np.outer(scale, scale)
     null = directions[rank:]
@@ -345,10 +336,10 @@ class Fit(Tabular, Generic[AnyLaw]):
     @property
     def from_prior(self) -> np.ndarray:
         """(P,) which parameters are known from their priors alone: the data add hardly anything."""
-        alone = np.zeros(len(self.names), bool)
-        for i, _, std in self.problem.priors:
-            alone[i] = self.standard_error[i] > PRIOR_ALONE * self.noise * std
-        return alone
+        std = np.full(len(self.names), np.inf)
+        for prior in self.problem.priors:
+            std[prior.parameter] = prior.std
+        return self.standard_error > PRIOR_ALONE * self.noise * std
 
     @property
     def tied(self) -> dict[str, tuple[float, float]]:
@@ -360,14 +351,11 @@ class Fit(Tabular, Generic[AnyLaw]):
         def values(x: jax.Array) -> jax.Array:
             """The tied entries of parameters x."""
             law = problem.law_in_scene(x)
-            parts = [jnp.ravel(value_of(law, entry_of(name)[0])) for name, _ in ties]
-            places = tied_places(law, ties).values()
-            return jnp.concatenate([part[np.array(at)] for part, at in zip(parts, places)])
+            return jnp.concatenate([tied_value(law, tie) for tie in ties])
 
-        x = jnp.asarray(self.value, problem.precision)
+        x, names = jnp.asarray(self.value, problem.precision), tied_names(problem.law, ties)
         errors = self.errors_of(np.asarray(jax.jacfwd(values)(x), float))
-        pairs = zip(np.asarray(values(x), float).tolist(), errors.tolist())
-        return dict(zip(tied_names(problem.law, ties), pairs))
+        return dict(zip(names, zip(np.asarray(values(x), float).tolist(), errors.tolist())))
 
     def errors_of(self, slope: np.ndarray) -> np.ndarray:
         """Standard errors of what depends on the parameters.
@@ -409,9 +397,9 @@ class Fit(Tabular, Generic[AnyLaw]):
         quantile = self.quantile(level)
         if self.experiments is None:
             raise ValueError("Argument `fit` must be to shots.")
-        data, scenes, units = shots, None, self.experiments.units
+        data, scenes, units, sigma = shots, None, self.experiments.units, None
         if isinstance(shots, Experiments):
-            data, scenes, units = shots.pre, shots.scenes, shots.units
+            data, scenes, units, sigma = shots.pre, shots.scenes, shots.units, shots.sigma
         if np.ndim(data) != 2 or np.shape(data)[1] != len(units):
             raise ValueError(
                 f"Argument `shots` must have shape (K, {len(units)}), velocities of the bodies of "
@@ -419,8 +407,7 @@ class Fit(Tabular, Generic[AnyLaw]):
             )
         check_values("shots", data)
         data = Experiments(data, np.zeros_like(np.asarray(data, float)), scenes=scenes, units=units)
-        law = self.problem.law_in_scene(self.value)
-        if isinstance(law, LawInScene) and scene is not None:
+        if isinstance(self.problem.law, LawInScene) and scene is not None:
             raise ValueError(
                 "Argument `scene` must be left out where parts of the scene were fitted: they hold "
                 "for that of the fit only."
@@ -428,14 +415,11 @@ class Fit(Tabular, Generic[AnyLaw]):
         own = self.problem.scene if scene is None else scene
         largest = own if scenes is None else max(scenes, key=lambda each: each.contacts)
         self._check_scene(largest, len(units))
-        ties = dict(self.problem.ties)
-        problem = FitProblem.from_shots(law, own, data, self.problem.parameters.labels, ties=ties)
-        point, every = problem.point(problem.start)[None], np.ones((1, len(problem.low)), bool)
-        ends = minimize(stacked([problem]), point, Solver(max_steps=1), fixed=every)
-        there = solution(problem, ends)
+        problem = self.problem.of_other(data, own)
+        there = solution(problem, outcome_at(problem, self.value))
         slope = problem.of_data(there.jacobian)
-        error = self.errors_of(problem.errors_of(slope / problem.steps_at(problem.start)))
-        value, noise = there.predicted, self._noise_of(shots)
+        error = self.errors_of(problem.errors_of(slope / problem.steps_at(self.value)))
+        value, noise = there.predicted, np.broadcast_to(self._noise_of(sigma), data.pre.shape)
         half = quantile * np.hypot(error, noise)
         return Predicted(value, error, np.asarray(there.status), noise, value - half, value + half)
 
@@ -453,15 +437,14 @@ class Fit(Tabular, Generic[AnyLaw]):
                 f"{scene.size} and {scene.contacts}."
             )
 
-    def _noise_of(self, shots: Any) -> np.ndarray:
-        """Standard errors (K, n) of measured velocities: of the shots, or as in the fit (rms)."""
-        if isinstance(shots, Experiments) and shots.sigma is not None:
+    def _noise_of(self, sigma: Any) -> np.ndarray:
+        """Standard errors of measured velocities: of these, or as in the fit (rms)."""
+        if sigma is not None:
             stretched = 1.0 if self.problem.sigma is None else self.noise
-            return stretched * np.asarray(shots.sigma, float)
-        pre = shots.pre if isinstance(shots, Experiments) else shots
+            return stretched * np.asarray(sigma, float)
         weight = np.ma.masked_equal(np.asarray(self.problem.weight, float), 0.0)
-        each = np.sqrt((1 / weight**2).mean(axis=0)).filled(np.nan)  # NaN: never measured
-        return np.broadcast_to(self.noise * each, np.shape(pre))
+        # NaN: never measured
+        return self.noise * np.sqrt((1 / weight**2).mean(axis=0)).filled(np.nan)
 
     @property
     def experiments(self) -> Experiments | None:
@@ -539,18 +522,15 @@ class Fit(Tabular, Generic[AnyLaw]):
         low, high = self.bounds[0][i], self.bounds[1][i]
         minima = [(self.value[i], self.standard_error[i], 0.0)]
         for minimum in self.starts[1:]:
-            if minimum.standard_error is not None:
-                more = minimum.sum_of_squares - self.starts[0].sum_of_squares
+            more = minimum.sum_of_squares - self.starts[0].sum_of_squares
+            if minimum.standard_error is not None and more < (q * self.noise) ** 2:
                 minima.append((minimum.value[i], minimum.standard_error[i], more))
-        pieces: list[tuple[float, float]] = []
+        pieces = []
         for value, error, more in minima:
-            if pieces and not more < (q * self.noise) ** 2:
-                continue
             half = error * np.sqrt(q**2 - (more / self.noise**2 if more else 0.0))
+            ends = value + np.array([-half, half])
             if self.problem.parameters.log[i]:
                 ends = value * np.exp(np.array([-half, half]) / value)
-            else:
-                ends = np.array([value - half, value + half])
             pieces.append(tuple(np.clip(ends, low, high)))
         return joined(pieces)
 
@@ -573,17 +553,10 @@ class Fit(Tabular, Generic[AnyLaw]):
             return True
         if not np.isfinite(self.noise):
             return False  # the errors are unknown
-        q = self.quantile(0.95)
-        for i in range(len(self.names)):
-            pieces = self.linearized_interval(i, q)
-            at_end = pieces[0][0] <= self.bounds[0][i] or pieces[-1][1] >= self.bounds[1][i]
-            wide = (
-                self.problem.parameters.log[i]
-                and self.standard_error[i] > HARDLY_SEEN * self.value[i]
-            )
-            if len(pieces) > 1 or at_end or wide:
-                return True
-        return False
+        wide = self.problem.parameters.log & (self.standard_error > HARDLY_SEEN * self.value)
+        low, high = self.confidence_interval().T
+        at_end = (low <= self.bounds[0]) | (high >= self.bounds[1])
+        return bool((wide | at_end).any()) or max(map(len, self.intervals())) > 1
 
 
 def check_squares(name: str, fit: Any) -> None:

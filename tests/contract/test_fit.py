@@ -1131,6 +1131,7 @@ PER_CONTACT = ji.LZB([0.9, 0.9], [1.0, 1.0])
         (ji.Newton(0.9), None, TWO, {}, r"`scene` must be a Scene"),
         (ji.Newton([0.9, 0.9]), PAIR, TWO, {}, r"`restitution` must have shape \(1,\)"),
         (ji.Newton(0.9), PAIR, TWO, {"search": ji.Search("newton")}, r"`method` must be one of 'levenberg-marquardt', .*'newton'"),
+        (ji.Newton(0.9), PAIR, TWO, {"search": ji.Search("newton", max_steps=5)}, r"`method` must be one of 'levenberg-marquardt', .*'newton'"),
         (ji.Newton(0.9), PAIR, TWO, {"starts": 0}, r"`starts` must be an int >= 1"),
         (ji.Newton(0.9), PAIR, TWO, {"search": ji.Search(max_steps=0)}, r"`max_steps` must be an int >= 1"),
     ],

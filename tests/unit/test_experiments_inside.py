@@ -5,7 +5,7 @@ from importlib.resources import files
 import numpy as np
 
 import jimpact as ji
-from jimpact.fits.data_checks import data_defects
+from jimpact.fits.data_checks import DATA_CHECKS, DataBalances, findings
 
 DATA = files("jimpact") / "data"
 
@@ -17,6 +17,12 @@ def written(tmp_path, text, encoding="utf-8"):
     path = tmp_path / "shots.csv"
     path.write_bytes(text.encode(encoding))
     return path
+
+
+def data_defects(experiments, scene, stored_energy=0.0):
+    """What the data break beyond their error, a line each."""
+    balances = DataBalances(experiments, scene, stored_energy)
+    return [found.line for found in findings(DATA_CHECKS, balances)]
 
 
 def test_momentum_of_the_measured_balls():

@@ -8,7 +8,7 @@ from scipy import optimize
 
 import jimpact as ji
 from jimpact.files.records import with_error
-from jimpact.fits.parameters import LawInScene, bounds_of, free_parameters, tied
+from jimpact.fits.parameters import LawInScene, bounds_of, checked_ties, free_parameters, tied
 from jimpact.fits.solve import Damping
 from jimpact.fits.uncertainty import Fit
 
@@ -73,6 +73,7 @@ def test_a_mass_with_a_prior_is_fitted_with_the_law():
     np.testing.assert_allclose(found.chi_squared, 2 * best.cost, rtol=1e-8)
     np.testing.assert_allclose(found.scene.mass, [1.0, found.value[1]])
     assert type(found.law) is type(found.problem.to_law(found.value)) is ji.Newton
+    np.testing.assert_allclose(found.predict(SHOTS).velocity, found.predicted, atol=1e-12)
     with pytest.raises(ValueError, match="`scene` must be left out"):
         found.predict(SHOTS, BALLS)
 
@@ -113,8 +114,9 @@ def test_ties_reach_across_fields_in_any_order():
         ("restitution[2]", lambda p: p["restitution[1]"] / 2),
     )
     for order in (ties, ties[::-1]):
-        np.testing.assert_array_equal(tied(law, order).stiffness, [1.0, 2.0, 2.25])
-    chosen, _ = free_parameters(law, ("restitution", "stiffness"), ties=ties)
+        checked = checked_ties(law, dict(order))
+        np.testing.assert_array_equal(tied(law, checked).stiffness, [1.0, 2.0, 2.25])
+    chosen, _ = free_parameters(law, ("restitution", "stiffness"), ties=checked)
     assert chosen.names == ("restitution[1]", "restitution[3]")  # stiffness[1]: only ratios matter
 
 
