@@ -28,7 +28,7 @@ from jimpact.audits import audit
 from jimpact.compiling import full_precision
 from jimpact.files.records import Column, Table, Tabular, as_data, fields_as_data
 from jimpact.laws.lzb import LZB
-from jimpact.methods.contenders import CONTENDERS, Contender, outcome
+from jimpact.methods.contenders import CONTENDERS, Contender, contender_of, outcome
 from jimpact.methods.points import in_batches, left_out_if_it_raises, left_out_notes
 from jimpact.progress import counting_bar
 from jimpact.scene import Scene, as_velocity, chain
@@ -348,10 +348,7 @@ def _methods(methods: Sequence[str | Contender] | None, place: Place) -> list[Co
         known = {name: m for name, m in known.items() if m.friction}
         defaults = FRICTION_NAMES
     chosen = defaults if methods is None else tuple(methods)
-    for each in chosen or ("",):
-        if not isinstance(each, Contender):
-            check_choice("methods", each, known)
-    return [each if isinstance(each, Contender) else known[each] for each in chosen]
+    return [contender_of("methods", each, known) for each in chosen or ("",)]
 
 
 def _checked(argument: str, values: Mapping[str, Any], names: tuple[str, ...]) -> Mapping[str, Any]:
