@@ -324,7 +324,7 @@ def _chosen(
 
 def _supported(argument: str, contender: str | Contender, case: Case) -> Contender:
     """The contender, or that of this name, if it supports the law."""
-    contender = contender_of(argument, contender)
+    contender = contender_of(argument, contender, CONTENDERS)
     reason = contender.supports(case.law)
     if reason is not None:
         raise ValueError(

@@ -13,7 +13,6 @@ A contender of your own is a function and its settings, and stands in the chart 
 True
 """
 
-from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import diffrax
@@ -144,9 +143,7 @@ _ALL = (
 CONTENDERS: dict[str, Contender] = {each.name: each for each in _ALL}
 
 
-def contender_of(
-    argument: str, given: str | Contender, known: Mapping[str, Contender] = CONTENDERS
-) -> Contender:
+def contender_of(argument: str, given: str | Contender, known: dict[str, Contender]) -> Contender:
     """The contender of this name among those known, or one of your own, with a name of its own."""
     if not isinstance(given, Contender):
         check_choice(argument, given, known)

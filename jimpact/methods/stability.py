@@ -228,8 +228,9 @@ def stability_map(
         `StabilityMap`; in double precision (jax_enable_x64) only.
 
     Raises:
-        ValueError: unknown names, values out of range, single precision, a scene without a
-            velocity, nothing approaches, methods without friction for a scene that has it.
+        ValueError: unknown names, a known name for a contender of your own, values out of range,
+            single precision, a scene without a velocity, nothing approaches, methods without
+            friction for a scene that has it.
 
     Source: docs/stability.md.
 
@@ -342,12 +343,10 @@ def _place(scene: Scene | None, velocity: Any) -> Place:
 
 def _methods(methods: Sequence[str | Contender] | None, place: Place) -> list[Contender]:
     """Contenders, those of these names, or those to map by default."""
-    known = {name: m for name, m in CONTENDERS.items() if m.jax}
-    defaults: tuple[str, ...] = NAMES
-    if place.friction:
-        known = {name: m for name, m in known.items() if m.friction}
-        defaults = FRICTION_NAMES
-    chosen = defaults if methods is None else tuple(methods)
+    able = [m for m in CONTENDERS.values() if m.jax and (m.friction or not place.friction)]
+    known = {m.name: m for m in able}
+    defaults = FRICTION_NAMES if place.friction else NAMES
+    chosen = tuple(defaults if methods is None else methods)
     return [contender_of("methods", each, known) for each in chosen or ("",)]
 
 
