@@ -18,8 +18,8 @@ from jimpact.fits.parameters import with_entries
 from jimpact.impacts import Impact, impact
 from jimpact.law import Law, check_law
 from jimpact.laws.lzb import LZB
-from jimpact.methods.contenders import CONTENDERS, Contender, outcome
-from jimpact.methods.points import in_turns, left_out_if_it_raises
+from jimpact.methods.contenders import CONTENDERS, Contender, contender_of, outcome
+from jimpact.methods.points import in_turns, left_out_if_it_raises, left_out_notes
 from jimpact.methods.schemes import UNCOUNTED
 from jimpact.progress import counting_bar
 from jimpact.registry import registered_laws
@@ -146,7 +146,7 @@ class WorkPrecision(Tabular):
             f"Times: medians of {self.repeats} in turns, per impact: alone, in a batch of "
             f"{self.batch} (quartiles), with J: with the Jacobian.",
         ]
-        notes += [f"left out: {name}: {why}." for name, why in self.left_out.items()]
+        notes += left_out_notes(self.left_out)
         notes += [f"no gradient: {name}: {why}." for name, why in self.without_gradient.items()]
         return Table(columns, rows, notes=notes, keys=2)
 
@@ -324,18 +324,12 @@ def _chosen(
 
 def _supported(argument: str, contender: str | Contender, case: Case) -> Contender:
     """The contender, or that of this name, if it supports the law."""
-    if not isinstance(contender, Contender):
-        check_choice(argument, contender, CONTENDERS)
-        contender = CONTENDERS[contender]
-    elif CONTENDERS.get(contender.name, contender) is not contender:
-        raise ValueError(
-            f"Argument `{argument}` must have contenders of new names, but has {contender.name!r}."
-        )
+    contender = contender_of(argument, contender, CONTENDERS)
     reason = contender.supports(case.law)
     if reason is not None:
         raise ValueError(
             f"Argument `{argument}` must be able to solve the impact, but has {contender.name!r}: "
-            f"{reason}."
+            f"it {reason}."
         )
     return contender
 

@@ -19,6 +19,7 @@ import diffrax
 import jax
 import numpy as np
 
+from jimpact._checks import check_choice
 from jimpact.contact import Contact
 from jimpact.impacts import Impact, impact
 from jimpact.law import Impulses, Law
@@ -57,11 +58,11 @@ class Contender(NamedTuple):
     duration_apart: bool = False
 
     def supports(self, law: LZB) -> str | None:
-        """None, or why it cannot integrate this law."""
+        """None, or why it cannot integrate this law: what follows the word "it"."""
         if law.friction is not None and not self.friction:
-            return "it has no friction"
+            return "has no friction"
         refused = self.divides and np.any(law.restitution == 0)
-        return "it divides by e^2, and a restitution is 0" if refused else None
+        return "divides by e^2, and a restitution is 0" if refused else None
 
 
 class _KnownImpulses(Law):
@@ -140,3 +141,15 @@ _ALL = (
     ),
 )
 CONTENDERS: dict[str, Contender] = {each.name: each for each in _ALL}
+
+
+def contender_of(argument: str, given: str | Contender, known: dict[str, Contender]) -> Contender:
+    """The contender of this name among those known, or one of your own, with a name of its own."""
+    if not isinstance(given, Contender):
+        check_choice(argument, given, known)
+        return known[given]
+    if CONTENDERS.get(given.name, given) is not given:
+        raise ValueError(
+            f"Argument `{argument}` must have contenders of new names, but has {given.name!r}."
+        )
+    return given

@@ -28,7 +28,7 @@ from jimpact.audits import audit
 from jimpact.compiling import full_precision
 from jimpact.files.records import Column, Table, Tabular, as_data, fields_as_data
 from jimpact.laws.lzb import LZB
-from jimpact.methods.contenders import CONTENDERS, Contender, outcome
+from jimpact.methods.contenders import CONTENDERS, Contender, contender_of, outcome
 from jimpact.methods.points import in_batches, left_out_if_it_raises, left_out_notes
 from jimpact.progress import counting_bar
 from jimpact.scene import Scene, as_velocity, chain
@@ -228,8 +228,9 @@ def stability_map(
         `StabilityMap`; in double precision (jax_enable_x64) only.
 
     Raises:
-        ValueError: unknown names, values out of range, single precision, a scene without a
-            velocity, nothing approaches, methods without friction for a scene that has it.
+        ValueError: unknown names, a known name for a contender of your own, values out of range,
+            single precision, a scene without a velocity, nothing approaches, methods without
+            friction for a scene that has it.
 
     Source: docs/stability.md.
 
@@ -342,16 +343,11 @@ def _place(scene: Scene | None, velocity: Any) -> Place:
 
 def _methods(methods: Sequence[str | Contender] | None, place: Place) -> list[Contender]:
     """Contenders, those of these names, or those to map by default."""
-    known = {name: m for name, m in CONTENDERS.items() if m.jax}
-    defaults: tuple[str, ...] = NAMES
-    if place.friction:
-        known = {name: m for name, m in known.items() if m.friction}
-        defaults = FRICTION_NAMES
-    chosen = defaults if methods is None else tuple(methods)
-    for each in chosen or ("",):
-        if not isinstance(each, Contender):
-            check_choice("methods", each, known)
-    return [each if isinstance(each, Contender) else known[each] for each in chosen]
+    able = [m for m in CONTENDERS.values() if m.jax and (m.friction or not place.friction)]
+    known = {m.name: m for m in able}
+    defaults = FRICTION_NAMES if place.friction else NAMES
+    chosen = tuple(defaults if methods is None else methods)
+    return [contender_of("methods", each, known) for each in chosen or ("",)]
 
 
 def _checked(argument: str, values: Mapping[str, Any], names: tuple[str, ...]) -> Mapping[str, Any]:

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
@@ -18,7 +17,9 @@ from jimpact.plot.style import (
     COLUMNS,
     GREY,
     HIGHLIGHT,
+    MARKERS,
     SMALL,
+    by_code,
     colour_of,
     in_words,
     legend_below,
@@ -31,9 +32,8 @@ from jimpact.plot.style import (
 )
 from jimpact.status import CODE, STATUS
 
-_MARKERS = "osD^vP"
 _LAW_MARKERS = "*phX8d"
-_LEAST = 1e-16  # smaller errors are drawn here: rounding
+_LEAST = 1e-16  # smaller relative errors are drawn here: rounding
 _DEFAULT = "time"  # what `impact` does: a thick line
 
 # right, flagged, wrong, gains energy, stalls, does not end, not finite, unchecked: Okabe and Ito's
@@ -61,7 +61,6 @@ _CLASS_LABELS = {  # where the name of a class does not say why
 }
 _TICKS = 5  # labelled values along an axis, at most
 _STYLES = {"moreau": "--", "binary": ":"}
-_FLOOR = 1e-9  # smaller errors are drawn here
 
 
 @styled(WorkPrecision)
@@ -114,7 +113,7 @@ def _styles(points: Mapping[str, tuple[Point, ...]]) -> dict[str, dict[str, Any]
     for number, name in enumerate(methods):
         default = name == _DEFAULT
         styles[name] = {
-            "marker": _MARKERS[number % len(_MARKERS)],
+            "marker": MARKERS[number % len(MARKERS)],
             "ms": 5,
             "ls": "-" if number < len(COLOURS) else "--",
             "lw": 2.6 if default else 1.2,
@@ -262,9 +261,7 @@ def _pair(axes: Axes, result: StabilityMap, each: Slice, bottom: bool, left: boo
 
 def _draw_classes(axes: Axes, codes: np.ndarray) -> None:
     """A coloured cell for each class code (rows, columns)."""
-    colours = ListedColormap(CLASS_COLOURS)
-    edges = BoundaryNorm(np.arange(len(CLASSES) + 1) - 0.5, len(CLASSES))
-    axes.imshow(codes, cmap=colours, norm=edges, aspect="auto", interpolation="nearest")
+    axes.imshow(codes, aspect="auto", interpolation="nearest", **by_code(CLASS_COLOURS))
     rows, columns = codes.shape
     axes.set_xticks(np.arange(columns + 1) - 0.5, minor=True)
     axes.set_yticks(np.arange(rows + 1) - 0.5, minor=True)
@@ -334,7 +331,7 @@ def validity_map(result: ValidityMap, tolerance: float = 1e-2, title: str = "") 
     for i, eta in enumerate(result.exponents):
         top.plot(result.ratios, result.dispersion[i], label=f"LZB, exponent {eta:g}")
         for name, style in _STYLES.items():
-            error = np.maximum(result.error(name)[i], _FLOOR)
+            error = np.maximum(result.error(name)[i], _LEAST)
             bottom.plot(result.ratios, error, style, color=colour_of(i))
     for name, style in _STYLES.items():
         top.axhline(result.law_dispersion[name], color="black", ls=style, lw=1, label=name)

@@ -9,6 +9,7 @@ from typing import Any, ParamSpec, TypeVar
 import matplotlib.style
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
@@ -55,6 +56,12 @@ def styled(kind: type = object) -> Callable[[Callable[P, R]], Callable[P, R]]:
 def colour_of(i: int) -> str:
     """The colour of line or body number i; after the last one the first again."""
     return COLOURS[i % len(COLOURS)]
+
+
+def by_code(colours: tuple[str, ...]) -> dict[str, Any]:
+    """Options of an image whose values are whole numbers, the code of a colour each."""
+    edges = np.arange(len(colours) + 1) - 0.5
+    return {"cmap": ListedColormap(colours), "norm": BoundaryNorm(edges, len(colours))}
 
 
 def new_figure(

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
@@ -16,6 +15,7 @@ from jimpact.plot.style import (
     COLUMNS,
     GREY,
     SMALL,
+    by_code,
     colour_of,
     legend_below,
     mark,
@@ -265,12 +265,11 @@ def rocking_outcomes(
     """
     figure, panels = _panels(result, title, "restitution e")
     codes = result.outcomes(separation_threshold)
-    colours = ListedColormap(_OUTCOME_COLOURS)
-    norm = BoundaryNorm(np.arange(len(OUTCOMES) + 1) - 0.5, len(OUTCOMES))
+    coloured = by_code(_OUTCOME_COLOURS)
     theta, e = np.degrees(result.kinetic_angle), np.asarray(result.restitution)
     for j, axes in enumerate(panels):
         axes.grid(False)
-        axes.pcolormesh(theta, e, codes[:, j].T, cmap=colours, norm=norm, shading="nearest")
+        axes.pcolormesh(theta, e, codes[:, j].T, shading="nearest", **coloured)
     _critical_lines(panels, result)
     handles = [Patch(color=_OUTCOME_COLOURS[i], label=OUTCOMES[i]) for i in np.unique(codes)]
     legend_below(figure, 5, handles)
