@@ -10,6 +10,7 @@ the highest precision.
 import hashlib
 import os
 import random
+import re
 import subprocess
 import sys
 import tempfile
@@ -40,8 +41,10 @@ WORTH_SHARING = "0.2"  # seconds
 
 # A program counts if it has at least this many operations before the compiler optimizes them; single
 # operations that run eagerly have a few. Programs are counted by their text, each once, so that
-# neither the count nor BUDGET depends on how fast the machine is or which process runs which test.
+# neither the count nor BUDGET depends on how fast the machine is or which process runs which test:
+# names of values and the order of independent lines depend on what a process traced before.
 COUNTS_FROM = 200  # operations of StableHLO
+NAMES = re.compile(rb"[%@][\w.#:]+")
 # Programs of the default suite, over all processes.
 BUDGET = 270
 COMPILED = "/jax/core/compile/backend_compile_duration"
@@ -84,7 +87,7 @@ def compiled(event, duration, **_):
         text = path.read_bytes()
         path.unlink()
         count = text.count(b" = ")  # one a line that computes something
-        name = hashlib.sha256(text).hexdigest()
+        name = hashlib.sha256(b"\n".join(sorted(NAMES.sub(b"", text).splitlines()))).hexdigest()
         if count >= COUNTS_FROM and name not in operations:
             operations[name] = running[0], count
 

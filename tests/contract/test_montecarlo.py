@@ -85,6 +85,7 @@ def test_each_sample_is_the_impact_of_its_gaps():
         result.replay(300)
 
 
+@pytest.mark.slow
 def test_random_parameters_velocities_and_their_analytic_moments():
     balls = chain([1.0, 1.0])
     result = monte_carlo(
