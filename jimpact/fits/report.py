@@ -24,6 +24,7 @@ from jimpact.status import STATUS
 if TYPE_CHECKING:
     from jimpact.fits.uncertainty import Fit  # which imports this module
 
+_ZERO = 1e-12  # parameters in whatever unit that are printed as 0: rounding, as minima end in it
 _ROUNDING = 1e-7  # share of the largest velocity that is printed as 0: impacts are good to 1e-8
 _VELOCITIES_SHOWN = 24  # in the table of shots
 _MINIMA_SHOWN = 5  # in the list of minima, the lowest first
@@ -147,10 +148,11 @@ def _headline(fit: "Fit") -> str:
     values = int(measured.sum())
     if fit.experiments is None:
         return f"Fit of {law} to {values} measured values, {fit.method}"
-    shots, bodies = fit.predicted.shape
+    shots, size = fit.predicted.shape
     count = f"{values}" if measured.all() else f"{values} of {measured.size}"
+    what = "bodies" if len(set(fit.experiments.units)) == 1 else "coordinates"
     return (
-        f"Fit of {law} to {shots} shot{'s' * (shots > 1)} of {bodies} bodies "
+        f"Fit of {law} to {shots} shot{'s' * (shots > 1)} of {size} {what} "
         f"({count} velocities measured), {fit.method}"
     )
 
@@ -171,7 +173,7 @@ def marked(value: float, seen: bool, digits: str) -> str:
 
 def named_values(fit: "Fit", values: np.ndarray) -> str:
     """Names and values (P,) of the parameters, in brackets what the data do not determine."""
-    cells = zip(fit.names, values, fit.determined)
+    cells = zip(fit.names, np.where(np.abs(values) <= _ZERO, 0.0, values), fit.determined)
     return ", ".join(f"{name} {marked(value, seen, '.4g')}" for name, value, seen in cells)
 
 
@@ -210,7 +212,9 @@ def _parameters(fit: "Fit") -> list[str]:
 def _quality(fit: "Fit") -> list[str]:
     """Residuals, noise, how many parameters the data determine, the solver."""
     unit, one = (" m/s", "velocity") if fit.experiments is not None else ("", "value")
-    lines = [f"rms residual   {fit.rms:.4g}{unit}"]
+    exact = fit.starts[0].sum_of_squares <= fit.problem.exact_squares
+    rms = "0 (the values are reproduced)" if exact else f"{fit.rms:.4g}{unit}"
+    lines = [f"rms residual   {rms}"]
     if fit.problem.sigma is not None:
         squares = f"{fit.starts[0].sum_of_squares:.4g} with {degrees(fit.degrees_of_freedom)}"
         lines.append(f"chi^2          {squares} (sigma given)")
@@ -233,7 +237,10 @@ def _quality(fit: "Fit") -> list[str]:
     state = "converged" if fit.converged else "NOT converged"
     rank = f"{fit.rank} of {total} parameter{'s' * (total > 1)}"
     lines.append(f"determined     {rank} (rank of the derivatives{fewer})")
-    return [*lines, f"solver         {state}, at most {fit.steps} steps a start"]
+    return [
+        *lines,
+        f"solver         {state}, at most {fit.steps} step{'s' * (fit.steps > 1)} a start",
+    ]
 
 
 def degrees(count: int) -> str:
@@ -273,8 +280,9 @@ def _minima(fit: "Fit") -> list[str]:
     where = f"{count} minima" if fit.rank == len(fit.names) else f"{count} points of one valley"
     lines = [f"{total} starts ended in {where}:  sum of squares, number of starts, values"]
     for minimum in fit.starts[:_MINIMA_SHOWN]:
-        values = named_values(fit, minimum.value)
-        lines.append(f"  {minimum.sum_of_squares:12.5g} {minimum.count:4d}   {values}")
+        values, squares = named_values(fit, minimum.value), minimum.sum_of_squares
+        squares = 0.0 if squares <= fit.problem.exact_squares else squares
+        lines.append(f"  {squares:12.5g} {minimum.count:4d}   {values}")
     if count > _MINIMA_SHOWN:
         lines.append(f"  ... and {count - _MINIMA_SHOWN} more")
     return lines + unfinished
@@ -287,7 +295,8 @@ def _shots(fit: "Fit") -> list[str]:
         return []
     mixed = len(set(data.units)) > 1
     common_unit = "" if mixed else f" [{data.units[0]}]"
-    head = f"{'shot':>8s} {'body':>5s} {'before':>12s} {'measured':>12s} {'fitted':>12s}"
+    which = "coord" if mixed else "body"
+    head = f"{'shot':>8s} {which:>5s} {'before':>12s} {'measured':>12s} {'fitted':>12s}"
     lines, (shots, bodies) = [head + common_unit], data.pre.shape
     before, measured = np.asarray(data.pre, float), np.asarray(data.post, float)
     largest = np.abs(fit.predicted).max(axis=1, keepdims=True)
