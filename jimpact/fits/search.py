@@ -39,8 +39,9 @@ START_RESTITUTION = 0.5
 # where the data do not determine them. What starts leave is a tenth of that.
 SAME_COST, SAME_ERRORS, SAME_VALUE = 1e-2, 0.2, 1e-3
 STARTS, ROUNDS = 12, 8  # by default, and how often others around the best follow
-# What chi^2 rejects at this level is searched for again, so often at most.
-REJECTED, TURNS = 0.1, 4
+# What chi^2 rejects at this level is searched for again, with twice as many starts in each turn, in
+# so many turns at most. Ten times less: side minima that fit nearly as well are taken.
+REJECTED, TURNS = 0.1, 3
 IDLE_PARAMETERS = 4  # a round without a gain is the last one, or the second of more parameters
 # A search of its own choice starts at the lowest of so many points for P parameters, and around the
 # best at the lowest of the least number: values alone cost a tenth of derivatives. A box of P
@@ -179,20 +180,20 @@ def find_minima(problem: "FitProblem", starts: int | None, seed: int, solver: So
     Two thirds of the starts are those of `start_points`. The law is only piecewise smooth, so that
     the sum of squares has side minima close to a minimum: the others begin around the best. Where
     their number is left open, they are the lowest of many such points, further ones around the
-    best follow as long as they lower the sum of squares, and all is done again with other points
-    if sigma contradicts what was found, as long as that helps.
+    best follow as long as they lower the sum of squares, and all is done again with other and
+    twice as many points if sigma contradicts what was found, as long as that helps.
     """
     rng, turns = np.random.default_rng(seed), 1 if starts else TURNS
     if starts == 1:
         points = start_points(problem, 1, rng)
         return solution(problem, minimize(stacked([problem]), points, solver, what="starts"))
     ends, idle = _rough_ends(problem, starts, rng, solver), 0
-    for _ in range(1, turns):
+    for turn in range(1, turns):
         least = np.nanmin(ends.squares)
         freedom = problem.values - len(problem.names)
         if problem.sigma is None or freedom < 1 or chdtrc(freedom, least) > REJECTED:
             break
-        more = _rough_ends(problem, starts, rng, solver)
+        more = _rough_ends(problem, None, rng, solver, STARTS * 2**turn)
         ends, idle = _both(ends, more), 0 if _gains(more, least) else idle + 1
         if idle * IDLE_PARAMETERS >= len(problem.names):
             break
@@ -207,10 +208,17 @@ def find_minima(problem: "FitProblem", starts: int | None, seed: int, solver: So
 
 
 def _rough_ends(
-    problem: "FitProblem", starts: int | None, rng: np.random.Generator, solver: Solver
+    problem: "FitProblem",
+    starts: int | None,
+    rng: np.random.Generator,
+    solver: Solver,
+    most: int = STARTS,
 ) -> Ends:
-    """Where starts end, and others around the best, so far that minima can be told apart."""
-    count, noise = starts or STARTS, 0.0 if problem.sigma is None else 1.0
+    """Where starts end, and others around the best, so far that minima can be told apart.
+
+    `most` is how many there are of each kind where their number is left open.
+    """
+    count, noise = starts or most, 0.0 if problem.sigma is None else 1.0
     far, log = count - count // 3, problem.parameters.log
     scanned = starts is None and bool(len(log) > 1 or log.any())
     if solver.method == "levenberg-marquardt":
