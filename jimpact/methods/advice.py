@@ -197,7 +197,7 @@ def advise(
     >>> import jimpact as ji
     >>> advice = ji.advise(ji.chain([1.0, 1.0]), [1.0, 0.0], restitution=0.9, timing=False)
     >>> advice.name, advice.reason
-    ('newton', "single contact: every law is Newton's")
+    ('newton', 'single contact')
     """
     v = as_velocity(scene, velocity, finite=True)
     k = np.ones(()) if stiffness is None else stiffness
@@ -393,10 +393,13 @@ def _unknown_stiffnesses(
         return ()
     unknown = []
     for block in situation.coupled:
-        base = None if absolute else block.contacts[0]
+        first = block.contacts[0]
         for j in block.contacts if absolute else block.contacts[1:]:
-            nominal = float(stiffness[j] / (1.0 if base is None else stiffness[base]))
-            unknown.append(Unknown(j, base, nominal, nominal * factors[0], nominal * factors[1]))
+            name, nominal = f"k{j + 1}", float(stiffness[j])
+            if not absolute:
+                name, nominal = f"{name}/k{first + 1}", nominal / float(stiffness[first])
+            low, high = (nominal * factor for factor in factors)
+            unknown.append(Unknown(name, j, nominal, low, high))
     return tuple(unknown)
 
 
@@ -576,5 +579,5 @@ def _effects(
         alone = float(np.nanmax(situation.distance(v[rows] - v[0])))
         slope = float(situation.distance(v[up] - v[down])) / (2 * NUDGE)
         needed = tolerance / slope if slope > 0 else math.inf
-        unknown.append(each._replace(alone=alone, slope=slope, needed=needed))
+        unknown.append(each._replace(alone=alone, needed=needed))
     return tuple(unknown)
