@@ -19,7 +19,7 @@ from jimpact.impacts import Impact, impact
 from jimpact.law import Law, check_law
 from jimpact.laws.lzb import LZB
 from jimpact.methods.contenders import CONTENDERS, Contender, contender_of, outcome
-from jimpact.methods.points import in_turns, left_out_if_it_raises, left_out_notes
+from jimpact.methods.points import in_turns, left_out_if_it_raises, left_out_notes, relative_error
 from jimpact.methods.schemes import UNCOUNTED
 from jimpact.progress import counting_bar
 from jimpact.registry import registered_laws
@@ -32,7 +32,7 @@ ALGEBRAIC = ("newton", "moreau", "poisson", "binary")
 SPREAD = 10.0  # stiffnesses of a batch lie within this factor, half of it to either side
 SAMPLE = 16  # impacts of the batch on which errors are measured: one alone may be right by chance
 HOST_BATCH = 4  # impacts that a method without vmap does, in a loop, for its time in a batch
-HOST = "host code: finite differences only"
+HOST = "runs on the host: finite differences only"
 FINEST, SECOND = 1e-14, 1e-12  # rtol of the reference, and of the second solution
 
 
@@ -147,7 +147,7 @@ class WorkPrecision(Tabular):
             f"{self.batch} (quartiles), with J: with the Jacobian.",
         ]
         notes += left_out_notes(self.left_out)
-        notes += [f"no gradient: {name}: {why}." for name, why in self.without_gradient.items()]
+        notes += left_out_notes(self.without_gradient, "has no gradient")
         return Table(columns, rows, notes=notes, keys=2)
 
     def to_csv(self, path: Any = None) -> str:
@@ -508,9 +508,9 @@ def _errors(case: Case, solution: Solved, truth: Solved) -> dict[str, float]:
         "gradient": (solution.jacobian, truth.jacobian, fastest),
     }
     return {
-        name: float(np.abs(a - b[: len(a)]).max() / scale)
-        if a is not None and b is not None
-        else float("nan")
+        name: float("nan")
+        if a is None or b is None
+        else float(relative_error(np.ravel(a), np.ravel(b[: len(a)]), scale))
         for name, (a, b, scale) in compared.items()
     }
 

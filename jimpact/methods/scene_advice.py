@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -224,13 +225,8 @@ class _Simpler(NamedTuple):
         """An impact for each set of contacts to leave out, some at a time."""
         m = self.scene.contacts
         lanes = max(1, min(LANES, m + 1, ENTRIES // m**2))
-        velocities = jnp.tile(self.velocity, (lanes, 1))
-
-        def run(gaps: Any) -> Outcomes:
-            """Some of them."""
-            return varied_impacts(self.law, self.scene, velocities, {"gaps": jnp.asarray(gaps)})
-
-        return in_batches(run, self.gaps(left_out), lanes)
+        run = partial(varied_impacts, self.law, self.scene, self.velocity)
+        return in_batches(run, {"gaps": self.gaps(left_out)}, lanes)
 
     def changes(self, left_out: Sequence[Any], whole: Outcomes) -> np.ndarray:
         """Changes (r, n) of v+ from that of the whole scene; NaN where the law fails."""
