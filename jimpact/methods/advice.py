@@ -19,9 +19,7 @@ from jimpact.law import Law, check_law, free_parameters_of, options_of
 from jimpact.laws.binary import Binary
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Bistiffness
-from jimpact.laws.kinematic import Moreau, Newton
 from jimpact.laws.lzb import LZB, default_rtol
-from jimpact.laws.poisson import Poisson
 from jimpact.methods.advice_report import Advice, Candidate, ContactBlock, Unknown
 from jimpact.methods.points import (
     EnergyNorm,
@@ -33,7 +31,7 @@ from jimpact.methods.points import (
 )
 from jimpact.montecarlo.gaps import gap_scale
 from jimpact.progress import counting_bar
-from jimpact.registry import ADVISED, REGISTRY, simplest_first
+from jimpact.registry import ADVISED, registered_laws, simplest_first
 from jimpact.scene import (
     Scene,
     as_velocity,
@@ -231,13 +229,11 @@ def _advice(
     follows_gaps = situation.gapped.any() or apart > tolerance / SMALL_PART
     name = "compliant" if follows_gaps else "lzb"
     reference = _usable_rows(outcomes[name], name)
+    costs = _costs(laws, v, k) if timing else {}
     candidates = {
-        key: _candidate(law, situation, outcomes[key], reference, random)
+        key: _candidate(law, situation, outcomes[key], reference, random, costs.get(key))
         for key, law in laws.items()
     }
-    if timing:
-        for key, cost in _costs(laws, v, k).items():
-            candidates[key] = replace(candidates[key], cost=cost)
     suffice = [key for key, c in candidates.items() if c.usable and c.worst <= tolerance]
     chosen = suffice[0] if suffice else name
     if "rtol" in options_of(type(laws[chosen].law)):
@@ -424,19 +420,9 @@ def trials(situation: Situation, law: LZB) -> dict[str, Trial]:
     e, k = (jnp.broadcast_to(x, (m,)).astype(v.dtype) for x in (law.restitution, law.stiffness))
     mu, touching = law.friction, situation.touching
     gapped = bool(situation.gapped.any())
-    laws: dict[str, Law] = {
-        "newton": Newton(e, mu),
-        "moreau": Moreau(e, mu),
-        "poisson": Poisson(e, mu),
-        "binary": Binary(e, "earliest" if gapped else "fastest", friction=mu),
-        "lzb": LZB(e, k, law.exponent, friction=mu),
-        "compliant": Compliant(Bistiffness(k, law.exponent, e), friction=mu),
-    }
-    known = dict(zip(ADVISED, (e, k, law.exponent, mu), strict=True))
-    for name in simplest_first():
-        row = REGISTRY[name]
-        if name not in laws:  # a user's own law
-            laws[name] = row.build(**{key: known[key] for key in row.arguments if key in known})
+    laws, _ = registered_laws(dict(zip(ADVISED, (e, k, law.exponent, mu), strict=True)))
+    laws["binary"] = Binary(e, "earliest" if gapped else "fastest", friction=mu)
+    laws["compliant"] = Compliant(Bistiffness(k, law.exponent, e), friction=mu)
     ordered = {name: laws[name] for name in simplest_first()}
     return {
         name: Trial(law, situation.scene if gapped and law.uses_gaps else touching)
@@ -492,7 +478,12 @@ def _usable_rows(reference: Outcomes, name: str) -> Outcomes:
 
 
 def _candidate(
-    trial: Trial, situation: Situation, outcomes: Outcomes, reference: Outcomes, random: slice
+    trial: Trial,
+    situation: Situation,
+    outcomes: Outcomes,
+    reference: Outcomes,
+    random: slice,
+    cost: float | None,
 ) -> Candidate:
     """The record of a law with its outcomes (one row for all, or one each)."""
     error = situation.distance(outcomes.velocity[:1] - reference.velocity)
@@ -505,6 +496,7 @@ def _candidate(
         median=float(np.nanmedian(error[random])),
         worst=float(np.nanmax(error)),
         status=STATUS[int(outcomes.status[0])].name,
+        cost=cost,
     )
 
 

@@ -263,7 +263,8 @@ def _cause(advice: Advice) -> str:
         slowest = float(advice.gap_velocity.min())
         return f"no approach: nothing happens (smallest gap velocity {slowest:.3g} m/s)"
     if all(len(block.contacts) == 1 for block in at_work):
-        return "single contact" if len(at_work) == 1 else "contacts decoupled"
+        alone, several = "single contact", "contacts decoupled: kinetic angle 90 degrees"
+        return alone if len(at_work) == 1 else several
     stiffnesses = _stiffnesses(advice, at_work)
     if not advice.within:
         strongest = max(advice.unknown, key=lambda u: u.alone)
@@ -276,7 +277,7 @@ def _cause(advice: Advice) -> str:
         return f"contacts open and close again, where lzb and compliant are up to {apart} apart"
     if advice.name == "newton" and not np.any(parameters_of(advice.law)["restitution"].value):
         return "plastic contacts (restitution 0) that stay together"
-    return stiffnesses
+    return f"{stiffnesses}: {advice.name} is within {share(advice.candidates[advice.name].worst)}"
 
 
 def _stiffnesses(advice: Advice, at_work: list[ContactBlock]) -> str:
