@@ -43,11 +43,6 @@ class Timing(NamedTuple):
     low: float
     high: float
 
-    def __str__(self) -> str:
-        """In microseconds, the quartiles in brackets."""
-        low, high = microseconds(self.low), microseconds(self.high)
-        return f"{microseconds(self.median)} ({low}-{high})"
-
 
 @dataclass(frozen=True)
 class Point:
@@ -123,7 +118,9 @@ class WorkPrecision(Tabular):
             *(Column(name, ".1e", head) for name, head in zip(QUANTITIES, heads)),
             Column("evaluations", ".0f", "evals"),
             Column("alone_s", microseconds, "alone", "µs"),
-            Column("batch_s", lambda x: str(x), "batch", "µs"),
+            Column("batch_s", microseconds, "batch", "µs"),
+            Column("batch_low_s", microseconds, "from"),
+            Column("batch_high_s", microseconds, "to"),
             Column("gradient_s", microseconds, "with J", "µs"),
             Column("compile_s", ".1f", "compile", "s"),
             Column("status"),
@@ -133,7 +130,7 @@ class WorkPrecision(Tabular):
             compiled = sum(self.compile_time.get(name, {}).values()) or None  # said once
             for x in points:
                 errors = [x.error.get(q, np.nan) for q in QUANTITIES]
-                times = [x.single.median, x.batched, x.gradient and x.gradient.median]
+                times = [x.single.median, *x.batched, x.gradient and x.gradient.median]
                 rows.append([name, x.setting, *errors, x.evaluations, *times, compiled, x.status])
                 compiled = None
         uncertain = ", ".join(
@@ -144,17 +141,11 @@ class WorkPrecision(Tabular):
             f"Errors: relative, the largest of {self.sample} impacts with stiffness spread over a "
             f"factor {self.spread:g}; of a law its model error.",
             f"Times: medians of {self.repeats} in turns, per impact: alone, in a batch of "
-            f"{self.batch} (quartiles), with J: with the Jacobian.",
+            f"{self.batch} (from, to: quartiles), with J: with the Jacobian.",
         ]
         notes += left_out_notes(self.left_out)
         notes += left_out_notes(self.without_gradient, "has no gradient")
         return Table(columns, rows, notes=notes, keys=2)
-
-    def to_csv(self, path: Any = None) -> str:
-        """The table as CSV; of times in a batch the medians."""
-        table = self.table
-        rows = [[getattr(x, "median", x) for x in row] for row in table.rows]
-        return Table(table.columns, rows).to_csv(path)
 
 
 @full_precision
