@@ -228,7 +228,8 @@ def _advice(
     apart = _reclosing(situation, outcomes)
     follows_gaps = situation.gapped.any() or apart > tolerance / SMALL_PART
     name = "compliant" if follows_gaps else "lzb"
-    reference = _usable_rows(outcomes[name], name)
+    outcomes[name].check_first(f"The reference law {name} fails on this scene")
+    reference = outcomes[name].where_usable()
     costs = _costs(laws, v, k) if timing else {}
     candidates = {
         key: _candidate(law, situation, outcomes[key], reference, random, costs.get(key))
@@ -465,16 +466,6 @@ def _reclosing(situation: Situation, outcomes: dict[str, Outcomes]) -> float:
     if situation.gapped.any() or not usable.any():
         return 0.0
     return float(situation.distance((lzb.velocity - compliant.velocity)[usable]).max())
-
-
-def _usable_rows(reference: Outcomes, name: str) -> Outcomes:
-    """The reference with NaN where it failed; at the nominal stiffness it must not."""
-    if reference.failed[0]:
-        raise RuntimeError(
-            f"The reference law {name} fails on this scene: "
-            f"{STATUS[int(reference.status[0])].message}."
-        )
-    return reference.where_usable()
 
 
 def _candidate(

@@ -41,6 +41,11 @@ class Outcomes(NamedTuple):
         """Which of them (r,) have a status that is a failure."""
         return np.array([STATUS[int(code)].failure for code in self.status], bool)
 
+    def check_first(self, what: str) -> None:
+        """If the first one failed, a RuntimeError says what that means, and the status."""
+        if self.failed[0]:
+            raise RuntimeError(f"{what}: {STATUS[int(self.status[0])].message}.")
+
     def where_usable(self) -> "Outcomes":
         """The same, NaN where it failed."""
         lost = self.failed[:, None]

@@ -19,7 +19,6 @@ from jimpact.methods.advice_report import ContactBlock, share
 from jimpact.methods.points import EnergyNorm, Outcomes, in_batches, varied_impacts
 from jimpact.scene import Scene, as_velocity, gap_velocity, with_gaps
 from jimpact.solvers.tridiagonal import diagonal
-from jimpact.status import STATUS
 
 # Impacts computed together, and the entries of their Delassus matrices. Ten times more take ten
 # times the memory, a gigabyte, and are not faster.
@@ -172,10 +171,7 @@ def simplest_scene(
     norm = EnergyNorm.of(scene, np.asarray(v), watched)
     trial = _Simpler(law, scene, v, norm)
     whole = trial.run([()])
-    if STATUS[int(whole.status[0])].failure:
-        raise RuntimeError(
-            f"The law fails on the whole scene: {STATUS[int(whole.status[0])].message}."
-        )
+    whole.check_first("The law fails on the whole scene")
     friction, trial = _frictions(trial, whole, tolerance)
     working, errors, changes = _alone(trial, runs)
     kept, error = _together(trial, whole, working, errors, tolerance, runs)
