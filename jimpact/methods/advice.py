@@ -19,9 +19,7 @@ from jimpact.law import Law, check_law, free_parameters_of, options_of
 from jimpact.laws.binary import Binary
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Bistiffness
-from jimpact.laws.kinematic import Moreau, Newton
 from jimpact.laws.lzb import LZB, default_rtol
-from jimpact.laws.poisson import Poisson
 from jimpact.methods.advice_report import Advice, Candidate, ContactBlock, Unknown
 from jimpact.methods.points import (
     EnergyNorm,
@@ -33,7 +31,7 @@ from jimpact.methods.points import (
 )
 from jimpact.montecarlo.gaps import gap_scale
 from jimpact.progress import counting_bar
-from jimpact.registry import ADVISED, REGISTRY, simplest_first
+from jimpact.registry import ADVISED, registered_laws, simplest_first
 from jimpact.scene import (
     Scene,
     as_velocity,
@@ -101,43 +99,25 @@ class Situation(NamedTuple):
         return tuple(b for b in self.blocks if b.approaches and len(b.contacts) > 1)
 
 
-class StiffnessSamples(NamedTuple):
-    """Stiffnesses (r, m) to try; row 0 is the nominal one, `random` are the last rows.
-
-    `alone` (u, places) are the rows in which only unknown u leaves its nominal value, `nudged`
-    (u, 2) those in which it does so by a little.
-    """
-
-    stiffness: np.ndarray
-    unknown: tuple[Unknown, ...]
-    alone: np.ndarray
-    nudged: np.ndarray
-    random: slice
-
-
 class Trial(NamedTuple):
     """A law to try, and the scene to try it on: contacts taken as closed or not."""
 
     law: Law
     scene: Scene
 
-    @property
-    def has_stiffness(self) -> bool:
-        """Whether stiffnesses are parameters of the law."""
-        return "stiffness" in free_parameters_of(self.law)
+    def varied(self, velocity: np.ndarray, stiffness: np.ndarray) -> tuple[dict[str, Any], int]:
+        """Rows to run, of stiffness or one of a law without it, and how many of them together."""
+        rows, contacts = stiffness.shape
+        if "stiffness" not in free_parameters_of(self.law):
+            return {"velocity": velocity[None, :]}, max(1, LANES // contacts**2)
+        return {"stiffness": stiffness}, CHUNK if contacts <= FEW_CONTACTS else min(rows, CHUNK)
 
-    def lanes(self, rows: int) -> int:
-        """Impacts computed together for these rows of stiffness: enough to hide a call's cost."""
-        return rows if self.has_stiffness else max(1, LANES // self.scene.contacts**2)
-
-    def run(self, velocity: np.ndarray, stiffness: np.ndarray) -> Outcomes:
-        """Outcomes over rows of stiffness, or of the same impact many times."""
-        v = jnp.tile(jnp.asarray(velocity), (self.lanes(len(stiffness)), 1))
+    def run(self, velocity: np.ndarray, varied: dict[str, Any]) -> Outcomes:
+        """Outcomes over rows; scenes with and without gaps share one compiled program."""
         scene = self.scene
-        if scene.gaps is None:  # scenes with and without gaps share one compiled program
+        if scene.gaps is None:
             scene = with_gaps(scene, jnp.zeros(scene.contacts, scene.mass.dtype))
-        rows = {"stiffness": jnp.asarray(stiffness, v.dtype)} if self.has_stiffness else {}
-        return varied_impacts(self.law, scene, v, rows)
+        return varied_impacts(self.law, scene, jnp.asarray(velocity), varied)
 
 
 def advise(
@@ -197,7 +177,7 @@ def advise(
     >>> import jimpact as ji
     >>> advice = ji.advise(ji.chain([1.0, 1.0]), [1.0, 0.0], restitution=0.9, timing=False)
     >>> advice.name, advice.reason
-    ('newton', "single contact: every law is Newton's")
+    ('newton', 'single contact')
     """
     v = as_velocity(scene, velocity, finite=True)
     k = np.ones(()) if stiffness is None else stiffness
@@ -222,19 +202,22 @@ def advise(
     nominal = np.broadcast_to(np.asarray(k, v.dtype), (scene.contacts,))
     unknown = _unknown_stiffnesses(situation, nominal, factors, absolute)
     tried = _samples(nominal, unknown, samples, seed)
-    return _advice(situation, trials(situation, law), tried, float(tolerance), timing, progress)
+    laws, options = trials(situation, law), (float(tolerance), timing, progress)
+    return _advice(situation, laws, unknown, tried, slice(-samples, None), *options)
 
 
 def _advice(
     situation: Situation,
     laws: dict[str, Trial],
-    tried: StiffnessSamples,
+    unknown: tuple[Unknown, ...],
+    k: np.ndarray,
+    random: slice,
     tolerance: float,
     timing: bool,
     progress: float | None,
 ) -> Advice:
-    """Runs every law, chooses the reference and the simplest law near it."""
-    v, k = situation.velocity, tried.stiffness
+    """Runs every law over stiffnesses k (r, m), chooses the reference and the simplest near it."""
+    v = situation.velocity
     outcomes: dict[str, Outcomes] = {}
     left_out: dict[str, str] = {}
     for name, law in laws.items():
@@ -245,14 +228,13 @@ def _advice(
     apart = _reclosing(situation, outcomes)
     follows_gaps = situation.gapped.any() or apart > tolerance / SMALL_PART
     name = "compliant" if follows_gaps else "lzb"
-    reference = _usable_rows(outcomes[name], name)
+    outcomes[name].check_first(f"The reference law {name} fails on this scene")
+    reference = outcomes[name].where_usable()
+    costs = _costs(laws, v, k) if timing else {}
     candidates = {
-        key: _candidate(law, situation, outcomes[key], reference, tried.random)
+        key: _candidate(law, situation, outcomes[key], reference, random, costs.get(key))
         for key, law in laws.items()
     }
-    if timing:
-        for key, cost in _costs(laws, v, k).items():
-            candidates[key] = replace(candidates[key], cost=cost)
     suffice = [key for key, c in candidates.items() if c.usable and c.worst <= tolerance]
     chosen = suffice[0] if suffice else name
     if "rtol" in options_of(type(laws[chosen].law)):
@@ -271,7 +253,7 @@ def _advice(
         candidates=candidates,
         blocks=_with_simplest_laws(situation, candidates, outcomes, reference, tolerance),
         stiffness=k[0],
-        unknown=_effects(situation, tried, reference, tolerance),
+        unknown=_effects(situation, unknown, reference, tolerance),
         rows=len(k),
         gap_ratio=gap_ratio,
         far=tuple(np.flatnonzero(situation.far).tolist()),
@@ -393,40 +375,44 @@ def _unknown_stiffnesses(
         return ()
     unknown = []
     for block in situation.coupled:
-        base = None if absolute else block.contacts[0]
+        first = block.contacts[0]
         for j in block.contacts if absolute else block.contacts[1:]:
-            nominal = float(stiffness[j] / (1.0 if base is None else stiffness[base]))
-            unknown.append(Unknown(j, base, nominal, nominal * factors[0], nominal * factors[1]))
+            name, nominal = f"k{j + 1}", float(stiffness[j])
+            if not absolute:
+                name, nominal = f"{name}/k{first + 1}", nominal / float(stiffness[first])
+            low, high = (nominal * factor for factor in factors)
+            unknown.append(Unknown(name, j, nominal, low, high))
     return tuple(unknown)
 
 
 def _samples(
     stiffness: np.ndarray, unknown: tuple[Unknown, ...], samples: int, seed: int
-) -> StiffnessSamples:
-    """Nominal, one at a time, corners of the ranges, and a log-uniform sample of them."""
+) -> np.ndarray:
+    """Stiffnesses (r, m): the nominal ones, each unknown by itself, corners, log-uniform samples.
+
+    By itself an unknown has the places `ALONE` and a nudge up and down, after those of the one
+    before it.
+    """
     count, random = len(unknown), np.random.default_rng(seed)
     if count == 0:
-        none = np.zeros((0, 2), int)
-        return StiffnessSamples(stiffness[None, :], (), none, none, slice(1))
+        return stiffness[None, :]
     low = np.log([u.low / u.nominal for u in unknown])
     high = np.log([u.high / u.nominal for u in unknown])
     places = np.concatenate(
         [low + np.outer(ALONE, high - low), [[NUDGE] * count, [-NUDGE] * count]]
     )
-    single = np.concatenate([np.diag(place) for place in places])  # places, then unknowns
+    single = places.T[:, :, None] * np.eye(count)[:, None, :]  # unknown, place, change of each
     if 2**count <= CORNERS:
         ends = np.array(list(itertools.product((0.0, 1.0), repeat=count)))
     else:
         ends = random.integers(0, 2, (CORNERS, count)).astype(float)
     drawn = random.uniform(0.0, 1.0, (samples, count))
     spread = low + np.concatenate([ends, drawn]) * (high - low)
-    change = np.concatenate([np.zeros((1, count)), single, spread])
+    change = np.concatenate([np.zeros((1, count)), single.reshape(-1, count), spread])
     tried = np.tile(stiffness, (len(change), 1))
     for i, u in enumerate(unknown):
         tried[:, u.contact] *= np.exp(change[:, i])
-    rows = 1 + np.arange(len(single)).reshape(-1, count).T
-    alone, nudged = np.split(rows, [len(ALONE)], axis=1)
-    return StiffnessSamples(tried, unknown, alone, nudged, slice(len(change) - samples, None))
+    return tried
 
 
 def trials(situation: Situation, law: LZB) -> dict[str, Trial]:
@@ -435,19 +421,9 @@ def trials(situation: Situation, law: LZB) -> dict[str, Trial]:
     e, k = (jnp.broadcast_to(x, (m,)).astype(v.dtype) for x in (law.restitution, law.stiffness))
     mu, touching = law.friction, situation.touching
     gapped = bool(situation.gapped.any())
-    laws: dict[str, Law] = {
-        "newton": Newton(e, mu),
-        "moreau": Moreau(e, mu),
-        "poisson": Poisson(e, mu),
-        "binary": Binary(e, "earliest" if gapped else "fastest", friction=mu),
-        "lzb": LZB(e, k, law.exponent, friction=mu),
-        "compliant": Compliant(Bistiffness(k, law.exponent, e), friction=mu),
-    }
-    known = dict(zip(ADVISED, (e, k, law.exponent, mu), strict=True))
-    for name in simplest_first():
-        row = REGISTRY[name]
-        if name not in laws:  # a user's own law
-            laws[name] = row.build(**{key: known[key] for key in row.arguments if key in known})
+    laws, _ = registered_laws(dict(zip(ADVISED, (e, k, law.exponent, mu), strict=True)))
+    laws["binary"] = Binary(e, "earliest" if gapped else "fastest", friction=mu)
+    laws["compliant"] = Compliant(Bistiffness(k, law.exponent, e), friction=mu)
     ordered = {name: laws[name] for name in simplest_first()}
     return {
         name: Trial(law, situation.scene if gapped and law.uses_gaps else touching)
@@ -462,22 +438,21 @@ def _outcomes(
     trial: Trial, velocity: np.ndarray, stiffness: np.ndarray, progress: float | None
 ) -> Outcomes:
     """Outcomes over rows of stiffness (r, m); one row of a law without it."""
-    rows = stiffness if trial.has_stiffness else stiffness[:1]
-    with counting_bar(len(rows), "impacts", progress) as advance:
-        return in_batches(partial(trial.run, velocity), rows, _chunk(stiffness), advance)
-
-
-def _chunk(stiffness: np.ndarray) -> int:
-    """Rows computed together: one size where impacts are cheap, so that it compiles once."""
-    rows, contacts = stiffness.shape
-    return CHUNK if contacts <= FEW_CONTACTS else min(rows, CHUNK)
+    varied, lanes = trial.varied(velocity, stiffness)
+    count = len(next(iter(varied.values())))
+    with counting_bar(count, "impacts", progress) as advance:
+        return in_batches(partial(trial.run, velocity), varied, lanes, advance)
 
 
 def _costs(laws: dict[str, Trial], velocity: np.ndarray, stiffness: np.ndarray) -> dict[str, float]:
     """Time of one impact in a batch over the cheapest law's: medians, side by side."""
-    few = stiffness[np.arange(_chunk(stiffness)) % len(stiffness)]
-    times = in_turns([partial(trial.run, velocity, few) for trial in laws.values()], ROUNDS)
-    each = [np.median(t) / trial.lanes(len(few)) for t, trial in zip(times, laws.values())]
+    runs, counts = [], []
+    for trial in laws.values():
+        varied, lanes = trial.varied(velocity, stiffness)
+        full = {name: np.resize(x, (lanes, *x.shape[1:])) for name, x in varied.items()}
+        runs.append(partial(trial.run, velocity, jax.device_put(full)))
+        counts.append(lanes)
+    each = [np.median(times) / count for times, count in zip(in_turns(runs, ROUNDS), counts)]
     return {name: float(x / min(each)) for name, x in zip(laws, each)}
 
 
@@ -493,18 +468,13 @@ def _reclosing(situation: Situation, outcomes: dict[str, Outcomes]) -> float:
     return float(situation.distance((lzb.velocity - compliant.velocity)[usable]).max())
 
 
-def _usable_rows(reference: Outcomes, name: str) -> Outcomes:
-    """The reference with NaN where it failed; at the nominal stiffness it must not."""
-    if reference.failed[0]:
-        raise RuntimeError(
-            f"The reference law {name} fails on this scene: "
-            f"{STATUS[int(reference.status[0])].message}."
-        )
-    return reference.where_usable()
-
-
 def _candidate(
-    trial: Trial, situation: Situation, outcomes: Outcomes, reference: Outcomes, random: slice
+    trial: Trial,
+    situation: Situation,
+    outcomes: Outcomes,
+    reference: Outcomes,
+    random: slice,
+    cost: float | None,
 ) -> Candidate:
     """The record of a law with its outcomes (one row for all, or one each)."""
     error = situation.distance(outcomes.velocity[:1] - reference.velocity)
@@ -517,6 +487,7 @@ def _candidate(
         median=float(np.nanmedian(error[random])),
         worst=float(np.nanmax(error)),
         status=STATUS[int(outcomes.status[0])].name,
+        cost=cost,
     )
 
 
@@ -545,36 +516,35 @@ def _with_simplest_laws(
     tolerance: float,
 ) -> tuple[ContactBlock, ...]:
     """The blocks, each with the simplest law whose impulses there move v+ within tolerance."""
+    m, blocks = situation.scene.contacts, []
     moved = jax.vmap(partial(velocity_change, situation.scene))
-
-    def error(name: str, block: ContactBlock) -> float:
-        """Largest distance that the impulses of a law in this block cause."""
-        inside = np.isin(np.arange(situation.scene.contacts), block.contacts)
-        wrong = outcomes[name].impulse[:1] - reference.impulse
-        side, t = None, reference.tangential.shape[1]
-        if t:
-            each = np.repeat(inside, t // len(inside))
-            side = (outcomes[name].tangential[:1] - reference.tangential) * each
-        return float(np.nanmax(situation.distance(np.asarray(moved(wrong * inside, side)))))
-
-    def simplest(block: ContactBlock) -> str | None:
-        """The first law within tolerance."""
-        for name, candidate in candidates.items():
-            if candidate.status != "order_dependent" and error(name, block) <= tolerance:
-                return name
-        return None
-
-    return tuple(b._replace(law=simplest(b)) if b.approaches else b for b in situation.blocks)
+    for block in situation.blocks:
+        names = candidates if block.approaches else ()
+        inside = np.isin(np.arange(m), block.contacts)
+        for name in names:
+            out, side = outcomes[name], None
+            if t := reference.tangential.shape[1]:
+                each = np.repeat(inside, t // m)
+                side = (out.tangential[:1] - reference.tangential) * each
+            wrong = moved((out.impulse[:1] - reference.impulse) * inside, side)
+            within = np.nanmax(situation.distance(np.asarray(wrong))) <= tolerance
+            if within and candidates[name].status != "order_dependent":
+                block = block._replace(law=name)
+                break
+        blocks.append(block)
+    return tuple(blocks)
 
 
 def _effects(
-    situation: Situation, tried: StiffnessSamples, reference: Outcomes, tolerance: float
+    situation: Situation, unknown: tuple[Unknown, ...], reference: Outcomes, tolerance: float
 ) -> tuple[Unknown, ...]:
-    """The unknown stiffnesses with what each does by itself."""
-    v, unknown = reference.velocity, []
-    for each, rows, (up, down) in zip(tried.unknown, tried.alone, tried.nudged):
-        alone = float(np.nanmax(situation.distance(v[rows] - v[0])))
-        slope = float(situation.distance(v[up] - v[down])) / (2 * NUDGE)
+    """The unknown stiffnesses with what each does by itself: its rows follow the nominal one."""
+    each, places = [], len(ALONE) + 2
+    for i, u in enumerate(unknown):
+        v = reference.velocity[1 + i * places :][:places]
+        *_, up, down = v
+        alone = float(np.nanmax(situation.distance(v[: len(ALONE)] - reference.velocity[0])))
+        slope = float(situation.distance(up - down)) / (2 * NUDGE)
         needed = tolerance / slope if slope > 0 else math.inf
-        unknown.append(each._replace(alone=alone, slope=slope, needed=needed))
-    return tuple(unknown)
+        each.append(u._replace(alone=alone, needed=needed))
+    return tuple(each)

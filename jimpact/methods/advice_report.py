@@ -1,29 +1,24 @@
-"""What `advise` reports, in words with the numbers of the scene: half a page."""
+"""What `advise` reports: half a page, with the numbers of the scene."""
 
 import math
-import shutil
 import textwrap
 from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from jimpact.files.records import Column, Table, Tabular, as_data, fields_as_data
+from jimpact.files.records import Column, Table, Tabular, as_data, fields_as_data, listed
 from jimpact.law import Declared, Law, parameters_of
-from jimpact.laws import REGISTRY
 from jimpact.methods.points import left_out_notes
-from jimpact.montecarlo.gaps import NEARLY_TOUCHING, WIDE
 from jimpact.scene import Scene
 from jimpact.status import CODE, STATUS
 
 _WIDTH = 80  # characters of the printed lines
-_NAMED = 4  # stiffness ratios named one by one; the others are "..."
+_NAMED = 4  # unknown stiffnesses named one by one; the others are "..."
 _PERCENT_FROM = 1e-4  # smaller errors are printed as 2e-05, not as 0.002 %
 _ROUNDING = 1e-12  # errors up to this are printed as "rounding"
-_NO_CHANGE = 1e-6  # a relative change of v+ up to this is reported as no difference
 _POSITIONAL = ("restitution", "stiffness", "exponent")  # parameters of a law as it is printed
 _KEYWORDS = ("friction", "order", "rtol")  # the same, by name, where they are not the default
-NAMES = {name: row.law.__name__ for name, row in REGISTRY.items()} | {"binary": "binary"}
 
 
 class ContactBlock(NamedTuple):
@@ -34,33 +29,22 @@ class ContactBlock(NamedTuple):
     angles: tuple[float, float] | None
     law: str | None = None  # the simplest one that is within tolerance in this block
 
-    @property
-    def name(self) -> str:
-        """Contacts counted from 1."""
-        return ", ".join(str(j + 1) for j in self.contacts)
-
 
 class Unknown(NamedTuple):
-    """A stiffness known within a range only: of `contact`, over that of `base` (None: SI).
+    """A stiffness of `contact` that is known within a range only; `k2/k1`: a ratio, `k2`: in SI.
 
     What it does to v+ by itself, in the energy norm over that of v-: `alone`: largest change over
-    its range; `slope`: |d v+ / d ln k|; `needed`: relative accuracy of k at which it moves v+ by
-    the tolerance (inf: it does not).
+    its range; `needed`: relative accuracy of k at which it moves v+ by the tolerance (inf: it does
+    not).
     """
 
+    name: str
     contact: int
-    base: int | None
     nominal: float
     low: float
     high: float
     alone: float = math.nan
-    slope: float = math.nan
     needed: float = math.nan
-
-    @property
-    def name(self) -> str:
-        """`k2/k1`, contacts counted from 1."""
-        return f"k{self.contact + 1}" + ("" if self.base is None else f"/k{self.base + 1}")
 
 
 @dataclass(frozen=True)
@@ -94,7 +78,7 @@ class Advice(Tabular):
     """The result of `advise`; `ji.impact(advice.law, advice.scene, advice.velocity)` applies it.
 
     Attributes:
-        name: of the simplest law; `reason` says why, in words.
+        name: of the simplest law; `reason` says what decided.
         tolerance: as passed.
         within: whether that law is within it.
         reference: name of the law that all are compared with, 'lzb' or 'compliant'.
@@ -142,14 +126,9 @@ class Advice(Tabular):
         return self.candidates[self.name].scene
 
     @property
-    def at_work(self) -> list[ContactBlock]:
-        """Blocks in which a contact approaches."""
-        return [block for block in self.blocks if block.approaches]
-
-    @property
     def reason(self) -> str:
-        """Why this law, with numbers of this scene."""
-        return reason(self)
+        """What decided, and how far off the simpler laws are."""
+        return "; ".join(filter(None, (_cause(self), _closest_simpler(self))))
 
     def to_dict(self) -> dict[str, Any]:
         """Everything, as a JSON file can hold it; contacts counted from 1."""
@@ -157,29 +136,29 @@ class Advice(Tabular):
             name: fields_as_data(c, "law", "scene") | {"law": as_code(c.law), "usable": c.usable}
             for name, c in self.candidates.items()
         }
-        words = {"advice": self.name, "law": as_code(self.law), "reason": self.reason}
-        blocks = [as_data(b) | {"contacts": [j + 1 for j in b.contacts]} for b in self.blocks]
-        unknown = [{"name": u.name} | as_data(u._asdict()) for u in self.unknown]
-        for each in unknown:
-            del each["contact"], each["base"]
-        far = [j + 1 for j in self.far]
-        parts = {"laws": laws, "blocks": blocks, "unknown": unknown, "far": far}
-        return words | fields_as_data(self, "name", "candidates", *parts) | parts
+        return fields_as_data(self, "name", "candidates") | {
+            "advice": self.name,
+            "law": as_code(self.law),
+            "reason": self.reason,
+            "laws": laws,
+            "blocks": [as_data(b) | {"contacts": _from_one(b.contacts)} for b in self.blocks],
+            "unknown": [as_data(u) | {"contact": u.contact + 1} for u in self.unknown],
+            "far": _from_one(self.far),
+        }
 
     @property
     def table(self) -> Table:
         """A row for each law, below the advice: half a page."""
         verdict = "within" if self.within else "NOT within"
         head = [f"Advice: {as_code(self.law)}, {verdict} {share(self.tolerance)}"]
-        head += _wrapped("because", self.reason) + _wrapped("scene", structure(self))
-        if len(self.unknown) > 1:
-            head += _wrapped("unknown", f"{ratios(self)}; {effects(self)}")
-        if also := agreeing(self):
-            head += _wrapped("also", also)
+        for line in (self.reason, *_contacts(self)):
+            head += textwrap.wrap(line, _WIDTH)
+        if self.unknown:
+            head += ["", *str(_unknown_table(self.unknown)).splitlines()]
         columns = (
             Column("law", lambda name: ("*" if name == self.name else " ") + name),
             *(Column(name, share) for name in ("median", "worst")),
-            Column("cost", lambda x: "" if x is None else f"{x:.{1 if x < 10 else 0}f}"),
+            Column("cost", ".3g", "relative cost"),
             *(Column(f"v_{i + 1}_plus", ".4f", f"v{i + 1}+") for i in range(len(self.velocity))),
             Column("status"),
         )
@@ -187,40 +166,30 @@ class Advice(Tabular):
             [name, c.median, c.worst, c.cost, *c.velocity.tolist(), c.status]
             for name, c in self.candidates.items()
         ]
-        notes = ["", *textwrap.wrap(self._footnote(), _width())]
-        notes += left_out_notes(self.left_out)
+        footnote = (
+            f"Error of v+ against {self.reference}: sqrt(dv^T M dv) over sqrt(v-^T M v-), dv the "
+            f"difference of v+; stiffnesses tried: {self.rows}."
+        )
+        notes = ["", *textwrap.wrap(footnote, _WIDTH), *left_out_notes(self.left_out)]
         return Table(columns, rows, [*head, ""], notes)
 
-    def _footnote(self) -> str:
-        """What the columns of the table mean."""
-        words = (
-            f"Error of v+ against {title(self.reference)}: sqrt(dv^T M dv) over "
-            "sqrt(v-^T M v-), dv the difference of v+"
-        )
-        if self.rows > 1:
-            words += f"; median and worst over {self.rows} stiffnesses"
-        if all(c.cost is not None for c in self.candidates.values()):
-            words += "; cost of an impact in a batch, cheapest = 1"
-        if self.gap_ratio is not None:
-            words += "; delta_c: the indentation scale of a contact, see ji.theory.gap_scale"
-        return f"{words}."
+
+def _from_one(contacts: tuple[int, ...]) -> list[int]:
+    """Contacts counted from 1."""
+    return [j + 1 for j in contacts]
 
 
-def _width() -> int:
-    """Characters of the printed lines."""
-    return min(_WIDTH, shutil.get_terminal_size((_WIDTH, 0)).columns)
-
-
-def _wrapped(key: str, text: str) -> list[str]:
-    """Lines behind a key word; a number keeps its unit."""
-    whole = f"{text}.".replace(" %", "\u00a0%")
-    lines = textwrap.wrap(whole, _width(), initial_indent=f"{key:9s}", subsequent_indent=" " * 9)
-    return [line.replace("\u00a0%", " %") for line in lines]
-
-
-def title(name: str) -> str:
-    """A law's name as it is written in a sentence."""
-    return NAMES.get(name, name)
+def _unknown_table(unknown: tuple[Unknown, ...]) -> Table:
+    """What each unknown stiffness does by itself, the strongest first."""
+    columns = (
+        Column("unknown"),
+        Column("range"),
+        Column("alone", share, "moves v+ by"),
+        Column("needed", lambda x: f"{100 * x:.2g} %" if x < 1 else "", "know it within"),
+    )
+    strongest = sorted(unknown, key=lambda u: -u.alone)[:_NAMED]
+    rows = [[u.name, f"{u.low:.3g} to {u.high:.3g}", u.alone, u.needed] for u in strongest]
+    return Table(columns, rows)
 
 
 def share(x: float) -> str:
@@ -241,7 +210,7 @@ def share(x: float) -> str:
 
 def as_code(law: Declared) -> str:
     """The law as one writes it: `LZB(0.9, 1, 1.5, rtol=0.001)`."""
-    words, keywords = [], []
+    words = []
     for each in fields(law):
         value = getattr(law, each.name)
         if isinstance(value, Declared):
@@ -249,202 +218,85 @@ def as_code(law: Declared) -> str:
         elif each.name in _POSITIONAL:
             words.append(_in_code(value))
         elif each.name in _KEYWORDS and value is not None:
-            if not isinstance(value, str):
-                keywords.append(f"{each.name}={_in_code(value)}")
-            elif value != each.default:
-                keywords.append(f"{each.name}={value!r}")
-    return f"{type(law).__name__}({', '.join(words + keywords)})"
+            if isinstance(value, str) and value == each.default:
+                continue
+            words.append(f"{each.name}={_in_code(value)}")
+    return f"{type(law).__name__}({', '.join(words)})"
 
 
 def _in_code(value: Any) -> str:
-    """A number, or a list of them unless all are equal."""
+    """A word, a number, or a list of numbers unless all are equal."""
+    if isinstance(value, str):
+        return repr(value)
     array = np.asarray(value)
     if array.size and (array == array.flat[0]).all():
         return f"{array.flat[0]:.6g}"
     return f"[{', '.join(f'{x:.6g}' for x in array)}]"
 
 
-def structure(advice: Advice) -> str:
-    """Which contacts are coupled: one sentence a block of several, one for all others."""
-    words = []
-    for block in advice.at_work:
-        if block.angles is None:
-            continue
-        low, high = block.angles
-        angle = f"angle {low:.4g}" if high - low < 0.05 else f"angles {low:.4g} to {high:.4g}"
-        law = f"{title(block.law)} is enough" if block.law else "no law is within tolerance"
-        words.append(f"contacts {block.name} are coupled (kinetic {angle} degrees): {law}")
-    groups: dict[str, list[int]] = {}
+def _contacts(advice: Advice) -> list[str]:
+    """Which contacts are coupled, and the law that suffices there: a line a group."""
+    groups: dict[tuple[str, Any], list[int]] = {}
     for block in advice.blocks:
+        law = f"{block.law or 'no law'} suffices"
+        what, coupled = f"decoupled: {law}", None
         if not block.approaches:
             what = "without an approach"
-        elif len(block.contacts) == 1:
-            what = f"decoupled: {title(block.law or 'no law')} is enough"
-        else:
-            continue
-        groups.setdefault(what, []).extend(block.contacts)
+        elif block.angles is not None:
+            coupled = block.contacts
+            low, high = (f"{angle:.4g}" for angle in block.angles)
+            angles = f"angle {low}" if low == high else f"angles {low} to {high}"
+            what = f"coupled (kinetic {angles} degrees): {law}"
+        groups.setdefault((what, coupled), []).extend(block.contacts)
     if advice.far:
-        groups["too far open to close during the impact"] = list(advice.far)
-    for what, contacts in groups.items():
-        named = ", ".join(str(j + 1) for j in contacts)
-        words.append(f"contact{'s' * (len(contacts) > 1)} {named} {what}")
-    return "; ".join(words)
-
-
-def effects(advice: Advice) -> str:
-    """What each unknown stiffness does by itself, the strongest first."""
-    words = []
-    for unknown in sorted(advice.unknown, key=lambda u: -u.alone)[:_NAMED]:
-        needed = f" (know it within {100 * unknown.needed:.2g} %)" if unknown.needed < 1 else ""
-        words.append(f"{unknown.name} {share(unknown.alone)}{needed}")
-    return f"alone they move v+ by: {', '.join(words)}"
-
-
-def agreeing(advice: Advice) -> str:
-    """Other laws, simpler than the reference, that are within tolerance too."""
-    names = list(advice.candidates)
-    simpler = names[: names.index(advice.reference)] if advice.within else []
-    others = [
-        title(name)
-        for name in simpler
-        if name != advice.name
-        and advice.candidates[name].usable
-        and advice.candidates[name].worst <= advice.tolerance
+        groups["too far open to close during the impact", None] = list(advice.far)
+    return [
+        f"contact{'s' * (len(contacts) > 1)} {', '.join(str(j + 1) for j in contacts)} {what}"
+        for (what, _), contacts in groups.items()
     ]
-    return f"within {share(advice.tolerance)}: {', '.join(others)}" if others else ""
 
 
-def ratios(advice: Advice) -> str:
-    """The stiffness ratios this advice is about."""
-    if advice.unknown:
-        names = [u.name for u in advice.unknown]
-        ends = {(u.low, u.high) for u in advice.unknown}
-        first = advice.unknown[0]
-        values = f"in [{first.low:.3g}, {first.high:.3g}]" if len(ends) == 1 else "in their ranges"
-        ending = "es" if first.base is None else "s"
-        kind = "stiffness" if first.base is None else "stiffness ratio"
-    else:
-        pairs = [(b.contacts[0], j) for b in advice.at_work for j in b.contacts[1:]]
-        names = [f"k{j + 1}/k{i + 1}" for i, j in pairs]
-        each = [f"{advice.stiffness[j] / advice.stiffness[i]:.3g}" for i, j in pairs[:_NAMED]]
-        values = f"= {', '.join(each)}"
-        kind, ending = "stiffness ratio", "s"
-    more = ", ..." if len(names) > _NAMED else ""
-    plural = ending if len(names) > 1 else ""
-    return f"{kind}{plural} {', '.join(names[:_NAMED])}{more} {values}"
-
-
-def reason(advice: Advice) -> str:
-    """Why this law, in one sentence or two."""
-    if not advice.at_work:
+def _cause(advice: Advice) -> str:
+    """What decided: no approach, contacts that act alone, gaps, or stiffnesses."""
+    at_work = [block for block in advice.blocks if block.approaches]
+    if not at_work:
         slowest = float(advice.gap_velocity.min())
         return f"no approach: nothing happens (smallest gap velocity {slowest:.3g} m/s)"
-    main = _main_reason(advice)
-    closest = _closest_simpler(advice)
-    return f"{main}; {closest}" if closest else main
-
-
-def _main_reason(advice: Advice) -> str:
-    """Why the advised law is within tolerance, or why none is."""
-    name, worst = advice.name, share(advice.candidates[advice.name].worst)
-    verb = f"{title(name)} is within {worst}"
-    if all(len(block.contacts) == 1 for block in advice.at_work):
-        return _single_contacts(advice, verb)
+    if all(len(block.contacts) == 1 for block in at_work):
+        alone, several = "single contact", "contacts decoupled: kinetic angle 90 degrees"
+        return alone if len(at_work) == 1 else several
+    stiffnesses = _stiffnesses(advice, at_work)
     if not advice.within:
-        return _undecided(advice)
+        strongest = max(advice.unknown, key=lambda u: u.alone)
+        return f"{stiffnesses} decides: measure {strongest.name} first"
     if advice.gap_ratio is not None:
-        return _gaps(advice, verb)
+        gaps = listed([f"{x:.3g}" for x in advice.gap_ratio], _NAMED)
+        return f"gaps of {gaps} delta_c, see ji.theory.gap_scale"
     if advice.reference == "compliant":
-        return f"{_reclosing(advice)}: {verb}"
-    if name == "lzb":
-        if not advice.unknown:
-            return f"{ratios(advice)}: no simpler law is within {share(advice.tolerance)}"
-        return f"{ratios(advice)}: whatever they are, LZB at the nominal ones is within {worst}"
-    if name == "newton" and not np.any(parameters_of(advice.law)["restitution"].value):
-        return f"plastic contacts (restitution 0) that stay together: {verb}"
-    return f"{ratios(advice)}{_no_difference(advice)}: {verb}"
+        apart = share(advice.reclosing)
+        return f"contacts open and close again, where lzb and compliant are up to {apart} apart"
+    if advice.name == "newton" and not np.any(parameters_of(advice.law)["restitution"].value):
+        return "plastic contacts (restitution 0) that stay together"
+    return f"{stiffnesses}: {advice.name} is within {share(advice.candidates[advice.name].worst)}"
 
 
-def _single_contacts(advice: Advice, verb: str) -> str:
-    """The reason if no two loaded contacts are coupled."""
-    if len(advice.gap_velocity) == 1:
-        words = "single contact"
-    elif len(advice.at_work) == 1:
-        words = f"only contact {advice.at_work[0].name} takes part: a single contact"
-    else:
-        words = "contacts decoupled: kinetic angle 90 degrees"
-    if _has_friction(advice):
-        return f"{words}, with friction: {verb}"
-    if len(advice.gap_velocity) == 1:
-        return f"{words}: every law is Newton's"
-    if advice.name == "newton":
-        return f"{words}, all laws agree"
-    return f"{words}; {title(advice.name)} leaves separating contacts alone"
-
-
-def _has_friction(advice: Advice) -> bool:
-    """Whether the laws have friction."""
-    friction = parameters_of(advice.law).get("friction")
-    return friction is not None and friction.value is not None
-
-
-def _reclosing(advice: Advice) -> str:
-    """Why Compliant is the reference although no contact has a gap."""
-    return (
-        "contacts open and close again: LZB lets them close at once, Compliant when the gap is "
-        f"closed, and they are up to {share(advice.reclosing)} apart"
-    )
-
-
-def _no_difference(advice: Advice) -> str:
-    """Where unknown ratios make no difference, and where angles above 90 degrees explain it."""
-    if not advice.unknown or max(u.alone for u in advice.unknown) > _NO_CHANGE:
-        return ""
-    widest = max(b.angles[1] for b in advice.at_work if b.angles is not None)
-    words = " makes no difference" if len(advice.unknown) == 1 else " make no difference"
-    if widest > 90 + _NO_CHANGE and not _has_friction(advice):
-        words += f" (kinetic angle {widest:.4g} degrees: pushing one contact opens the other)"
-    return words
-
-
-def _gaps(advice: Advice, verb: str) -> str:
-    """Where gaps matter: how wide they are, and what that allows."""
-    assert advice.gap_ratio is not None
-    low, high = float(np.min(advice.gap_ratio)), float(np.max(advice.gap_ratio))
-    both = f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
-    if advice.name == "binary" and low > WIDE:
-        return f"gaps exceed {WIDE:g} delta_c (they are {both} delta_c): {verb}"
-    if advice.name == "compliant":
-        return f"gaps of {both} delta_c decide the outcome: only contacts with real gaps follow"
-    if high < NEARLY_TOUCHING:
-        return f"gaps below {NEARLY_TOUCHING:g} delta_c ({both}) are much as if touching: {verb}"
-    return f"gaps of {both} delta_c: {verb}"
-
-
-def _undecided(advice: Advice) -> str:
-    """Nothing is within tolerance, because the stiffnesses are not known."""
-    moved, bound = share(advice.candidates[advice.name].worst), share(advice.tolerance)
-    most, several = max(advice.unknown, key=lambda u: u.alone), len(advice.unknown) > 1
-    decide, they_move = ("decide", "they move") if several else ("decides", "it moves")
-    words = (
-        f"{ratios(advice)} {decide}: no law is within {bound}, because {they_move} v+ by up to "
-        f"{moved}"
-    )
-    if several:
-        return f"{words}; measure {most.name} first (alone {share(most.alone)})"
-    if most.needed < 1:
-        words += f"; it would have to be known within {100 * most.needed:.2g} %"
-    return words
+def _stiffnesses(advice: Advice, at_work: list[ContactBlock]) -> str:
+    """The unknown stiffnesses with their ranges, or else the ratios within coupled contacts."""
+    words = [f"{u.name} in [{u.low:.3g}, {u.high:.3g}]" for u in advice.unknown]
+    if not words:
+        k, pairs = advice.stiffness, [(b.contacts[0], j) for b in at_work for j in b.contacts[1:]]
+        words = [f"k{j + 1}/k{i + 1} = {k[j] / k[i]:.3g}" for i, j in pairs]
+    kind = "stiffness ratio" if "/" in words[0] else "stiffness"
+    return f"{kind} {listed(words, _NAMED)}"
 
 
 def _closest_simpler(advice: Advice) -> str:
     """How far off the best of the simpler laws is, or what it violates."""
     names = list(advice.candidates)
     simpler = {name: advice.candidates[name] for name in names[: names.index(advice.name)]}
-    if not simpler:
+    if not simpler or not any(block.approaches for block in advice.blocks):
         return ""
     best = min(simpler, key=lambda name: (not simpler[name].usable, simpler[name].worst))
     if not simpler[best].usable:
-        return f"{title(best)} fails: {simpler[best].status}"
-    error = share(simpler[best].worst)
-    return f"of the simpler laws {title(best)} comes closest and is off by {error}"
+        return f"{best} fails: {simpler[best].status}"
+    return f"of the simpler laws {best} comes closest and is off by {share(simpler[best].worst)}"

@@ -19,7 +19,7 @@ from jimpact.impacts import Impact, impact
 from jimpact.law import Law, check_law
 from jimpact.laws.lzb import LZB
 from jimpact.methods.contenders import CONTENDERS, Contender, contender_of, outcome
-from jimpact.methods.points import in_turns, left_out_if_it_raises, left_out_notes
+from jimpact.methods.points import in_turns, left_out_if_it_raises, left_out_notes, relative_error
 from jimpact.methods.schemes import UNCOUNTED
 from jimpact.progress import counting_bar
 from jimpact.registry import registered_laws
@@ -32,7 +32,7 @@ ALGEBRAIC = ("newton", "moreau", "poisson", "binary")
 SPREAD = 10.0  # stiffnesses of a batch lie within this factor, half of it to either side
 SAMPLE = 16  # impacts of the batch on which errors are measured: one alone may be right by chance
 HOST_BATCH = 4  # impacts that a method without vmap does, in a loop, for its time in a batch
-HOST = "host code: finite differences only"
+HOST = "runs on the host: finite differences only"
 FINEST, SECOND = 1e-14, 1e-12  # rtol of the reference, and of the second solution
 
 
@@ -42,11 +42,6 @@ class Timing(NamedTuple):
     median: float
     low: float
     high: float
-
-    def __str__(self) -> str:
-        """In microseconds, the quartiles in brackets."""
-        low, high = microseconds(self.low), microseconds(self.high)
-        return f"{microseconds(self.median)} ({low}-{high})"
 
 
 @dataclass(frozen=True)
@@ -123,7 +118,9 @@ class WorkPrecision(Tabular):
             *(Column(name, ".1e", head) for name, head in zip(QUANTITIES, heads)),
             Column("evaluations", ".0f", "evals"),
             Column("alone_s", microseconds, "alone", "µs"),
-            Column("batch_s", lambda x: str(x), "batch", "µs"),
+            Column("batch_s", microseconds, "batch", "µs"),
+            Column("batch_low_s", microseconds, "from"),
+            Column("batch_high_s", microseconds, "to"),
             Column("gradient_s", microseconds, "with J", "µs"),
             Column("compile_s", ".1f", "compile", "s"),
             Column("status"),
@@ -133,7 +130,7 @@ class WorkPrecision(Tabular):
             compiled = sum(self.compile_time.get(name, {}).values()) or None  # said once
             for x in points:
                 errors = [x.error.get(q, np.nan) for q in QUANTITIES]
-                times = [x.single.median, x.batched, x.gradient and x.gradient.median]
+                times = [x.single.median, *x.batched, x.gradient and x.gradient.median]
                 rows.append([name, x.setting, *errors, x.evaluations, *times, compiled, x.status])
                 compiled = None
         uncertain = ", ".join(
@@ -144,17 +141,11 @@ class WorkPrecision(Tabular):
             f"Errors: relative, the largest of {self.sample} impacts with stiffness spread over a "
             f"factor {self.spread:g}; of a law its model error.",
             f"Times: medians of {self.repeats} in turns, per impact: alone, in a batch of "
-            f"{self.batch} (quartiles), with J: with the Jacobian.",
+            f"{self.batch} (from, to: quartiles), with J: with the Jacobian.",
         ]
         notes += left_out_notes(self.left_out)
-        notes += [f"no gradient: {name}: {why}." for name, why in self.without_gradient.items()]
+        notes += left_out_notes(self.without_gradient, "has no gradient")
         return Table(columns, rows, notes=notes, keys=2)
-
-    def to_csv(self, path: Any = None) -> str:
-        """The table as CSV; of times in a batch the medians."""
-        table = self.table
-        rows = [[getattr(x, "median", x) for x in row] for row in table.rows]
-        return Table(table.columns, rows).to_csv(path)
 
 
 @full_precision
@@ -508,9 +499,9 @@ def _errors(case: Case, solution: Solved, truth: Solved) -> dict[str, float]:
         "gradient": (solution.jacobian, truth.jacobian, fastest),
     }
     return {
-        name: float(np.abs(a - b[: len(a)]).max() / scale)
-        if a is not None and b is not None
-        else float("nan")
+        name: float("nan")
+        if a is None or b is None
+        else float(relative_error(np.ravel(a), np.ravel(b[: len(a)]), scale))
         for name, (a, b, scale) in compared.items()
     }
 

@@ -41,6 +41,11 @@ class Outcomes(NamedTuple):
         """Which of them (r,) have a status that is a failure."""
         return np.array([STATUS[int(code)].failure for code in self.status], bool)
 
+    def check_first(self, what: str) -> None:
+        """If the first one failed, a RuntimeError says what that means, and the status."""
+        if self.failed[0]:
+            raise RuntimeError(f"{what}: {STATUS[int(self.status[0])].message}.")
+
     def where_usable(self) -> "Outcomes":
         """The same, NaN where it failed."""
         lost = self.failed[:, None]
@@ -50,19 +55,21 @@ class Outcomes(NamedTuple):
 
 @precise_jit
 def varied_impacts(law: Law, scene: Scene, velocity: jax.Array, varied: dict[str, Any]) -> Outcomes:
-    """Impacts at velocities (r, n), over rows (r, ...) of parameters of the law, and of `gaps`."""
+    """Impacts at v- (n,) over rows (r, ...) of parameters of the law, of `gaps`, of `velocity`."""
 
-    def one(v: jax.Array, values: dict[str, jax.Array]) -> Outcomes:
+    def one(values: dict[str, jax.Array]) -> Outcomes:
         """One impact."""
-        place, tried = scene, law
+        place, tried, v = scene, law, velocity
         for name, value in values.items():
-            if name == "gaps":
+            if name == "velocity":
+                v = value
+            elif name == "gaps":
                 place = with_gaps(scene, value)
             else:
                 tried = with_entries(tried, (name,), jnp.ravel(value))
         return Outcomes.of(impact(tried, place, v))
 
-    return jax.vmap(one)(velocity, varied)
+    return jax.vmap(one)(varied)
 
 
 class EnergyNorm(NamedTuple):
@@ -126,9 +133,14 @@ def left_out_if_it_raises(name: str, left_out: dict[str, str]) -> Iterator[None]
         left_out[name] = f"raised {type(error).__name__}: {reason}"
 
 
-def left_out_notes(left_out: Mapping[str, str]) -> list[str]:
-    """A line of a table's notes for each candidate that is left out."""
-    return [f"{name} is left out: it {why}" for name, why in left_out.items()]
+def left_out_notes(left_out: Mapping[str, str], what: str = "is left out") -> list[str]:
+    """A line of a table's notes for each candidate that is left out, or that lacks something."""
+    return [f"{name} {what}: it {why}" for name, why in left_out.items()]
+
+
+def relative_error(value: Any, exact: Any, scale: Any = 1.0) -> np.ndarray:
+    """Largest |difference| (...) of each row (..., n) over a scale, such as the largest |v-|."""
+    return np.abs(np.asarray(value) - exact).max(axis=-1) / scale
 
 
 def seconds(run: Callable[[], Any], count: int = 1) -> float:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -18,7 +19,6 @@ from jimpact.methods.advice_report import ContactBlock, share
 from jimpact.methods.points import EnergyNorm, Outcomes, in_batches, varied_impacts
 from jimpact.scene import Scene, as_velocity, gap_velocity, with_gaps
 from jimpact.solvers.tridiagonal import diagonal
-from jimpact.status import STATUS
 
 # Impacts computed together, and the entries of their Delassus matrices. Ten times more take ten
 # times the memory, a gigabyte, and are not faster.
@@ -171,10 +171,7 @@ def simplest_scene(
     norm = EnergyNorm.of(scene, np.asarray(v), watched)
     trial = _Simpler(law, scene, v, norm)
     whole = trial.run([()])
-    if STATUS[int(whole.status[0])].failure:
-        raise RuntimeError(
-            f"The law fails on the whole scene: {STATUS[int(whole.status[0])].message}."
-        )
+    whole.check_first("The law fails on the whole scene")
     friction, trial = _frictions(trial, whole, tolerance)
     working, errors, changes = _alone(trial, runs)
     kept, error = _together(trial, whole, working, errors, tolerance, runs)
@@ -224,13 +221,8 @@ class _Simpler(NamedTuple):
         """An impact for each set of contacts to leave out, some at a time."""
         m = self.scene.contacts
         lanes = max(1, min(LANES, m + 1, ENTRIES // m**2))
-        velocities = jnp.tile(self.velocity, (lanes, 1))
-
-        def run(gaps: Any) -> Outcomes:
-            """Some of them."""
-            return varied_impacts(self.law, self.scene, velocities, {"gaps": jnp.asarray(gaps)})
-
-        return in_batches(run, self.gaps(left_out), lanes)
+        run = partial(varied_impacts, self.law, self.scene, self.velocity)
+        return in_batches(run, {"gaps": self.gaps(left_out)}, lanes)
 
     def changes(self, left_out: Sequence[Any], whole: Outcomes) -> np.ndarray:
         """Changes (r, n) of v+ from that of the whole scene; NaN where the law fails."""

@@ -29,7 +29,7 @@ from jimpact.compiling import full_precision
 from jimpact.files.records import Column, Table, Tabular, as_data, fields_as_data
 from jimpact.laws.lzb import LZB
 from jimpact.methods.contenders import CONTENDERS, Contender, contender_of, outcome
-from jimpact.methods.points import in_batches, left_out_if_it_raises, left_out_notes
+from jimpact.methods.points import in_batches, left_out_if_it_raises, left_out_notes, relative_error
 from jimpact.progress import counting_bar
 from jimpact.scene import Scene, as_velocity, chain
 from jimpact.status import CODE
@@ -515,8 +515,8 @@ def _confirm(points: np.ndarray, place: Place, exact: np.ndarray) -> Confirmatio
         balls = int(points[i, AXES.index("balls")])
         law, scene, v = place.impact_at(list(map(float, points[i])), balls, CHECK_STEPS)
         result = CONTENDERS[name].solve(law, scene, v, rtol)
-        change = outcome(law, scene, v, result).velocity - exact[i, : len(v)]
-        differences.append(float(np.abs(change).max()))
+        after = outcome(law, scene, v, result).velocity
+        differences.append(float(relative_error(after, exact[i, : len(v)])))
     agree = sum(x <= within for x in differences)
     largest = max(differences, default=float("nan"))
     return Confirmation(len(points), len(differences), agree, largest, within)
@@ -549,22 +549,20 @@ def classes_of(
     codes, errors = np.full(len(points), FLAGGED), np.full(len(points), np.nan)
     level = points[:, AXES.index("setting")]
     setting = setting_of(method.setting, level)
-    allowed = np.full(len(points), FIXED_STEP_RIGHT)
-    if method.setting == "rtol":
-        allowed = HONEST * setting
+    fixed = np.full(len(points), FIXED_STEP_RIGHT)
+    allowed = HONEST * setting if method.setting == "rtol" else fixed
     e = points[:, AXES.index("restitution")]
     for group, n in place.groups(points):
         run, size = runners(method, n), place.size(n)
         at = group[e[group] > 0] if method.divides else group
         if len(at):
             out = run(points[at], setting[at])
-            errors[at] = np.abs(out.velocity - exact[at, :size]).max(axis=1)
+            errors[at] = relative_error(out.velocity, exact[at, :size])
             codes[at] = _classified(out, errors[at], allowed[at])
         wrong = at[codes[at] == WRONG]
         if len(wrong):
             finer = run(points[wrong], FINER * setting[wrong])
-            error = np.abs(finer.velocity - exact[wrong, :size]).max(axis=1)
-            falls = error < FALLS * errors[wrong]
+            falls = relative_error(finer.velocity, exact[wrong, :size]) < FALLS * errors[wrong]
             codes[wrong[(finer.code == CODE["ok"]) & ~falls]] = STALLS
         advance(len(group))
     return codes, errors

@@ -16,7 +16,7 @@ from jimpact.law import Law
 from jimpact.laws.binary import Binary
 from jimpact.laws.kinematic import Moreau
 from jimpact.laws.lzb import LZB
-from jimpact.methods.points import varied_impacts
+from jimpact.methods.points import relative_error, varied_impacts
 from jimpact.scene import Scene, as_velocity
 from jimpact.status import STATUS
 from jimpact.theory.dispersion import dispersion_index
@@ -48,8 +48,7 @@ class ValidityMap(Tabular):
     def error(self, law: str) -> np.ndarray:
         """Error of v+ of a law, 'moreau' or 'binary', against LZB (x, r), relative to max |v-|."""
         check_choice("law", law, self.laws)
-        scale = np.abs(self.before).max()
-        return np.abs(self.velocity - self.laws[law]).max(axis=-1) / scale
+        return relative_error(self.velocity, self.laws[law], np.abs(self.before).max())
 
     def limit(self, law: str, tolerance: float = 1e-2) -> np.ndarray:
         """Ratio (x,) from which on Moreau's law, or up to which binary, is within `tolerance`.
@@ -137,8 +136,7 @@ def validity_map(
     exponents, ratios = (x.ravel() for x in jnp.meshgrid(eta, ratio, indexing="ij"))
     k = ratios[:, None] ** jnp.arange(scene.contacts).astype(v.dtype)[None, :]
     law = LZB(e.astype(v.dtype), k[0], eta[0])
-    velocities = jnp.tile(v, (len(ratios), 1))
-    out = varied_impacts(law, scene, velocities, {"stiffness": k, "exponent": exponents})
+    out = varied_impacts(law, scene, v, {"stiffness": k, "exponent": exponents})
     spread = jax.vmap(partial(dispersion_index, scene))(out.velocity)
     laws: dict[str, Law] = {"moreau": Moreau(e), "binary": Binary(e)}
     after = {name: impact(law, scene, v).velocity for name, law in laws.items()}
