@@ -101,7 +101,7 @@ def test_the_best_admissible_matrix_is_found_at_many_edges():
 @pytest.mark.release
 def test_gradient_descent_ends_at_the_same_matrix():
     data = shots(np.array([[0.1, 0.2], [0.95, 0.1]]), noise=0.1, seed=4)
-    found = fitted(data, method="adam")
+    found = fitted(data, search=ji.Search(method="adam"))
     assert min(slacks(np.asarray(found.law.matrix), inverse(CHAIN))) > -1e-13
     np.testing.assert_allclose(found.law.matrix, fitted(data).law.matrix, atol=1e-5)
 
