@@ -616,7 +616,7 @@ def test_ctrl_c_while_importing_and_compiling(verb, tmp_path, monkeypatch):
     monkeypatch.setenv("JIMPACT_CACHE", "")
     for seconds in (0.0, 1.0, 3.0):
         code, message = interrupted([verb], tmp_path, after_jax(seconds))
-        if code is None:
+        if code in (None, 0):
             break  # this machine had done it all before ctrl-C
         assert code == 130
         assert message.splitlines()[-1].startswith("jimpact")
