@@ -159,8 +159,12 @@ def _place(law: type[Law]) -> tuple[str, str]:
     return law.__module__, law.__qualname__
 
 
-def registered_laws(values: Mapping[str, Any]) -> tuple[dict[str, Law], dict[str, str]]:
-    """A law of each row of the registry, from parameters by name; and why others are left out.
+def registered_laws(
+    values: Mapping[str, Any], names: Iterable[str] | None = None
+) -> tuple[dict[str, Law], dict[str, str]]:
+    """Laws of these names, from parameters by name; and why others are left out.
+
+    `names`: in the registry, in their order; None: all.
 
     >>> import jimpact as ji
     >>> from jimpact.registry import registered_laws
@@ -170,7 +174,8 @@ def registered_laws(values: Mapping[str, Any]) -> tuple[dict[str, Law], dict[str
     (Newton(restitution=0.9, friction=None, tangential_restitution=None), 'needs `matrix`')
     """
     laws, left_out = {}, {}
-    for name, row in REGISTRY.items():
+    for name in REGISTRY if names is None else names:
+        row = REGISTRY[name]
         missing = [f"`{key}`" for key in row.required if key not in values]
         if missing:
             left_out[name] = f"needs {', '.join(missing)}"

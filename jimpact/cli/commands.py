@@ -368,14 +368,14 @@ def chart(command: options.ChartCommand, steps: Steps) -> CommandResult:
 
     study, before, _ = _impact_of(command)
     law = _lzb(study)
-    laws, _ = registered_laws(shared_parameters(law))
+    laws, _ = registered_laws(shared_parameters(law), QUICK_LAWS)
     quick = [name for name in QUICK_METHODS if CONTENDERS[name].supports(law) is None]
     result = ji.work_precision(
         study.scene,
         before,
         law,
         command.methods or (None if command.full else quick),
-        laws=None if command.full else {x: laws[x] for x in QUICK_LAWS},
+        laws=None if command.full else laws,
         batch=command.batch,
         repeats=command.repeats,
         gradients=command.full,

@@ -181,7 +181,7 @@ def _impact_study(tables: Mapping[str, Any], place: Path, law_name: str | None) 
     fittable = free_parameters_of(law)
     bounce = [name for name in ("restitution", *OF_SPEED) if name in fittable]
     data = tables.get("data")
-    study = Study(
+    return Study(
         str(tables.get("title", place.stem)),
         scene,
         law,
@@ -193,19 +193,16 @@ def _impact_study(tables: Mapping[str, Any], place: Path, law_name: str | None) 
         priors=fitted.priors,
         monte_carlo=_sampling(tables["monte_carlo"], law, scene) if "monte_carlo" in tables else {},
     )
-    if study.experiments is not None:
-        study._problem(of_shots)  # it refuses what is wrong with [fit], [law.bounds], [law.priors]
-    return study
 
 
 def _scene(table: Mapping[str, Any]) -> tuple[Scene, Body | None]:
     """The scene of a study, and the body whose scene it is."""
     if "kind" not in table:
-        return chain(**arguments_of("[scene]", table, CHAIN, ("masses_kg",))), None
+        check_keys("[scene]", table, CHAIN, ("masses_kg",))
+        return chain(**arguments_of(table, CHAIN)), None
     body = body_of("[scene]", table, tuple(CONFIGURATION))
     check_keys("[scene]", table, tuple(table), ("q",))
-    place = {CONFIGURATION[key]: x for key, x in table.items() if key in CONFIGURATION}
-    return body.scene(**place), body
+    return body.scene(**arguments_of(table, CONFIGURATION)), body
 
 
 def _experiments(table: Mapping[str, Any], study: Path, place: Scene | Body) -> Experiments:
@@ -236,12 +233,13 @@ def _sampling(table: Mapping[str, Any], law: Law, scene: Scene) -> dict[str, Any
     if not isinstance(laws, dict):
         raise ValueError(f"[monte_carlo.law] must be a table, but is {laws!r}.")
     random = {name: _distribution(f"law.{name}", x) for name, x in laws.items()}
-    arguments = {
-        SAMPLING[key]: _distribution(key, x) if isinstance(x, dict) else x
+    sampled = {
+        key: _distribution(key, x) if isinstance(x, dict) else x
         for key, x in table.items()
         if key != "law"
     }
-    return {"scene": scene, "law": RandomLaw(law, **random) if random else law} | arguments
+    drawn = RandomLaw(law, **random) if random else law
+    return {"scene": scene, "law": drawn} | arguments_of(sampled, SAMPLING)
 
 
 def _distribution(key: str, table: Any) -> Distribution:

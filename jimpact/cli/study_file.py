@@ -17,7 +17,7 @@ from jimpact._checks import check_word, suggestion
 from jimpact.bodies import assembly, particles, pendulums, shapes
 from jimpact.bodies.base import Body
 from jimpact.fits.matrices import admissible_start
-from jimpact.fits.parameters import OF_A_SCENE, entry_of
+from jimpact.fits.parameters import OF_A_SCENE, entry_of, free_parameters
 from jimpact.fits.search import Search
 from jimpact.law import Law
 from jimpact.laws import REGISTRY
@@ -124,12 +124,9 @@ def check_kind(where: str, key: str, value: Any, kind: type, words: str) -> None
         raise ValueError(f"`{key}` in {where} must be {words}, but is {value!r}.")
 
 
-def arguments_of(
-    where: str, table: Any, keys: Mapping[str, str], required: tuple[str, ...] = ()
-) -> dict[str, Any]:
-    """The values of a table by the arguments that its keys stand for; other keys are refused."""
-    check_keys(where, table, keys, required)
-    return {keys[key]: value for key, value in table.items()}
+def arguments_of(table: Mapping[str, Any], keys: Mapping[str, str]) -> dict[str, Any]:
+    """The values of a table by the arguments that these keys of it stand for."""
+    return {name: table[key] for key, name in keys.items() if key in table}
 
 
 def check_tables(
@@ -204,8 +201,12 @@ def law_of(
         fields = (*row.parameters, *OF_A_SCENE)
         return {x: y for x, y in pairs.items() if other_law is None or entry_of(x)[0] in fields}
 
+    law, free = row.build(**values), kept(free)
+    own = {x: choice for x, choice in free.items() if entry_of(x)[0] not in OF_A_SCENE}
+    if own:  # refuse what this law does not have, whether or not it will be fitted
+        free_parameters(law, own, absolute=True)
     bounds, priors = kept(table.get("bounds", {})), kept(table.get("priors", {}))
-    return row.build(**values), values, Fitted(kept(free), bounds, priors, options)
+    return law, values, Fitted(free, bounds, priors, options)
 
 
 def _masks(free: Any) -> dict[str, Any]:
@@ -235,7 +236,7 @@ def without_none(options: Mapping[str, Any]) -> dict[str, Any]:
 def fit_arguments(options: Mapping[str, Any], search: Search) -> dict[str, Any]:
     """Arguments of `fit` from the options of a study, of which all but two belong to its search."""
     own = {name: options[name] for name in ("starts", "profiles") if name in options}
-    check_kind("[fit]", "profiles", own.get("profiles") or False, bool, "true or false")
+    check_kind("[fit]", "profiles", own.get("profiles", False), bool, "true or false")
     others = {name: value for name, value in options.items() if name not in own}
     return own | {"search": dataclasses.replace(search, **others)}
 

@@ -9,6 +9,7 @@ from jimpact._checks import check_choice
 from jimpact.bodies.base import STANDARD_GRAVITY
 from jimpact.cli.study_file import (
     NO_DATA,
+    arguments_of,
     body_of,
     check_keys,
     check_kind,
@@ -105,7 +106,7 @@ def motion_study_of(tables: Mapping[str, Any], place: Path, law_name: str | None
     law, _, fitted = law_of(tables, law_name, place.parent)
     check_keys("[motion]", tables["motion"], (*MOTION, *METHOD, *OTHERS), ("q0", "v0", "t_end_s"))
     motion = tables["motion"]
-    arguments = {name: motion[key] for key, name in MOTION.items() if key in motion}
+    arguments = arguments_of(motion, MOTION)
     arguments["t_end"] = float(motion.get("t_start_s", 0.0)), motion["t_end_s"]
     arguments["method"] = _method(motion)
     return MotionStudy(
@@ -136,7 +137,7 @@ def _method(motion: Mapping[str, Any]) -> Method:
     for key, name in METHOD.items():
         if key in motion and name not in known:
             raise ValueError(f"`{key}` in [motion] must be left out for method {word!r}.")
-    return as_method(word, **{name: motion[key] for key, name in METHOD.items() if key in motion})
+    return as_method(word, **arguments_of(motion, METHOD))
 
 
 def _system(
@@ -159,6 +160,6 @@ def _system(
             f"`direction` of a {type(body).__name__} must be {' or '.join(names)}, "
             f"but is {direction!r}."
         )
-    motion = HarmonicBase(**{BASE[key]: x for key, x in base.items() if key != "direction"})
+    motion = HarmonicBase(**arguments_of(base, BASE))
     moved = directions[:, names.index(direction), None]
     return System(body, potential=weight, base=motion, base_directions=moved, friction=friction)

@@ -421,7 +421,8 @@ def trials(situation: Situation, law: LZB) -> dict[str, Trial]:
     e, k = (jnp.broadcast_to(x, (m,)).astype(v.dtype) for x in (law.restitution, law.stiffness))
     mu, touching = law.friction, situation.touching
     gapped = bool(situation.gapped.any())
-    laws, _ = registered_laws(dict(zip(ADVISED, (e, k, law.exponent, mu), strict=True)))
+    known = dict(zip(ADVISED, (e, k, law.exponent, mu), strict=True))
+    laws, _ = registered_laws(known, simplest_first())
     laws["binary"] = Binary(e, "earliest" if gapped else "fastest", friction=mu)
     laws["compliant"] = Compliant(Bistiffness(k, law.exponent, e), friction=mu)
     ordered = {name: laws[name] for name in simplest_first()}

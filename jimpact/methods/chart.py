@@ -210,8 +210,7 @@ def work_precision(
     chosen, left_out = _chosen(methods, settings or {}, case)
     exact, second = _reference(reference, case), CONTENDERS["time"]
     if laws is None:
-        built = registered_laws(shared_parameters(law))[0]
-        laws = {name: built[name] for name in ALGEBRAIC}
+        laws, _ = registered_laws(shared_parameters(law), ALGEBRAIC)
 
     # of one name one program, which the reference shares with its own row
     different = {m.name: m for m in (exact, second, *chosen)}

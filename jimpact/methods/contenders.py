@@ -143,13 +143,13 @@ _ALL = (
 CONTENDERS: dict[str, Contender] = {each.name: each for each in _ALL}
 
 
-def contender_of(argument: str, given: str | Contender, known: dict[str, Contender]) -> Contender:
+def contender_of(argument: str, method: str | Contender, known: dict[str, Contender]) -> Contender:
     """The contender of this name among those known, or one of your own, with a name of its own."""
-    if not isinstance(given, Contender):
-        check_choice(argument, given, known)
-        return known[given]
-    if CONTENDERS.get(given.name, given) is not given:
+    if not isinstance(method, Contender):
+        check_choice(argument, method, known)
+        return known[method]
+    if CONTENDERS.get(method.name, method) is not method:
         raise ValueError(
-            f"Argument `{argument}` must have contenders of new names, but has {given.name!r}."
+            f"Argument `{argument}` must have contenders of new names, but has {method.name!r}."
         )
-    return given
+    return method

@@ -335,6 +335,7 @@ def test_simulate_in_space(tmp_path, capsys):
         ("amplitude_m", "size_m", "[base] must have the key `amplitude_m`"),
         ("t_end_s", "t_end", "must have the key `t_end_s`"),
         ("[law]", "[laws]", "must have the key `law`"),
+        ("[law]", "[fit]\nfree = ['restituton']\n[law]", "Did you mean restitution?"),
         ("0.2\nheight", "-0.2\nheight", "`width` must lie in"),
         ("0.3, 0.0]", "0.2, 0.0]", "must have no penetration"),
     ],

@@ -25,6 +25,7 @@ def test_one_shot_is_always_reproduced():
         found = fit(law, CHAIN, data, {"matrix": True}, starts=1)
         np.testing.assert_allclose(found.residual, 0, atol=1e-8)
         assert found.rank == 2
+        assert "rms residual   0 (the values are reproduced)" in str(found)
         assert any("Nothing keeps this matrix consistent" in line for line in found.warnings)
 
 

@@ -19,6 +19,19 @@ from jimpact.fits.selection import LawFit, LawFits
 from jimpact.fits.uncertainty import Profile
 from jimpact.motion.record import KIND_CODE, Motion, no_events
 from jimpact.plot.films import positions
+from jimpact.progress import wrapped
+
+
+def test_long_lines_keep_their_column(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "30")
+    assert wrapped("rms residual   a sentence that is longer than that").splitlines() == [
+        "rms residual   a sentence that",
+        "               is longer than",
+        "               that",
+    ]
+    assert wrapped("  - a warning of many words, too").splitlines()[1] == "    too"
+    table = "e    0.5    0.01    a row of a table stays as it is"
+    assert wrapped(table) == table
 
 
 @pytest.mark.parametrize("shots", [1, 2, 50])
