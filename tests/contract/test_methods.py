@@ -16,7 +16,6 @@ from programs import failed, names
 from spatial_scenes import NAMED
 
 import jimpact as ji
-from jimpact.methods.contenders import CONTENDERS
 
 BALLS, STRIKE = ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0]
 
@@ -347,10 +346,6 @@ def test_stability_map_of_a_scene_with_friction():
     ("call", "message"),
     [
         (lambda: ji.stability_map(["rk5"]), "`methods` must be one of"),
-        (
-            lambda: ji.stability_map([CONTENDERS["rk4"]._replace(divides=False)]),
-            "`methods` must have contenders of new names, but has 'rk4'",
-        ),
         (lambda: ji.stability_map(axes={"mass": [1]}), "`axes` must be one of"),
         (lambda: ji.stability_map(axes={"balls": [2.5]}), "whole numbers"),
         (lambda: ji.stability_map(axes={"restitution": [1.1]}), r"lie in \[0, 1\]"),

@@ -166,3 +166,9 @@ def test_limits_are_of_the_unbroken_run_from_their_end():
     )  # fmt: skip
     assert validity.limit("binary").tolist() == [0.1]
     assert validity.limit("moreau").tolist() == [10.0]
+
+
+def test_a_contender_of_ones_own_has_a_name_of_its_own():
+    mine = CONTENDERS["rk4"]._replace(divides=False)
+    with pytest.raises(ValueError, match=r"`methods` must have contenders of new names.*'rk4'"):
+        ji.stability_map([mine])
