@@ -318,17 +318,24 @@ def _squares(problems: Any, points: jax.Array) -> jax.Array:
 def _near(
     problem: "FitProblem", ends: Ends, count: int, noise: float, rng: np.random.Generator
 ) -> np.ndarray:
-    """Points (count, Q) around the best, as far off as its standard errors and more, in bounds."""
-    best = int(np.nanargmin(ends.squares))
-    jacobian, measured = np.nan_to_num(ends.jacobian[best]), int(np.sum(problem.weight > 0))
+    """Points (count, Q) in bounds, as far off as standard errors and more, around the best.
+
+    Minima that fit as well take turns: another one may lie next to each.
+    """
+    measured = int(np.sum(problem.weight > 0))
+    variance = max(np.nanmin(ends.squares) / measured, noise**2)
+    distinct = [group[0] for group in _groups(problem, ends)]
+    best = [i for i in distinct if ends.squares[i] <= ends.squares[distinct[0]] + variance]
     # directions that the data do not determine are not searched
     least = RANK_TOLERANCE[problem.precision] ** 2
-    inverse = np.linalg.pinv(jacobian.T @ jacobian, rcond=least, hermitian=True)
-    variance = max(ends.squares[best] / measured, noise**2)
-    error, y = np.sqrt(variance * np.diag(inverse)), ends.y[best]
+    jacobian = np.nan_to_num(ends.jacobian[best])
+    curvature = np.swapaxes(jacobian, 1, 2) @ jacobian
+    inverse = np.linalg.pinv(curvature, rcond=least, hermitian=True)
+    error = np.sqrt(variance * np.diagonal(inverse, axis1=1, axis2=2))
+    centre = np.arange(count) % len(best)
     spread = np.exp(rng.uniform(np.log(NEAR_SPREAD), np.log(FAR_SPREAD), (count, 1)))
-    move = np.minimum(spread * error, START_SCALES) * rng.normal(size=(count, len(y)))
-    return np.clip(y + move, problem.low, problem.high)
+    move = np.minimum(spread * error[centre], START_SCALES) * rng.normal(size=(count, len(error[0])))
+    return np.clip(ends.y[best][centre] + move, problem.low, problem.high)
 
 
 def _groups(problem: "FitProblem", ends: Ends) -> list[list[int]]:
