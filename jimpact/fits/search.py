@@ -334,7 +334,8 @@ def _near(
     error = np.sqrt(variance * np.diagonal(inverse, axis1=1, axis2=2))
     centre = np.arange(count) % len(best)
     spread = np.exp(rng.uniform(np.log(NEAR_SPREAD), np.log(FAR_SPREAD), (count, 1)))
-    move = np.minimum(spread * error[centre], START_SCALES) * rng.normal(size=(count, len(error[0])))
+    z = rng.normal(size=(count, len(error[0])))
+    move = np.minimum(spread * error[centre], START_SCALES) * z
     return np.clip(ends.y[best][centre] + move, problem.low, problem.high)
 
 
