@@ -319,8 +319,8 @@ ROOMS = (  # from above: (name, task, modules); a room imports from rows below i
     (("events", "stepper and flows", ("events",)),),
     (("heart, below", "scene, contact", ("scene", "contact", "quasi_space")),),
     (("solvers", "LCP, friction, linear", ("solvers",)),),
-    (("shared", "checks, status, progress, compiling, loops, derivatives",
-      ("_checks", "status", "progress", "compiling", "loops", "derive", "tangents")),),
+    (("shared", "checks, status, progress, compiling, precision, loops, derivatives",
+      ("_checks", "status", "progress", "compiling", "precision", "loops", "derive", "tangents")),),
 )  # fmt: skip
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from jimpact._checks import as_float_array, is_traced
 from jimpact.compiling import full_precision
+from jimpact.precision import precision
 from jimpact.scene import Scene, gap_velocity, solve_mass, without_constraints
 from jimpact.solvers.sparse import Sparse
 from jimpact.solvers.tangential import TangentialBlock
@@ -26,11 +27,6 @@ from jimpact.solvers.tridiagonal import (
     scaled,
     structure_of,
 )
-
-# A gap velocity counts as 0 below this many times eps |N|^T |v-|, because v- results from a few
-# rounded sums and products. Ten times more would hide true, slow approaches in fast common motion;
-# without it, the last bits of equal velocities would be an impact.
-ROUNDINGS = 4
 
 # Groups of unequal size are padded to the largest of them, because compiling another program takes
 # longer than many impacts. A second program for the smaller groups must save this factor of the
@@ -226,8 +222,8 @@ class Contact(eqx.Module):
         size: jax.Array = abs(w) @ jnp.abs(normal)  # type: ignore[operator]
         if self.cross is not None and tangential is not None:
             size = size + jnp.abs(self.cross) @ jnp.abs(tangential)
-        eps = float(jnp.finfo(size.dtype).eps)
-        return self.noise + ROUNDINGS * eps * (jnp.abs(self.gap_velocity) + size)
+        rounding = precision(size.dtype).rounding
+        return self.noise + rounding * (jnp.abs(self.gap_velocity) + size)
 
 
 @full_precision
@@ -296,7 +292,7 @@ def rounded_gap_velocity(scene: Scene, velocity: jax.Array) -> tuple[jax.Array, 
         left, right = scene.walls
         padded = jnp.pad(speed, (int(left), int(right)))
         size = padded[:-1] + padded[1:]
-    noise = jax.lax.stop_gradient(ROUNDINGS * float(jnp.finfo(speed.dtype).eps) * size)
+    noise = jax.lax.stop_gradient(precision(speed.dtype).rounding * size)
     return gamma - jax.lax.stop_gradient(jnp.where(jnp.abs(gamma) <= noise, gamma, 0.0)), noise
 
 

@@ -21,6 +21,7 @@ from jimpact.compiling import full_precision, is_top_level_call, quick_jit
 from jimpact.contact import Contact, Groups, contacts_of_groups, coupled_groups
 from jimpact.derive import naming_the_adjoint
 from jimpact.law import Impulses, Law, check_law, is_separable, restrict_law, within_domains
+from jimpact.precision import precision
 from jimpact.scene import (
     Scene,
     as_velocity,
@@ -293,7 +294,7 @@ def _has_scale(size: jax.Array, v: jax.Array) -> jax.Array:
 
     True as well where the velocity (n,) is not finite, and the energy can have no value.
     """
-    tiny = float(jnp.finfo(size.dtype).tiny)
+    tiny = precision(size.dtype).tiny
     inside = (size**2 >= tiny) & (size**2 < jnp.inf)
     return inside | ~jnp.all(jnp.isfinite(v))
 

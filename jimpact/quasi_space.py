@@ -9,12 +9,9 @@ import numpy as np
 from jimpact._checks import is_traced
 from jimpact.compiling import quick_jit
 from jimpact.contact import kinetic_norm, normalized_delassus
+from jimpact.precision import precision
 from jimpact.scene import Scene, dense_mass, momentum, velocity_change
 from jimpact.solvers.tridiagonal import as_matrix
-
-# Normals count as dependent when the matrix of their cosines has an eigenvalue below this
-# multiple of eps times its size. Ten times more would refuse contacts that are nearly parallel.
-_SINGULAR = 100.0
 
 # Relative difference below which shares of coordinates in the tangent space count as equal: the
 # first one is taken, so that a basis does not depend on the last digit. Ten times more would take
@@ -97,7 +94,7 @@ def check_independent(scene: Scene) -> None:
     gram = normals.T @ np.linalg.solve(dense_mass(fixed), normals)
     norm = np.sqrt(np.diag(gram))
     smallest = np.linalg.eigvalsh(gram / np.outer(norm, norm))[0]
-    if smallest < _SINGULAR * np.finfo(gram.dtype).eps * len(gram):
+    if smallest < precision(gram.dtype).singular * len(gram):
         raise ValueError(
             _REDUNDANT.format(f"redundant ones: smallest eigenvalue of G {smallest:.3g}")
         )

@@ -31,6 +31,7 @@ from jimpact._checks import (
     is_traced,
 )
 from jimpact.compiling import full_precision
+from jimpact.precision import precision
 from jimpact.solvers.dense import solve_definite, solve_mass_matrix
 from jimpact.solvers.sparse import Neighbours, Sparse
 
@@ -658,7 +659,7 @@ def check_mass(mass: jax.Array) -> None:
     if not _is_symmetric(host):
         raise ValueError("Argument `mass` must be symmetric, but M - M^T is not zero.")
     smallest = np.linalg.eigvalsh(host)[0]
-    if smallest <= np.finfo(mass.dtype).eps * len(host) * np.abs(host).max():
+    if smallest <= precision(mass.dtype).eps * len(host) * np.abs(host).max():
         raise ValueError(
             "Argument `mass` must be positive definite, "
             f"but its smallest eigenvalue is {smallest:.3g}."

@@ -113,7 +113,7 @@ MUTATIONS = [
     Mutation("rebound of the last contact without e", "ContactFlow.at_work", "self.restitution * jnp.sqrt(jnp.where(works, energy, 1.0))", "jnp.sqrt(jnp.where(works, energy, 1.0))", FLOW),
     Mutation("audit forgets stored energy", "audit", "change - out.initial_energy", "change", ("test_consistency.py::test_stored_energy_is_not_an_energy_gain",)),
     Mutation("the median deviation taken for sigma", "", "MEDIAN = 1.4826", "MEDIAN = 1.0", ("test_fit.py::test_the_scale_of_robust_losses_is_that_of_normal_errors",)),
-    Mutation("a hundred times the rounding of velocities", "", "ROUNDINGS = 4", "ROUNDINGS = 400", ("test_seams.py::test_ten_times_the_rounding_is_an_impact",)),
+    Mutation("a hundred times the rounding of velocities", "precision", "4 * eps", "400 * eps", ("test_seams.py::test_ten_times_the_rounding_is_an_impact",)),
     Mutation("degrees of freedom of the F test swapped", "_f_test", "fdtrc(more, rest, ratio)", "fdtrc(rest, more, ratio)", ("test_selection.py::test_the_need_of_a_dependence_on_speed_is_tested",)),
     Mutation("moments of inertia of a box with 1/10", "Box.__init__", "(jnp.sum(sizes ** 2) - sizes ** 2) / 12", "(jnp.sum(sizes ** 2) - sizes ** 2) / 10", ("test_bodies.py::test_moments_of_inertia_of_homogeneous_solids",)),
     Mutation("a rod's inertia about its end", "_dimer", "rod * length ** 2 / 12", "rod * length ** 2 / 3", ("test_scenes.py",)),

@@ -12,13 +12,11 @@ import numpy as np
 from jimpact._checks import as_float_array, as_numbers, check_shape, check_values, is_traced
 from jimpact.bodies.closed_pairs import ActivePairs
 from jimpact.compiling import full_precision, quick_jit
+from jimpact.precision import precision
 from jimpact.scene import Scene
 
 STANDARD_GRAVITY = 9.80665  # m/s^2
 CLOSED_BELOW = 1e-12  # [m] gaps this small are rounding of f(q) = 0; ten times more are, too
-# Of the largest coordinate: a gap that small is zero, in float32 too. Ten times more would close
-# gaps that single precision can distinguish from 0.
-_ROUNDINGS = 16
 
 _AROUND = np.linspace(0, 2 * np.pi, 49)  # [rad] corners of a drawn circle
 CIRCLE = np.stack([np.cos(_AROUND), np.sin(_AROUND)], axis=1)  # outline of a ball of radius 1
@@ -244,8 +242,8 @@ class Body(eqx.Module):
                 f"of {type(self).__name__}, but it returns {f.shape}."
             )
         check_range("q", self, margin)
-        eps = float(jnp.finfo(f.dtype).eps)
-        none = jnp.maximum(closed_below, _ROUNDINGS * eps * jnp.maximum(1.0, jnp.abs(q).max()))
+        noise = precision(f.dtype).noise * jnp.maximum(1.0, jnp.abs(q).max())
+        none = jnp.maximum(closed_below, noise)
         check_penetration("q", f, none)
         gaps = jnp.where(f <= none.astype(f.dtype), 0.0, f)  # NaN stays
         parts = (mass, normals, tangents, gaps)

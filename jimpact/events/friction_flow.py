@@ -18,7 +18,6 @@ restitution).
 """
 
 import dataclasses
-import math
 from typing import Any, NamedTuple
 
 import jax
@@ -39,6 +38,7 @@ from jimpact.events.contact_flow import (
 )
 from jimpact.events.stepper import any_of
 from jimpact.loops import fori_loop
+from jimpact.precision import precision
 from jimpact.solvers.dense import load_shares, regularized_once, times
 from jimpact.solvers.friction import distribute
 
@@ -59,7 +59,7 @@ def ridge(dtype: Any) -> float:
     It matters only where K_tt is singular. A refinement removes its effect elsewhere, so that
     errors are least at the square root of the machine epsilon.
     """
-    return math.sqrt(float(jnp.finfo(dtype).eps))
+    return precision(dtype).root
 
 
 class FrictionConstants(NamedTuple):

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 
 from jimpact.contact import Contact
 from jimpact.derive import Arrays, in_lanes, without_derivatives
-from jimpact.events import implicit_steps, stepper
+from jimpact.events import implicit_steps
 from jimpact.events.contact_flow import (
     Chain,
     ContactFlow,
@@ -30,6 +30,7 @@ from jimpact.events.friction_flow import FrictionFlow
 from jimpact.events.implicit_steps import ImplicitSteps
 from jimpact.events.plastic_limit import final_impulses, to_the_end
 from jimpact.events.slip import SlipFlow
+from jimpact.precision import precision
 from jimpact.solvers.dense import unit
 from jimpact.solvers.sparse import Neighbours
 from jimpact.solvers.step_impulses import descent_lengths
@@ -416,7 +417,7 @@ def perturbed(problem: Problem) -> Problem:
     """
     still = jax.lax.stop_gradient(problem)
     gamma, tolerance = still.gamma, still.tolerance
-    held = stepper.FINEST * float(jnp.finfo(gamma.dtype).eps)
+    held = precision(gamma.dtype).noise
     finer = jnp.maximum(FINER * tolerance, held)
     coarser = APART * jnp.maximum(tolerance, held)
     last = held * (1 - 2 * (jnp.arange(len(gamma), dtype=gamma.dtype) % 2))

@@ -41,6 +41,7 @@ from jimpact.events.contact_flow import (
 )
 from jimpact.events.queues import until_over
 from jimpact.loops import cond, scan
+from jimpact.precision import precision
 from jimpact.solvers.step_impulses import StepProblem, descent_lengths, solve
 from jimpact.tangents import dual_like, is_dual, pushforward, value_of
 
@@ -69,9 +70,6 @@ LEAST_RESTITUTION = 0.1
 # Error of the velocities of a convex problem, in tolerances. Ten times more: its noise is taken for
 # an error of the step, which becomes shorter.
 INNER = 1e-2
-# Roundings of velocities below which an error estimate is noise. Ten times more loosens the finest
-# tolerances.
-ROUNDINGS = 64
 # A contact unloads implicitly where explicit expansion changes its force within a step by more than
 # this part. Ten times more is unstable.
 STIFF = 0.5
@@ -176,7 +174,7 @@ class ImplicitSteps:
         """By how much (m, B) a step's normal impulse falls with the velocity of separation."""
         if self.viscous is not None:
             return jnp.zeros_like(x)
-        some = x > float(jnp.finfo(x.dtype).tiny) ** 0.5  # the derivative divides by the square
+        some = x > precision(x.dtype).tiny ** 0.5  # the derivative divides by the square
         slope = self.eta * self.force_scale * power(x, self.exponent) / jnp.where(some, x, 1.0)
         return h**2 * slope * self.omega / self.least**2
 
@@ -387,7 +385,7 @@ class ImplicitSteps:
         size = jnp.max(jnp.abs(end.velocity), axis=0, keepdims=True)
         if self.viscous is not None:
             error = error + self.unseen(s, end, h)
-        allowed = ALLOWED * self.tolerance + ROUNDINGS * float(jnp.finfo(h.dtype).eps) * size
+        allowed = ALLOWED * self.tolerance + precision(h.dtype).accumulated * size
         better = jax.tree.map(lambda a, b: a + (a - b) / 3, end, big)
         x = jnp.where(loaded, jnp.maximum(better.indentation, 0.0), end.indentation)
         new = better._replace(indentation=x, rate=end.rate, time=end.time)

@@ -39,6 +39,7 @@ import numpy as np
 
 from jimpact.events.tableaux import DOP853
 from jimpact.loops import cond, scan
+from jimpact.precision import precision
 from jimpact.tangents import Dual, dual_like, is_dual, pushforward, value_of
 
 # Step-size control: a step is at most GROWTH times and at least SHRINK times the one before it, and
@@ -70,9 +71,6 @@ TIE = 1e-13
 FULL = 30
 # Newton steps to a root of the cubic of a step: from the chord they leave about 1e-3.
 POLISH = 2
-# Roundings: an error estimate below them is noise, and COARSE_ROUNDING of a state that is itself
-# large, behind a wide gap. Ten times more loosens the finest tolerances.
-FINEST, COARSE_ROUNDING = 16, 64
 # The error is no less than this part of the third-order estimate squared. Ten times more: steps
 # half as long.
 COARSE = 0.3
@@ -457,13 +455,13 @@ def _squared_error(
     flow: Flow, s: Step, y: jax.Array, errors: jax.Array, passes: jax.Array
 ) -> jax.Array:
     """Hairer's error (1, B) of a step, squared, in tolerances."""
-    eps, tiny = float(jnp.finfo(y.dtype).eps), float(jnp.finfo(y.dtype).tiny)
+    zero = precision(y.dtype)
     full = FULL * flow.taking_part
-    local = jnp.maximum(flow.tolerance * (full / jnp.maximum(passes, full)), FINEST * eps)
-    scale = local * flow.allowance(s.modes, y) + COARSE_ROUNDING * eps * jnp.abs(y)
+    local = jnp.maximum(flow.tolerance * (full / jnp.maximum(passes, full)), zero.noise)
+    scale = local * flow.allowance(s.modes, y) + zero.accumulated * jnp.abs(y)
     fifth, third = (x[None] for x in jnp.max(jnp.abs(errors) / scale[None], axis=1))
     # 0.01 is Hairer's; `tiny`: a landing of length 0 has no errors
-    error2 = fifth**4 / (fifth**2 + 0.01 * third**2 + tiny)
+    error2 = fifth**4 / (fifth**2 + 0.01 * third**2 + zero.tiny)
     # small by chance where the fifth order is: a landing from a maximum, a step of half a period
     return jnp.maximum(error2, (COARSE * third**2 * local) ** 2)
 

@@ -10,6 +10,7 @@ from jimpact._checks import is_traced
 from jimpact.compiling import full_precision
 from jimpact.contact import Contact, delassus_matrix
 from jimpact.law import Impulses, Law, Values, option, parameter
+from jimpact.precision import precision
 from jimpact.scene import Scene
 from jimpact.solvers import collisions
 from jimpact.solvers.tridiagonal import as_matrix
@@ -101,7 +102,7 @@ def interval(scene: Scene, restitution: jax.Array) -> tuple[np.ndarray, np.ndarr
     w = np.asarray(as_matrix(delassus_matrix(scene)), float)
     own, other = np.diag(w)[:, None], np.diag(w)[None, :]
     kept = np.broadcast_to(np.asarray(restitution, float) ** 2, (len(w),))[:, None]
-    presses = w < -collisions.COUPLED * np.finfo(float).eps * np.sqrt(own * other)
+    presses = w < -precision(float).noise * np.sqrt(own * other)
     off = np.where(presses, w, np.nan)
     linear = (1 - kept) * off  # other r^2 + linear r - kept own <= 0
     high = (-linear + np.sqrt(linear**2 + 4 * other * kept * own)) / (2 * other)

@@ -12,6 +12,7 @@ from jimpact.compiling import full_precision
 from jimpact.contact import Contact
 from jimpact.law import Impulses, Law, OptionalValues, Values, option, parameter
 from jimpact.laws.friction import friction_fields, frictional_impulses
+from jimpact.precision import precision
 from jimpact.quasi_space import check_independent, quasi_basis
 from jimpact.scene import Scene, momentum
 from jimpact.solvers.dense import solve_symmetric
@@ -322,4 +323,4 @@ def _least(matrix: jax.Array, right: jax.Array, size: jax.Array) -> tuple[jax.Ar
     """Least x with `A x = right`, and whether none has, compared to velocities of this size."""
     x = jnp.linalg.pinv(matrix) @ right
     off = jnp.abs(matrix @ x - right).max()
-    return x, off > jnp.sqrt(jnp.finfo(x.dtype).eps) * size
+    return x, off > precision(x.dtype).root * size

@@ -27,6 +27,7 @@ from jimpact.law import (
     parameter,
 )
 from jimpact.laws.forces import Bistiffness
+from jimpact.precision import precision
 from jimpact.scene import Scene
 
 # Tolerances of v+ if the law has no `rtol`, relative to max |v-|. Ten times more would make every
@@ -34,7 +35,6 @@ from jimpact.scene import Scene
 DEFAULT_RTOL = {"float64": 1e-8, "float32": 1e-5}
 # Method 'implicit': finer than what is measured, some 100 steps. Ten times more saves half of them.
 DEFAULT_RTOL_IMPLICIT = {"float64": 1e-5, "float32": 1e-4}
-FINEST_RTOL_IN_EPS = 16  # below this many eps the error estimate is noise
 
 # Contacts with friction up to which impact dynamics are tried: each of their events involves all of
 # them. Ten times more would not end within hours, and no status would ever say so.
@@ -55,7 +55,7 @@ def solver_of(law: Any, contact: Contact) -> tuple[str, float]:
 
 def check_rtol(rtol: float | None, dtype: jnp.dtype) -> None:
     """Raise a ValueError where the precision cannot hold this tolerance."""
-    finest = FINEST_RTOL_IN_EPS * float(jnp.finfo(dtype).eps)
+    finest = precision(dtype).noise
     if rtol is not None and rtol < finest:
         raise ValueError(
             f"Argument `rtol` must be at least {finest:.2g} in {dtype}, "

@@ -9,6 +9,7 @@ from jimpact.compiling import full_precision
 from jimpact.contact import Contact
 from jimpact.law import Impulses, Law, OptionalValues, Values, option, parameter
 from jimpact.laws.friction import friction_fields
+from jimpact.precision import precision
 from jimpact.solvers.dense import null_projector
 from jimpact.solvers.friction import solve
 from jimpact.solvers.lcp import solve_lcp
@@ -97,7 +98,7 @@ class Poisson(Law):
         rate = jnp.concatenate([contact.gap_velocity, (1 + e_t) * contact.slip])
         rate = rate + a @ jnp.concatenate([first.normal + returned, first.tangential])
         # also at e = 0, where it begins with e
-        load = returned + jnp.finfo(mu.dtype).eps ** 2 * first.normal
+        load = returned + precision(mu.dtype).eps ** 2 * first.normal
         second = solve(a, rate[:m], rate[m:], mu, complementary=True, load=load)
         code = jnp.maximum(first.status, second.status)
         if self.restitution.ndim == 1:
@@ -122,4 +123,4 @@ def _depends_on_sharing(w: jax.Array, e: jax.Array, free: jax.Array) -> jax.Arra
     w, e = jax.lax.stop_gradient((w, e))
     norm = jnp.sqrt(jnp.diagonal(w))
     returned = w @ (e[:, None] * free) / jnp.where(norm > 0, norm, 1.0)[:, None]
-    return jnp.abs(returned).max() > jnp.sqrt(jnp.finfo(w.dtype).eps)
+    return jnp.abs(returned).max() > precision(w.dtype).root

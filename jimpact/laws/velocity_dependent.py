@@ -21,12 +21,9 @@ from jimpact.law import (
     with_parameter,
 )
 from jimpact.loops import while_loop
+from jimpact.precision import precision
 from jimpact.registry import REGISTRY
 from jimpact.solvers.tridiagonal import as_matrix, diagonal
-
-# eps of |cos(kinetic angle)| below which contacts count as decoupled: the rounding of normals and
-# of M^-1. Ten times more would decouple contacts that influence each other slightly.
-DECOUPLED_IN_EPS = 64
 
 
 @forwards_to_law
@@ -139,7 +136,7 @@ def approach_speed(contact: Contact) -> jax.Array:
     speed = jnp.maximum(-contact.gap_velocity, 0.0)
     w = as_matrix(contact.delassus)
     root = jnp.sqrt(diagonal(contact.delassus))
-    least = DECOUPLED_IN_EPS * jnp.finfo(speed.dtype).eps
+    least = precision(speed.dtype).accumulated  # of normals and of M^-1
     joined, known = jax.lax.stop_gradient(
         (jnp.abs(w) > least * root[:, None] * root[None, :], speed)
     )

@@ -30,6 +30,7 @@ from jimpact.methods.points import (
     varied_impacts,
 )
 from jimpact.montecarlo.gaps import gap_scale
+from jimpact.precision import precision
 from jimpact.progress import counting_bar
 from jimpact.registry import ADVISED, registered_laws, simplest_first
 from jimpact.scene import (
@@ -54,9 +55,6 @@ COARSEST_RTOL = 1e-3
 
 # Range of an unknown ratio of two stiffnesses: contacts of bodies of one kind.
 UNKNOWN_RANGE = (0.1, 10.0)
-# Contacts whose directions have a cosine below this many roundings are decoupled: the
-# rounding of normals and of M^-1. Ten times more could hide a weak coupling of 1e-13.
-DECOUPLED_IN_EPS = 64
 # Stiffnesses with every ratio at an end of its range, all of them up to this number, else as many
 # at random.
 CORNERS = 64
@@ -339,7 +337,7 @@ def blocks_of(
     """These contacts in blocks that feel each other."""
     cosine = _largest_cosines(scene, friction)[np.ix_(contacts, contacts)]
     angle = np.degrees(np.asarray(kinetic_angles(scene)))
-    touch = cosine > DECOUPLED_IN_EPS * np.finfo(cosine.dtype).eps
+    touch = cosine > precision(cosine.dtype).accumulated  # of normals and of M^-1
     label = components(touch | np.eye(len(contacts), dtype=bool))
     blocks = []
     for first in np.unique(label):

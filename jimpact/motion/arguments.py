@@ -19,6 +19,7 @@ from jimpact.law import Law
 from jimpact.laws.forces import Force
 from jimpact.motion.dynamics import is_pile, mass_at, recorded_gaps, seen_from_base
 from jimpact.motion.system import System
+from jimpact.precision import precision
 from jimpact.scene import check_mass
 
 MOST_STEPS = np.iinfo(np.int32).max  # they are counted in 32 bits
@@ -32,9 +33,9 @@ MANY = 200
 # apart are struck together.
 CLOSED_BELOW = 1e-9
 ROUNDING_GAP = 1e-5  # of the gap that counts as closed: smaller gaps are rounding, hops as well
-# Roundings that a gap may be off by, of the largest coordinate or gap at the start; what counts as
-# closed is MORE_CLOSED times more. In metres and double precision neither of them matters.
-GAP_ROUNDINGS, MORE_CLOSED = 8, 10
+# What counts as closed is so many times more than what a gap may be off by. In metres and double
+# precision it does not matter.
+MORE_CLOSED = 10
 DIFFERENTIATED = ("gap_function", "tangent_function", "potential", "base")
 
 
@@ -87,7 +88,7 @@ def closed_gaps(
 ) -> tuple[jax.Array, jax.Array]:
     """Gaps () [m] below which a contact is closed, and below which a gap is rounding."""
     size = jax.lax.stop_gradient(jnp.maximum(jnp.abs(q).max(), jnp.abs(f).max()))
-    off = GAP_ROUNDINGS * float(jnp.finfo(q.dtype).eps) * size
+    off = precision(q.dtype).noise * size
     default = jnp.maximum(CLOSED_BELOW, MORE_CLOSED * off)
     below = default if closed_below is None else jnp.asarray(closed_below, q.dtype)
     return below.astype(q.dtype), jnp.maximum(ROUNDING_GAP * below, off).astype(q.dtype)

@@ -8,14 +8,13 @@ import jax.numpy as jnp
 
 from jimpact.compiling import full_precision
 from jimpact.motion.system import System
+from jimpact.precision import precision
 from jimpact.solvers.dense import solve_mass_matrix
-
-_ROUNDINGS = 4  # that a share may be off by in single precision; more would hide slow approach
 
 
 def not_rounding(share: float, dtype: jnp.dtype) -> float:
     """A share that counts as 0, in single precision that of a few roundings."""
-    return max(share, _ROUNDINGS * float(jnp.finfo(dtype).eps))
+    return max(share, precision(dtype).rounding)
 
 
 class Kinematics(NamedTuple):

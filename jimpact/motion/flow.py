@@ -11,7 +11,6 @@ from jax.flatten_util import ravel_pytree
 
 from jimpact.bodies.base import Body
 from jimpact.events import stepper
-from jimpact.laws.lzb import FINEST_RTOL_IN_EPS
 from jimpact.loops import any_lane
 from jimpact.motion.dynamics import (
     definite,
@@ -34,7 +33,6 @@ from jimpact.motion.persistent_contact import (
     contact_powers,
     contacts_at,
     forces,
-    least_regularity,
     regularity,
     rest_acceleration,
     slip_margins,
@@ -48,6 +46,7 @@ from jimpact.motion.slip_in_space import (
     turning_errors,
 )
 from jimpact.motion.system import System
+from jimpact.precision import precision
 from jimpact.status import CODE
 
 SMALLEST_STEP = 1e-15  # of the time: below it a step does not move time any more
@@ -122,9 +121,12 @@ def watched(
         return normal
     # sliding ends where slip does, and where its forces stop to exist: both may be in one step
     slides = any_lane(jnp.any(modes.active & ~modes.stick))  # else its product with slip is 0
-    lasts = jax.lax.cond(
-        slides, lambda: regularity(contacts, mu, modes, slip), lambda: jnp.ones((), w.dtype)
-    ) - least_regularity(w.dtype)
+    lasts = (
+        jax.lax.cond(
+            slides, lambda: regularity(contacts, mu, modes, slip), lambda: jnp.ones((), w.dtype)
+        )
+        - precision(w.dtype).root
+    )
     side = friction_margins(contacts, mu, modes, force, lasts, slack, scales.speed)
     return jnp.concatenate([normal, side])
 
@@ -332,9 +334,10 @@ class MechanicalFlow(MotionFlow):
 
 def check_rtol(rtol: float, dtype: jnp.dtype) -> None:
     """Raise for a relative tolerance that steps in this precision cannot reach."""
-    if rtol < FINEST_RTOL_IN_EPS * float(jnp.finfo(dtype).eps):
+    finest = precision(dtype).noise
+    if rtol < finest:
         raise ValueError(
-            f"Argument `rtol` must be at least {FINEST_RTOL_IN_EPS} roundings of {dtype}, but has "
+            f"Argument `rtol` must be at least {finest:.1e}, the rounding of {dtype}, but has "
             f"value {rtol:g}: enable jax_enable_x64, or give a coarser one."
         )
 
@@ -544,7 +547,7 @@ def allowed_errors(
 
 def roundings(settings: Settings, margins: jax.Array, targets: jax.Array) -> jax.Array:
     """Roundings of these margins and of the time to the next sample (k,)."""
-    least = float(jnp.finfo(targets.dtype).tiny) ** 0.5
+    least = precision(targets.dtype).tiny ** 0.5
     each = jnp.append(margins, _smallest_step(targets))
     return jax.lax.stop_gradient(jnp.maximum(each, least))
 

@@ -22,6 +22,7 @@ from jimpact.motion.dynamics import (
     user_force,
 )
 from jimpact.motion.system import System
+from jimpact.precision import precision
 from jimpact.solvers.dense import (
     determinants,
     load_shares,
@@ -56,9 +57,9 @@ _BEGINNING = 2e-3
 # the contact may be held by all of it.
 _LEANING = 0.1
 _PASSES = 3  # choices: contacts whose slip contradicts their choice are re-evaluated
-# A power of rounding: of the matrix of the forces the rest would be rounding. What happens until it
-# has fallen from there to 0 is as small.
-_LEAST_REGULARITY, _FAINT_RIDGE = 1 / 2, 3 / 4  # the second with redundant contacts
+# A power of rounding: a ridge that redundant contacts need to share their forces. Ten times more
+# would be seen in the forces.
+_FAINT_RIDGE = 3 / 4
 
 
 class Modes(NamedTuple):
@@ -268,7 +269,8 @@ def regularity(
     """Determinant () of the matrix of the forces, over what it is if nothing slides with friction.
 
     Of one contact `1 - mu s W_nt / W_nn`, with s the sign of slip. Where it has fallen to 0 forces
-    that keep the modes do not exist, or elastic contacts would not settle at them.
+    that keep the modes do not exist, or elastic contacts would not settle at them; below the root
+    of rounding it counts as 0.
     """
     w, held, _ = _dragged(contacts, mu, modes, slip)
     scale = 1 / jnp.sqrt(jnp.where(held, jnp.diagonal(contacts.delassus), 1.0))
@@ -276,7 +278,7 @@ def regularity(
     both = (held[:, None] & held[None, :])[None]
     k = jnp.stack([w, contacts.delassus]) * jnp.outer(scale, scale)[None]
     eye = jnp.eye(len(held), dtype=w.dtype)[None]
-    ridge = float(jnp.finfo(w.dtype).eps) ** _FAINT_RIDGE
+    ridge = precision(w.dtype).eps ** _FAINT_RIDGE
     with_friction, without = determinants(jnp.where(both, k, eye) + ridge * eye)
     return with_friction / without
 
@@ -284,11 +286,6 @@ def regularity(
 def rest_acceleration(dtype: jnp.dtype) -> float:
     """See `_REST_ACCELERATION`."""
     return not_rounding(_REST_ACCELERATION, dtype)
-
-
-def least_regularity(dtype: jnp.dtype) -> float:
-    """What of `regularity` is 0."""
-    return float(jnp.finfo(dtype).eps) ** _LEAST_REGULARITY
 
 
 def _sizes(dragged: jax.Array, delassus: jax.Array, m: int) -> jax.Array:
@@ -550,7 +547,7 @@ def _next_trial(asked: _ModeQuestion, tried: _ModeTrial) -> _ModeTrial:
     pressing = modes._replace(active=pressed, stick=pressed & ~slips)
     regular = regularity(contacts, mu, pressing, slide)
     # twice: flights end at once it
-    wedged = active & slips & (regular <= 2 * least_regularity(dtype))
+    wedged = active & slips & (regular <= 2 * precision(dtype).root)
     open_ones_part = jnp.all(~touching | tried.allowed | (rate[:m] >= -slack))
     return _ModeTrial(
         modes,

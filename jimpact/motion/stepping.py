@@ -46,19 +46,20 @@ from jimpact.motion.step_contacts import ActiveContacts, AllContacts, PileImpuls
 from jimpact.motion.system import System
 from jimpact.motion.tables import Course
 from jimpact.motion.transitions import FAILS, scene_at
+from jimpact.precision import precision
 from jimpact.scene import Scene
 from jimpact.solvers.many_contacts import Many, solve_many
 from jimpact.status import CODE
 
-# Gap velocities below _ROUNDING times the largest speed of the motion, or _ROUNDINGS times its
+# Gap velocities below _ROUNDING times the largest speed of the motion, or its
 # rounding, are what solving for contacts at rest leaves. Ten times less, and resting beads strike
 # in every step; ten times more, and slow impacts come a step later.
-_ROUNDING, _ROUNDINGS = 1e-12, 64
+_ROUNDING = 1e-12
 SLOW = 2.0  # steps of the free acceleration: slower approach is rest, not an impact
 # Misfit of a step's impulses over its velocities at which the solver ends: for a few contacts, for
-# a pile; at least ROUNDINGS times eps, which matters in float32. Ten times more, and what rests
+# a pile; at least rounding, which matters in float32. Ten times more, and what rests
 # creeps ten times faster.
-FEW, PILE, ROUNDINGS = 1e-9, 1e-6, 32
+FEW, PILE = 1e-9, 1e-6
 OFF = 1e-2  # misfit above which `unsolved_step` is reported; ten times more is no solution
 ITERATIONS = 1000  # of the solver, per step; ten times more costs time in jammed piles only
 MEAN = 4  # iterations of the mean velocity in the forces; the error falls by h omega (spin) each
@@ -288,10 +289,10 @@ def _set_up(problem: _StepProblem, progress: _Progress, t: jax.Array) -> _Setup:
     q_predicted = body.moved(q, 0.5 * h * (state.v + h * free))
     contacts = contacts_of_step(system, q, middle, q_predicted, end, closed_below, mu is not None)
     before = contacts.rates(state.v - base_velocity)
-    eps = float(jnp.finfo(dtype).eps)
+    rounding = precision(dtype).accumulated
     speed = jnp.maximum(progress.speed, contacts.fastest(state.v))
-    tolerance = max(PILE if is_pile(system) else FEW, ROUNDINGS * eps)
-    noise = max(_ROUNDING, _ROUNDINGS * eps) * speed + progress.residual_velocity
+    tolerance = max(PILE if is_pile(system) else FEW, rounding)
+    noise = max(_ROUNDING, rounding) * speed + progress.residual_velocity
     noise += tolerance * contacts.fastest(h * free)
     slow = noise + SLOW * h * jnp.abs(contacts.rates(free)[:, 0])
     strikes = contacts.closed & (before[:, 0] < -slow)

@@ -25,7 +25,6 @@ from jimpact.motion.persistent_contact import (
     constraint_impulse,
     contacts_at,
     in_space,
-    least_regularity,
     length,
     no_modes,
     pressed_together,
@@ -33,6 +32,7 @@ from jimpact.motion.persistent_contact import (
 )
 from jimpact.motion.record import KIND_CODE
 from jimpact.motion.system import System
+from jimpact.precision import precision
 from jimpact.scene import Scene
 from jimpact.status import CODE, STATUS
 
@@ -41,11 +41,10 @@ FAILS = tuple(row.failure and row.name != "inadmissible_velocity" for row in STA
 # Gap velocities below this share of what the kinetic energy could give are 0: rounding.
 REST_SPEED = 1e-9
 LEAST_COUPLING = 1e-9  # |W_ij| / sqrt(W_ii W_jj) of two contacts: less is rounding
-ROUNDINGS = 64  # of the time: velocities that arise within them are 0
-# An impact without collision is that of contacts that approach at this power of rounding, of the
+# An impact without collision is that of contacts that approach at the root of rounding, of the
 # slip: it errs by about as much. MORE times what is left of `regularity` is added to this, or
 # contacts would part before they are wedged.
-APPROACH, MORE = 1 / 2, 10.0
+MORE = 10.0
 # Slips that change by less than SUPPLIED approaches change by what any impact does.
 SUPPLIED = 100.0
 # Of the speed scale of the motion: slip in space below it has stopped where a step landed on its
@@ -395,15 +394,15 @@ def _undisturbed(system: System, contacts: Contacts, result: _Resting, t: jax.Ar
 
 def _approach(choice: ModeChoice, slip: jax.Array, held: jax.Array) -> jax.Array:
     """Gap velocity () of the approach to an impact without collision, 0 where nothing slips."""
-    left = jnp.clip(choice.regularity, 0.0, 2 * least_regularity(slip.dtype))
-    share = float(jnp.finfo(slip.dtype).eps) ** APPROACH + MORE * left
+    left = jnp.clip(choice.regularity, 0.0, 2 * precision(slip.dtype).root)
+    share = precision(slip.dtype).root + MORE * left
     return jax.lax.stop_gradient(share * jnp.max(jnp.where(held, jnp.abs(slip), 0.0)))
 
 
 def velocity_noise(settings: Settings, acceleration: jax.Array) -> jax.Array:
     """Velocities () that arise at this acceleration () within the rounding of time."""
     duration = jnp.abs(jax.lax.stop_gradient(settings.duration))
-    return ROUNDINGS * float(jnp.finfo(duration.dtype).eps) * duration * acceleration
+    return precision(duration.dtype).accumulated * duration * acceleration
 
 
 def _rest(settings: Settings, scales: Scales) -> jax.Array:

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 
 from jimpact.derive import by_jacobian
 from jimpact.loops import while_loop
+from jimpact.precision import precision
 from jimpact.solvers.friction import solve as solve_friction
 from jimpact.solvers.tangential import TangentialBlock, per_tangent
 from jimpact.solvers.tridiagonal import (
@@ -31,16 +32,10 @@ from jimpact.status import CODE
 # with the root of the number of collisions, so this covers some ten thousand; ten times more would
 # lose the last slow collisions of long sequences.
 REST = 128.0
-# eps of the time passed and to come, within which times to closing are equal. Ten times more would
-# report more sequences as dependent on the order.
-TIE = 16.0
-COUPLED = 16.0  # eps of |G_ij| above which the collisions of i and j do not commute
 # Three or more contacts: a last collision slower than this (relative, as REST) that leaves an
 # approach is one of an endless sequence; what remains of it is below REST. Ten times more would cut
 # off sequences that end.
 DECAYED = {"float64": 1e-9, "float32": 3e-4}
-BOUNDARY = 8.0  # eps: a state on the edge of the endless cone (body between two walls) is in it
-SINGULAR = 16.0  # eps: two contacts with 1 - cos^2 below this are redundant
 
 
 class CoulombFriction(NamedTuple):
@@ -199,7 +194,7 @@ def scale_of(inputs: Inputs) -> jax.Array:
 
 def rest_of(inputs: Inputs) -> jax.Array:
     """Normalized approach velocities up to this are rounding."""
-    return REST * float(jnp.finfo(inputs.qn.dtype).eps) * scale_of(inputs)
+    return REST * precision(inputs.qn.dtype).eps * scale_of(inputs)
 
 
 def approaches(inputs: Inputs, at: CollisionState) -> jax.Array:
@@ -245,7 +240,7 @@ def choose(inputs: Inputs, options: Options, g: Symmetric, at: CollisionState) -
     level = rivals & (speed + noise >= fastest)
     j = jnp.argmax(level).astype(jnp.int32)  # the lowest index among equals
     chosen = jnp.arange(speed.shape[0], dtype=jnp.int32) == j
-    floor = COUPLED * float(jnp.finfo(speed.dtype).eps)
+    floor = precision(speed.dtype).noise
     coupled = jnp.abs(times(g, chosen.astype(speed.dtype))) > floor
     equals = rivals if at.gaps is not None else level
     return NextCollision(j, at.place, wait[j], jnp.any(equals & coupled & ~chosen))
@@ -260,8 +255,7 @@ def first_to_close(
     safe = jnp.where(approaching, speed, 1.0)
     wait = jnp.where(approaching, at.gaps / safe, jnp.inf)
     first = jnp.min(wait)
-    eps = float(jnp.finfo(speed.dtype).eps)
-    rounding = TIE * eps * (at.time + first + inputs.gaps / safe)
+    rounding = precision(speed.dtype).noise * (at.time + first + inputs.gaps / safe)
     return approaching & (wait <= first + rounding), wait
 
 
@@ -320,11 +314,11 @@ def _correlated(
     `L = sum (1 - e_j^2) d_j qn_j^2 / (2 a_j)`, is what kinetic energy loses:
     `d.a s^2 / 2 + d.qn s + L = 0`, of which s is the larger root.
     """
-    eps = float(jnp.finfo(at.qn.dtype).eps)
+    noise = precision(at.qn.dtype).noise
     own = jnp.sum(jnp.where(chosen, inputs.root, 0.0))
     if ratio.ndim == 2:
         ratio = jnp.sum(jnp.where(chosen[:, None], ratio, 0.0), axis=0)
-    pressed = times(g, chosen.astype(at.qn.dtype)) < -COUPLED * eps
+    pressed = times(g, chosen.astype(at.qn.dtype)) < -noise
     beside = pressed & (at.qn <= rest_of(inputs)) & ~chosen
     d = jnp.where(chosen, 1.0, jnp.where(beside, ratio * inputs.root / own, 0.0))
     a = times(g, d)
@@ -333,7 +327,7 @@ def _correlated(
     stored = jnp.where(closing & ~stays, d * at.qn**2 / (2 * jnp.where(a > 0, a, 1.0)), 0.0)
     curvature, slope = jnp.sum(d * a), -jnp.sum(d * at.qn)
     square = slope**2 - 2 * curvature * jnp.sum((1 - inputs.restitution**2) * stored)
-    allowed = (square >= -SINGULAR * eps * slope**2) & ~jnp.any(stays) & (curvature > 0)
+    allowed = (square >= -noise * slope**2) & ~jnp.any(stays) & (curvature > 0)
     real = allowed & (square > 0)
     root = jnp.where(real, jnp.sqrt(jnp.where(real, square, 1.0)), 0.0)
     s = (slope + root) / jnp.where(curvature > 0, curvature, 1.0)
@@ -381,19 +375,19 @@ def endless_pair(inputs: Inputs, first: jax.Array) -> tuple[jax.Array, jax.Array
     """
     e, qn = jnp.broadcast_to(inputs.restitution, (2,)), inputs.qn
     c = -inputs.coupling[0]
-    eps = float(jnp.finfo(qn.dtype).eps)
+    noise = precision(qn.dtype).noise
     e_j, e_k, s_1 = e[first], e[1 - first], -qn[first]
     s_2 = c * (1 + e_j) * s_1 - qn[1 - first]
     both = e_j * e_k
     trace = c**2 * (1 + e_j) * (1 + e_k) - e_j - e_k
     ratio = c * (1 + e_k) * s_2 / s_1 - e_j
     chi = ratio**2 - trace * ratio + both
-    above = (ratio >= trace / 2) | (chi <= BOUNDARY * eps * (ratio**2 + trace * ratio + both))
+    above = (ratio >= trace / 2) | (chi <= noise * (ratio**2 + trace * ratio + both))
     possible = (c > 0) & (trace >= 2 * jnp.sqrt(jax.lax.stop_gradient(both)))
     endless = possible & (s_2 > 0) & (ratio >= 0) & above
     # redundant contacts (c = 1) have no inverse: there s_3 = e_1 e_2 s_1, a geometric series
     free = 1 - c**2
-    redundant = free <= SINGULAR * eps
+    redundant = free <= noise
     other = -(qn + c * jnp.flip(qn)) / jnp.where(redundant, 1.0, free)
     decay = jnp.where(both < 1, 1 - both, 1.0)
     series_j, series_k = (1 + e_j) * s_1 / decay, (1 + e_k) * s_2 / decay

@@ -32,6 +32,7 @@ import numpy as np
 
 from jimpact.compiling import full_precision
 from jimpact.loops import cond, fori_loop, while_loop
+from jimpact.precision import precision
 
 # Rows up to which a loop of our own factors a matrix, not LAPACK: in a batch that is three to six
 # times as fast for 4 rows. With ten times more the cubic cost of many contacts would not be
@@ -44,10 +45,6 @@ _BLOCKS = 64
 # is no vector operation: four times as long for the 12 of four contacts with friction in space. Ten
 # times more would make large programs of long chains.
 COLUMNS_WRITTEN_OUT = 12
-# With a unit diagonal a matrix of m rows counts as singular when it has an eigenvalue (singular
-# value) below this multiple of its rounding errors, eps m. Ten times more: nearly parallel contacts
-# are redundant.
-SINGULAR = 100.0
 # Parts of a matrix below this multiple of sqrt(eps) of its largest entry are none in its
 # pseudoinverse. Ten times more would drop small, regular parts.
 _NEGLIGIBLE_PART = 4.0
@@ -171,7 +168,7 @@ def block_inverse(matrix: jax.Array) -> jax.Array:
 
     A singular block is perturbed by eps^(1/3), which refinements by the caller undo.
     """
-    perturbation = float(jnp.finfo(matrix.dtype).eps) ** (1 / 3)
+    perturbation = precision(matrix.dtype).eps ** (1 / 3)
     m, eye = len(matrix), jnp.eye(matrix.shape[1], dtype=matrix.dtype)[..., None]
 
     def eliminate(i: jax.Array, inverse: jax.Array) -> jax.Array:
@@ -198,7 +195,7 @@ def block_solve(matrix: jax.Array, right: jax.Array) -> jax.Array:
     if m * b > _BLOCKS:
         flat = matrix.reshape(m * b, m * b), right.reshape(m * b, -1)
         return jnp.linalg.solve(*flat).reshape(right.shape)
-    perturbation = float(jnp.finfo(matrix.dtype).eps) ** 2  # of a block that is singular
+    perturbation = precision(matrix.dtype).eps ** 2  # of a block that is singular
     rows = jnp.concatenate([matrix.reshape(m, b, m * b), right], axis=2)
 
     def eliminate(i: jax.Array, rows: jax.Array) -> jax.Array:
@@ -370,7 +367,7 @@ class SingularValues(NamedTuple):
 
 def _are_null(values: jax.Array) -> jax.Array:
     """Which of falling singular values (n, ..) are rounding of the largest one."""
-    return values <= SINGULAR * len(values) * float(jnp.finfo(values.dtype).eps) * values[:1]
+    return values <= precision(values.dtype).singular * len(values) * values[:1]
 
 
 @jax.custom_batching.custom_vmap
@@ -469,7 +466,7 @@ def _orthogonal(matrix: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         end = fori_loop(0, places - 1, rotate, start)
         return end._replace(done=at.done + 1)
 
-    rounding = n * float(jnp.finfo(matrix.dtype).eps)
+    rounding = n * precision(matrix.dtype).eps
     whole = jnp.sum(matrix**2, axis=(0, 1), keepdims=True)
     first, second = jnp.split(both, 2, axis=1)
     start = Sweep(first, second, jnp.ones((), matrix.dtype), jnp.int32(0))
@@ -489,7 +486,7 @@ def null_projector(g: jax.Array) -> tuple[jax.Array, jax.Array]:
     Held constant in derivatives: a perturbation is taken to keep the rank.
     """
     values, vectors = eigenvectors(jax.lax.stop_gradient(g))
-    null = values < SINGULAR * jnp.finfo(g.dtype).eps * g.shape[0]
+    null = values < precision(g.dtype).singular * len(g)
     basis = jnp.where(null[None, :], vectors, 0.0)
     return basis @ basis.T, jnp.any(null)
 
@@ -508,5 +505,5 @@ def solve_symmetric(
     projector, singular = null_projector(g)
     x = solve_definite(g + projector, right)
     residual = jnp.abs(g @ x - right).max()
-    missed = residual > jnp.sqrt(jnp.finfo(g.dtype).eps) * jnp.abs(right).max()
+    missed = residual > precision(g.dtype).root * jnp.abs(right).max()
     return x, singular, singular & missed

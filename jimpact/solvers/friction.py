@@ -21,6 +21,7 @@ import numpy as np
 
 from jimpact.compiling import full_precision
 from jimpact.loops import fori_loop, while_loop
+from jimpact.precision import precision
 from jimpact.solvers.dense import block_inverse, block_solve, load_shares, singular_values, times
 from jimpact.solvers.interior_points import ATTEMPTS, Best, better, cones_of, within_cones
 from jimpact.solvers.lcp import gathered_rounding
@@ -340,7 +341,7 @@ def _enumerate(problem: _FrictionProblem) -> tuple[_Modes, jax.Array, jax.Array]
         jnp.zeros(kinds.shape, dtype),
     )
     modes, x = _newton(problem, modes)
-    misfit, root = _misfit(problem, x), float(jnp.finfo(dtype).eps) ** 0.5
+    misfit, root = _misfit(problem, x), precision(dtype).root
     # larger impulses are the rounding of a singular matrix
     good = (misfit <= problem.tolerance) & (_size(x) < 1 / root)
     best = jnp.where(jnp.any(good), jnp.argmax(good), jnp.nanargmin(misfit))
@@ -377,7 +378,7 @@ def _at_rest(problem: _FrictionProblem, x: jax.Array, margin: jax.Array) -> _Mod
     margin = (margin * _size(x[..., None]))[None]
     taking = rate[:, 0] <= margin if problem.complementary else jnp.ones(rate[:, 0].shape, bool)
     if problem.load is not None:
-        begins = (problem.load > 0) & (problem.load < float(jnp.finfo(x.dtype).eps))
+        begins = (problem.load > 0) & (problem.load < precision(x.dtype).eps)
         taking = taking & ~(begins[:, None] & (x[:, :1] <= margin))
     pushes = taking & (x[:, :1] >= -margin)
     if problem.load is not None:
@@ -451,7 +452,7 @@ def _freedom(problem: _FrictionProblem, inverted: _Inverted) -> tuple[jax.Array,
         return free, jnp.where(not_unique, CODE["impulse_not_unique"], CODE["ok"])
     # contacts that slide may share p so that slip changes
     moves = jnp.abs(problem.matrix.reshape(free.shape) @ free)
-    root = float(jnp.finfo(free.dtype).eps) ** 0.5
+    root = precision(free.dtype).root
     code = jnp.where(jnp.any(free != 0), CODE["impulse_not_unique"], CODE["ok"])
     return free, jnp.where(jnp.any(moves > root), CODE["several_outcomes"], code)
 

@@ -25,6 +25,7 @@ import numpy as np
 
 from jimpact.compiling import full_precision
 from jimpact.loops import fori_loop, while_loop
+from jimpact.precision import precision
 from jimpact.solvers.dense import block_solve
 
 # Iterations of an attempt; 10 to 15 are usual. Ten times more: what diverges takes longer.
@@ -34,10 +35,10 @@ _MOST = 25
 # stick turn their slip in each iteration. 4 of 1 000 scenes of 4 to 12 contacts need the last one.
 _SLIDES = np.array([100.0, 1.0, 1e-4])
 ATTEMPTS = len(_SLIDES)
-# Misfit, as a power of eps, at which Newton's method takes over in the first attempt, and part of
-# the tolerance in others. Ten times more: the modes are not yet right; ten times less: contacts
-# with p = r = 0 take all iterations.
-_CLOSE, _CLOSER = 0.5, 1e-2
+# Misfit, as a part of the tolerance, at which Newton's method takes over after the first attempt
+# (which ends at the root of rounding). Ten times more: the modes are not yet right; ten times less:
+# contacts with p = r = 0 take all iterations.
+_CLOSER = 1e-2
 # Of the way to the boundary of the cones, what an iteration goes at most. Closer to 1: those that
 # follow have no room.
 _WITHIN = 0.99
@@ -104,7 +105,7 @@ def within_cones(
     Returns:
         The x of the least misfit: that of the first attempt is close, others are closer.
     """
-    first_close = float(jnp.finfo(cones.constant.dtype).eps) ** _CLOSE
+    first_close = precision(cones.constant.dtype).root
     unit, none = jnp.ones_like(cones.load), jnp.zeros_like(cones.constant[:, 1:])
     nan = 0 * jnp.sum(cones.constant)  # NaN where a rate is not finite
     middle = _Inside(unit + nan, unit, none, unit, none)
@@ -236,7 +237,7 @@ def _room_in_cone(cones: Cones, at: _Inside, way: _Inside) -> jax.Array:
     side, change = (jnp.concatenate([x.side, x.slip]) for x in (at, way))
     grows = jnp.concatenate([way.push, way.bound])
     square = first**2 - jnp.sum(side**2, axis=1)
-    root = jnp.sqrt(jnp.maximum(square, jnp.finfo(first.dtype).tiny))
+    root = jnp.sqrt(jnp.maximum(square, precision(first.dtype).tiny))
     first, side = first / root, side / root[:, None]
     along = first * grows - jnp.sum(side * change, axis=1)
     across = change - ((along + grows) / (1 + first))[:, None] * side

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 
 from jimpact.compiling import full_precision
 from jimpact.loops import while_loop
+from jimpact.precision import precision
 from jimpact.solvers.dense import null_projector, solve_by_pivots, solve_definite
 from jimpact.solvers.many_contacts import solve_many
 from jimpact.solvers.sparse import Sparse, conjugate_gradients
@@ -102,7 +103,7 @@ def _solve_sparse(matrix: Sparse, q: jax.Array) -> LCP:
     right for `A z`, and NaN where not even that has any.
     """
     still, rate = jax.lax.stop_gradient((matrix, q))
-    tolerance = _DESCENT_ROUNDINGS * float(jnp.finfo(q.dtype).eps)
+    tolerance = _DESCENT_ROUNDINGS * precision(q.dtype).eps
     columns = still.diagonal[:, None], rate[:, None]
     found = solve_many(
         lambda z: (still @ z[:, 0])[:, None],
@@ -134,7 +135,7 @@ def gathered_rounding(unknowns: int, dtype: Any) -> float:
     A larger artificial variable left at its end means that there is no solution; a larger w means
     that the contact is open.
     """
-    return unknowns * float(jnp.finfo(dtype).eps) ** _POWER
+    return unknowns * precision(dtype).eps ** _POWER
 
 
 def _solve_on(
@@ -170,7 +171,7 @@ def _least_norm(a: jax.Array, b: jax.Array, z: jax.Array) -> tuple[jax.Array, ja
 
 def _rounding(unknowns: int, dtype: Any) -> float:
     """Rounding in a tableau of Lemke's method."""
-    return _ROUNDING * float(jnp.finfo(dtype).eps) * unknowns
+    return _ROUNDING * precision(dtype).eps * unknowns
 
 
 def _wrong(a: jax.Array, b: jax.Array, support: jax.Array, z: jax.Array) -> jax.Array:

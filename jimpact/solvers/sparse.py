@@ -11,6 +11,7 @@ import numpy as np
 
 from jimpact.compiling import full_precision
 from jimpact.loops import while_loop
+from jimpact.precision import precision
 
 # Residual over the right side at which conjugate gradients end, in roundings, and the one from
 # which on the system counts as having no solution, as a power of eps. Ten times more: derivatives
@@ -118,7 +119,7 @@ def conjugate_gradients(product: Callable[[jax.Array], jax.Array], right: jax.Ar
 
 def _iterated(product: Callable[[jax.Array], jax.Array], right: jax.Array) -> jax.Array:
     """As `conjugate_gradients`, without derivatives."""
-    eps = float(jnp.finfo(right.dtype).eps)
+    eps = precision(right.dtype).eps
     size = jnp.vdot(right, right)
 
     def going(state: Any) -> jax.Array:

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact.compiling import full_precision
+from jimpact.precision import precision
 from jimpact.solvers.dense import regularized
 from jimpact.solvers.friction import in_disc
 
@@ -123,7 +124,7 @@ def extrapolated(now: Move, change: Move, before: Move, weight: jax.Array) -> ja
         return jnp.sum(weight * a * b, axis=0, keepdims=True)
 
     aa, ab, bb = (dot(*x) for x in ((change.way,) * 2, (change.way, before.way), (before.way,) * 2))
-    both = aa * bb - ab**2 > float(jnp.finfo(weight.dtype).eps) * aa * bb
+    both = aa * bb - ab**2 > precision(weight.dtype).eps * aa * bb
     aa, bb = jnp.where(aa > 0, aa, 1.0), jnp.where(both, bb, 1.0)
     ab = jnp.where(both, ab, 0.0)
     a, b = dot(change.way, now.way), jnp.where(both, dot(before.way, now.way), 0.0)

@@ -253,7 +253,7 @@ def test_derivatives_of_a_checked_outcome_are_those_of_the_plain_one():
 
 # Rooms from below: a module imports those of its own floor and of the floors below.
 FLOORS = (
-    ("_checks", "status", "progress", "compiling", "loops", "tangents", "derive"),
+    ("_checks", "status", "progress", "compiling", "precision", "loops", "tangents", "derive"),
     ("solvers",),
     ("scene", "contact", "quasi_space"),
     ("events",),
