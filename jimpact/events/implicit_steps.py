@@ -39,7 +39,7 @@ from jimpact.events.contact_flow import (
     per_row,
     power,
 )
-from jimpact.events.queues import until_over
+from jimpact.events.driver import until_over
 from jimpact.loops import cond, scan
 from jimpact.precision import precision
 from jimpact.solvers.step_impulses import StepProblem, descent_lengths, solve

@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jimpact.events.driver import until_over
 from jimpact.events.implicit_steps import (
     FIRST,
     ImplicitState,
@@ -82,7 +83,7 @@ def comes_to_rest(
         """The largest of them (1, B)."""
         return jnp.max(holds(s), axis=0, keepdims=True)
 
-    def goes_on(look: _Look) -> jax.Array:
+    def goes_on(steps: ImplicitSteps, look: _Look) -> jax.Array:
         """Which looks (1, B) are not over."""
         left = size(look.state) > LEFT * visible
         return asked & look.clear & left & (look.passes < LONGEST * m)
@@ -93,9 +94,9 @@ def comes_to_rest(
         close = (own > COMPARED * visible) & (dp - s.impulse < MARGIN * own)
         return ~any_of(jnp.where(block, close, s.impulse > flow.tolerance))
 
-    def coarse_step(look: _Look) -> _Look:
+    def coarse_step(steps: ImplicitSteps, look: _Look) -> _Look:
         """One step tried, with errors that are a part of what is left."""
-        live = goes_on(look)
+        live = goes_on(steps, look)
         coarse = dataclasses.replace(steps, tolerance=COARSE * size(look.state))
         state, length, _ = attempt(coarse, look.state, look.length, live)
         clear = look.clear & is_clear(state)
@@ -104,6 +105,6 @@ def comes_to_rest(
     start = steps.start(x, flow.scales(modes) * g)
     none = jnp.zeros(visible.shape, jnp.int32)
     first = _Look(start, FIRST * jnp.ones_like(visible), none, is_clear(start))
-    end = jax.lax.while_loop(lambda look: jnp.any(goes_on(look)), coarse_step, first)
+    end = until_over(goes_on, coarse_step, steps, first)
     rests = ~any_of(block & (jnp.abs(end.state.velocity) > visible)) & any_of(block)
     return asked & end.clear & (size(end.state) <= LEFT * visible) & rests

@@ -23,8 +23,8 @@ import jax.numpy as jnp
 
 from jimpact.events import stepper
 from jimpact.events.contact_flow import OFTEN, ContactFlow
+from jimpact.events.driver import until_over
 from jimpact.events.look_ahead import comes_to_rest
-from jimpact.events.queues import until_over
 from jimpact.events.stepper import GOES_ON, OVER, PAUSED, any_of, total
 from jimpact.loops import cond, fori_loop, scan
 from jimpact.status import CODE

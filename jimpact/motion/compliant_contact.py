@@ -1,11 +1,13 @@
 """Motions in which contact forces of a `Compliant` law act, instead of impacts at an instant."""
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from jimpact.events.contact_flow import COMPRESSION, EXPANSION, OPEN
+from jimpact.events.driver import until_over
 from jimpact.loops import any_lane
 from jimpact.motion.compliant_flow import (
     Phases,
@@ -102,13 +104,13 @@ def _start(problem: MotionProblem) -> State:
 
 def _run(problem: MotionProblem, max_events: int, until_apart: bool) -> MotionEnd:
     """From pass to pass."""
-    start = _begin(problem, max_events)
 
-    def going(run: _CompliantRun) -> jax.Array:
+    def goes_on(problem: MotionProblem, run: _CompliantRun) -> jax.Array:
         on = (run.status == CODE["ok"]) & (run.flight.sample < problem.times.shape[0])
         return on & ~run.apart if until_apart else on
 
-    end = jax.lax.while_loop(going, lambda run: _one_pass(problem, max_events, run), start)
+    one = partial(_one_pass, max_events)
+    end = until_over(goes_on, one, problem, _begin(problem, max_events))
     flight = end.flight
     counts = jnp.stack([flight.sample, end.event_count])
     return MotionEnd(
@@ -203,7 +205,7 @@ def _with_friction(problem: MotionProblem, run: _CompliantRun) -> _CompliantRun:
     return run._replace(flight=run.flight._replace(aim=aim), status=status)
 
 
-def _one_pass(problem: MotionProblem, max_events: int, run: _CompliantRun) -> _CompliantRun:
+def _one_pass(max_events: int, problem: MotionProblem, run: _CompliantRun) -> _CompliantRun:
     """One pass of the stepper, and what it shows."""
     run = _with_friction(problem, run)
     system, times, flight, m = problem.system, problem.times, run.flight, problem.contacts

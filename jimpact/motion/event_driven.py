@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jimpact.events.driver import until_over
 from jimpact.law import forward_only
 from jimpact.loops import any_lane, over_lanes
 from jimpact.motion.dynamics import free_acceleration, gaps, mass_at, user_force
@@ -96,19 +97,22 @@ def _run(problem: MotionProblem, max_events: int) -> MotionEnd:
     if problem.past is not None:
         start = _unpack_checkpoint(start, problem.past.numbers)
 
-    def goes_on(run: _EventRun) -> jax.Array:
+    def goes_on(problem: MotionProblem, run: _EventRun) -> jax.Array:
         flight = run.flight
         reached = flight.sample >= problem.times.shape[0]
         return (run.status == CODE["ok"]) & ~flight.stuck & ~reached
 
-    def one(run: _EventRun) -> _EventRun:
-        on = goes_on(run)
+    def one(problem: MotionProblem, run: _EventRun) -> _EventRun:
+        on = goes_on(problem, run)
         waiting, flying = on & run.waits, on & ~run.waits
         due = over_lanes(waiting.astype(jnp.int32)) >= over_lanes(flying.astype(jnp.int32))
         run = _resolved(problem, max_events, run, waiting, due)
-        return _flown(problem, run, goes_on(run) & ~run.waits)
+        return _flown(problem, run, goes_on(problem, run) & ~run.waits)
 
-    end = jax.lax.while_loop(lambda run: any_lane(goes_on(run)), one, start)
+    def any_goes_on(problem: MotionProblem, run: _EventRun) -> jax.Array:
+        return any_lane(goes_on(problem, run))
+
+    end = until_over(any_goes_on, one, problem, start)
     stuck = end.flight.stuck & (end.status == CODE["ok"])
     status = jnp.where(
         stuck, why_stuck(problem.system, end.flight, problem.q0, problem.times), end.status

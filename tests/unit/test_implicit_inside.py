@@ -13,8 +13,8 @@ import jimpact as ji
 from jimpact.contact import contact_of
 from jimpact.events import implicit_steps
 from jimpact.events.contact_flow import Chain, Dense
+from jimpact.events.driver import SLOTS
 from jimpact.events.impact_dynamics import method_for
-from jimpact.events.queues import SLOTS
 from jimpact.solvers.step_impulses import StepProblem, descent_lengths, solve
 
 pytestmark = pytest.mark.release  # they compile programs of their own

@@ -1,4 +1,4 @@
-"""The loop of all impacts: side by side, or in a queue where one that is over makes room."""
+"""The loop of impacts and motions: side by side, or in a queue with room for the next one."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
@@ -39,11 +39,12 @@ def until_over(
     checkpoints: bool = False,
     queues: bool = False,
 ) -> Carry:
-    """All impacts to their ends.
+    """All impacts, or one motion, to their ends.
 
     `goes_on(flow, carry)` says which (1, B) are not over, `advance(flow, carry)` makes one pass;
-    the batch B is the last axis of all arrays. With `checkpoints` the loop has a reverse mode, in
-    the place of a forward mode. If it `queues`, a CPU has at most SLOTS impacts side by side.
+    the batch B of impacts is the last axis of all arrays. With `checkpoints` the loop has a reverse
+    mode, in the place of a forward mode. If it `queues`, a CPU has at most SLOTS impacts side by
+    side.
     """
 
     def at_once(flow: Any, carry: Any) -> Any:

@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 
 import jimpact as ji
-from jimpact.events import queues
+from jimpact.events import driver
 
 
 @pytest.mark.release
 def test_a_queue_gives_the_outcomes_of_single_impacts(monkeypatch):
-    monkeypatch.setattr(queues, "SLOTS", 4)
-    monkeypatch.setattr(queues, "FREE", 2)
+    monkeypatch.setattr(driver, "SLOTS", 4)
+    monkeypatch.setattr(driver, "FREE", 2)
     box = ji.Box([0.3, 0.4, 0.5], mass=1.3)
     scene = box.scene(box.touching())
     v = np.random.default_rng(0).normal(size=(16, 6)) * [1, 1, 0, 1, 1, 1] - [0, 0, 2, 0, 0, 0]
