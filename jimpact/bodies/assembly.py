@@ -231,7 +231,7 @@ class Bodies(RigidBodies):
         if len(faces):
             i, j = faces.T
             a, b = points[i], points[j]
-            facing = facing_sides(a, b)
+            facing = facing_sides(*jax.lax.stop_gradient((a, b)))  # which sides: no derivative
             counts, angles = self._counts, self.all_bodies(q)[:, 2]
             at, sizes = (angles[i], angles[j]), (counts[i], counts[j])
             both = polygon_on_polygon(a, b, facing, changed_places((a, b), at, sizes, facing))

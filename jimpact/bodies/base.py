@@ -324,9 +324,9 @@ def check_range(name: str, body: Body, margin: Any, where: str = "") -> None:
 
 def check_penetration(name: str, f: jax.Array, closed_below: jax.Array) -> None:
     """Raise unless all gaps f (m,) are at least `-closed_below` [m]."""
-    if is_traced((f, closed_below)) or (f >= -closed_below).all():
+    if is_traced((f, closed_below)) or (np.asarray(f) >= -np.asarray(closed_below)).all():
         return
-    worst = int(jnp.argmin(f))
+    worst = int(np.argmin(f))
     raise ValueError(
         f"Argument `{name}` must have no penetration (f >= -{float(closed_below):g} m), "
         f"but gap {worst} has value {float(f[worst]):g} m."
@@ -392,10 +392,10 @@ def as_planes(planes: Any, dimension: int) -> jax.Array:
 
 
 def lengths(vectors: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Lengths (g,) and unit vectors of vectors (g, d); one of length 0 has no direction."""
-    square = jnp.sum(vectors**2, axis=1)
+    """Lengths (..) and unit vectors of vectors (.., d); one of length 0 has no direction."""
+    square = dot(vectors, vectors)
     length = jnp.sqrt(jnp.where(square > 0, square, 1.0))
-    return jnp.where(square > 0, length, 0.0), vectors / length[:, None]
+    return jnp.where(square > 0, length, 0.0), vectors / length[..., None]
 
 
 def dot(a: jax.Array, b: jax.Array) -> jax.Array:

@@ -77,18 +77,18 @@ def disc_on_polygon(middle: jax.Array, rim: jax.Array, corners: jax.Array) -> Co
 def _from_side(
     point: jax.Array, begin: jax.Array, side: jax.Array, n: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Distances (g,) of points (g, 2) from sides with normals n, negative behind one of them.
+    """Distances (..) of points (.., 2) from sides with normals n, negative behind one of them.
 
-    And where (g, 2) they touch at distance 0, and unit vectors (g, 2) from the side.
+    And where (.., 2) they touch at distance 0, and unit vectors (.., 2) from the side.
     """
-    square = dot(side, side)
-    along = dot(side, point - begin)
+    square, from_begin = dot(side, side), point - begin
+    along = dot(side, from_begin)
     slack = PARALLEL * jnp.sqrt(square)
     beyond = (along < -slack) | (along > square + slack)
-    end = begin + jnp.where(along > square, 1.0, 0.0)[:, None] * side
+    end = begin + jnp.where(along > square, 1.0, 0.0)[..., None] * side
     length, toward = lengths(point - end)
-    distance = jnp.where(beyond, length, dot(n, point - begin))
-    beyond = beyond[:, None]
+    distance = jnp.where(beyond, length, dot(n, from_begin))
+    beyond = beyond[..., None]
     return distance, jnp.where(beyond, 0.5 * (point + end), point), jnp.where(beyond, toward, n)
 
 
@@ -113,12 +113,13 @@ def facing_sides(a: jax.Array, b: jax.Array) -> Facing:
     The line of one side keeps the polygons apart most. The other polygon's nearest corner to this
     line is an end of its side that is most opposite.
     """
-    (_, n_a), (_, n_b) = sides(a), sides(b)
-    beyond_a = _of_sides(jnp.min(dot(b[:, None] - a[None], n_a[None]), axis=0), n_a)
-    beyond_b = _of_sides(jnp.min(dot(a[:, None] - b[None], n_b[None]), axis=0), n_b)
-    side_a, side_b = jnp.argmax(beyond_a), jnp.argmax(beyond_b)
+    both = jnp.stack([a, b])
+    _, normals = sides(both)
+    heights = dot(both[::-1, :, None] - both[:, None], normals[:, None])  # polygon, corner, side
+    beyond = _of_sides(jnp.min(heights, axis=1), normals)
+    (side_a, side_b), (n_a, n_b) = jnp.argmax(beyond, axis=1), normals
     opposite = n_a @ n_b.T
-    by_b = jnp.max(beyond_b) > jnp.max(beyond_a) + PARALLEL
+    by_b = jnp.max(beyond[1]) > jnp.max(beyond[0]) + PARALLEL
     side_a = jnp.where(by_b, jnp.argmin(opposite[:, side_b]), side_a)
     side_b = jnp.where(by_b, side_b, jnp.argmin(opposite[side_a]))
     return Facing(side_a, side_b, jnp.where(by_b, -n_b[side_b], n_a[side_a]))
@@ -133,30 +134,29 @@ def polygon_on_polygon(
     second side that faces it to the first side: the distance has no jumps. Where `swapped` (g,)
     that at the end comes first.
     """
-    row = np.arange(len(a))
-    begin_a, begin_b = a[row, facing.first], b[row, facing.second]
-    end_a = a[row, (facing.first + 1) % a.shape[1]]
-    end_b = b[row, (facing.second + 1) % b.shape[1]]
-    side_a, side_b = end_a - begin_a, end_b - begin_b
-    n_a, n_b = outward(side_a), outward(side_b)
+    corners = jnp.stack([a, b])
+    is_facing = jax.nn.one_hot(jnp.stack(facing[:2]), a.shape[1], dtype=bool)
 
-    def at_end(a: jax.Array, b: jax.Array) -> ContactPoints:
-        """Contacts at the ends a (g, 2) of first sides, which face the ends b of second ones."""
-        gap_a, point_a, from_b = _from_side(a, begin_b, side_b, n_b)
-        gap_b, point_b, from_a = _from_side(b, begin_a, side_a, n_a)
-        first = (gap_a <= gap_b)[:, None]
-        return ContactPoints(
-            jnp.minimum(gap_a, gap_b),
-            jnp.where(first, point_a, point_b),
-            jnp.where(first, from_b, -from_a),
-        )
+    def of_facing(points: jax.Array) -> jax.Array:
+        """That of the sides that face each other (2, g, 2) of points of all sides."""
+        return jnp.sum(jnp.where(is_facing[..., None], points, 0.0), axis=2)
 
-    both = at_end(begin_a, end_b), at_end(end_a, begin_b)
-    in_turn = [jnp.stack(parts, axis=1) for parts in zip(*both)]
+    begin, end = of_facing(corners), of_facing(jnp.roll(corners, -1, axis=2))
+    side = end - begin
+    # of each body its ends, in the order of those of the first one, from the other body's side
+    ends = jnp.stack([jnp.stack([begin[0], end[0]]), jnp.stack([end[1], begin[1]])])
+    lines = [x[::-1, None] for x in (begin, side, outward(side))]
+    gaps, points, normals = _from_side(ends, *lines)
+    first = (gaps[0] <= gaps[1])[..., None]
+    both = ContactPoints(
+        jnp.minimum(*gaps),
+        jnp.where(first, points[0], points[1]),
+        jnp.where(first, normals[0], -normals[1]),
+    )
     if swapped is not None:
-        each = [swapped.reshape(-1, *[1] * (x.ndim - 1)) for x in in_turn]
-        in_turn = [jnp.where(swap, x[:, ::-1], x) for swap, x in zip(each, in_turn)]
-    return ContactPoints(*in_turn)
+        each = [swapped.reshape(-1, *[1] * (x.ndim - 2)) for x in both]
+        both = ContactPoints(*(jnp.where(swap, x[::-1], x) for swap, x in zip(each, both)))
+    return ContactPoints(*(jnp.swapaxes(x, 0, 1) for x in both))
 
 
 def changed_places(

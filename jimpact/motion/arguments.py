@@ -15,6 +15,7 @@ from jimpact._checks import (
     is_traced,
 )
 from jimpact.bodies.base import check_range
+from jimpact.compiling import precise_jit
 from jimpact.law import Law
 from jimpact.laws.forces import Force
 from jimpact.motion.dynamics import is_pile, mass_at, recorded_gaps, seen_from_base
@@ -87,11 +88,12 @@ def closed_gaps(
     q: jax.Array, f: jax.Array, closed_below: float | None
 ) -> tuple[jax.Array, jax.Array]:
     """Gaps () [m] below which a contact is closed, and below which a gap is rounding."""
-    size = jax.lax.stop_gradient(jnp.maximum(jnp.abs(q).max(), jnp.abs(f).max()))
-    off = precision(q.dtype).noise * size
-    default = jnp.maximum(CLOSED_BELOW, MORE_CLOSED * off)
-    below = default if closed_below is None else jnp.asarray(closed_below, q.dtype)
-    return below.astype(q.dtype), jnp.maximum(ROUNDING_GAP * below, off).astype(q.dtype)
+    q, f = jax.lax.stop_gradient((q, f))
+    numpy: Any = jnp if is_traced((q, f)) else np  # on the host nothing is compiled
+    off = precision(q.dtype).noise * numpy.maximum(numpy.abs(q).max(), numpy.abs(f).max())
+    below = numpy.maximum(CLOSED_BELOW, MORE_CLOSED * off) if closed_below is None else closed_below
+    rounding = numpy.maximum(ROUNDING_GAP * below, off)
+    return jnp.asarray(below, q.dtype), jnp.asarray(rounding, q.dtype)
 
 
 def _check_functions(system: System, q: jax.Array, v: jax.Array, t: jax.Array) -> None:
@@ -172,9 +174,8 @@ def _check_system(
     end: jax.Array,
 ) -> jax.Array:
     """Raise for values that cannot be used, where they are known; the gaps (m,) at the start."""
+    mass, f, valid = _at_start(system, q, start)
     # functions of a system may close over traced numbers
-    found = eqx.filter_jit(recorded_gaps) if is_pile(system) else recorded_gaps
-    mass, f = mass_at(system, q), found(system, q, start)
     if is_traced((system, q, v, start, end, mass, f)):
         return f
     if callable(system.mass):
@@ -191,8 +192,15 @@ def _check_system(
                 "Argument `system` must have a finite base motion, but base(t) has value "
                 f"{np.asarray(base)[bad][0]} at t = {instants[bad][0]:g} s."
             )
-    check_range("q0", system.body, system.body.valid(seen_from_base(system, q, start)))
+    check_range("q0", system.body, valid)
     return f
+
+
+@precise_jit
+def _at_start(system: System, q: jax.Array, t: jax.Array) -> tuple[jax.Array, ...]:
+    """M, gaps (m,), of a pile the least one, and which coordinates are in range."""
+    valid = system.body.valid(seen_from_base(system, q, t))
+    return mass_at(system, q), recorded_gaps(system, q, t), valid
 
 
 def without_closures(system: System, q: jax.Array, v: jax.Array, t: jax.Array) -> System:
