@@ -19,6 +19,10 @@ from jimpact.motion.record import KIND_CODE, Events
 from jimpact.motion.system import System
 from jimpact.motion.transitions import After, sides_of
 
+# Power of the largest number that makes tangents of 1e-31 (float32) infinite the second time, but
+# none below 1e3 the first time.
+LARGE = 0.9
+
 
 class Past(NamedTuple):
     """What a run takes over from the one before it."""
@@ -141,25 +145,37 @@ def _undetermined(arrays: list[jax.Array], unknown: jax.Array) -> jax.Array:
 
     As those of a sine of all inputs, multiplied by something infinite: they are not 0.
     """
-    return jnp.zeros(unknown.shape)
+    return jnp.where(unknown, 0.0, 0.0)
 
 
 @_undetermined.defjvp
 def _undetermined_tangent(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
-    """Of the sine. Only products make it infinite: what has a cotangent of 0 remains 0."""
+    """Of the sine. What has a tangent or cotangent of 0 remains 0."""
     arrays, unknown = primals
     flat = jnp.concatenate([jnp.where(jnp.isfinite(x), x, 0.0).ravel() for x in arrays])
-    slope = jnp.cos(1 + flat @ np.sqrt(np.arange(2.0, 2 + flat.size)))  # no direction is level
-    total = sum(jnp.sum(_nan_unless_zero(slope * x, jnp.any(unknown))) for x in tangents[0])
-    each = _nan_unless_zero(jnp.broadcast_to(total, unknown.shape), unknown)
-    return jnp.zeros(unknown.shape), jnp.where(unknown, each, 0.0).astype(float)
+    flat = _reversed(flat)  # and an infinite cotangent becomes NaN
+    slope = jnp.cos(1 + flat @ _weights(flat.size))
+    some = jnp.any(unknown)
+    # large, not yet NaN, on either side of the slope: its own derivative may be multiplied by 0
+    total = sum(jnp.sum(_enlarged(slope * _enlarged(x, some), some)) for x in tangents[0])
+    each = jnp.where(unknown, total * _weights(unknown.size), 0.0)
+    return jnp.where(unknown, 0.0, 0.0), each.astype(float)
 
 
-def _nan_unless_zero(x: jax.Array, chosen: jax.Array) -> jax.Array:
-    """x, but NaN where `chosen` unless it is 0: products, so that derivatives are, too."""
-    huge = jnp.where(chosen, jnp.finfo(x.dtype).max, 1.0).astype(x.dtype)
-    times_infinity = jnp.where(chosen, 0.0, 1.0).astype(x.dtype) * (huge * (huge * x))
-    return huge * (huge * times_infinity)
+def _weights(count: int) -> np.ndarray:
+    """Numbers of which no usual combination is 0."""
+    return np.sqrt(np.arange(2.0, 2 + count))
+
+
+def _enlarged(x: jax.Array, chosen: jax.Array) -> jax.Array:
+    """x times a number so large, where `chosen`, that the second time gives infinity: NaN."""
+    factor = jnp.where(chosen, float(jnp.finfo(x.dtype).max) ** LARGE, 1.0).astype(x.dtype)
+    return _reversed(factor * _reversed(x))  # and so is its transpose
+
+
+def _reversed(x: jax.Array) -> jax.Array:
+    """-x, NaN of infinity; so is its transpose."""
+    return x + (-2) * x
 
 
 def sampled_states(samples: jax.Array, start: State, reached: jax.Array) -> State:

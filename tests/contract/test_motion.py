@@ -625,7 +625,7 @@ def test_a_mass_matrix_that_turns_singular():
     assert status(ji.simulate(nan, ji.Newton(0.5), [0.0], [1.0], 3.0)) == "not_finite"
 
 
-@pytest.mark.release
+@pytest.mark.slow  # the only derivative of a batch of motions
 def test_fit_through_event_times():
     """Two balls dropped from 1 and .25 m: each bounces in the times of its own height."""
     heights = np.array([[1.0], [0.25]])

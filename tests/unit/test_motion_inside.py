@@ -16,10 +16,33 @@ from jimpact.motion.simulate import CHUNK
 from jimpact.motion.tables import nan_derivatives
 from jimpact.motion.transitions import impact_jump
 
-pytestmark = pytest.mark.release  # they compile programs of their own
+
+def test_what_a_motion_does_not_reach_has_no_derivatives():
+    """NaN in both modes, unless its cotangent is 0; whatever the sum of the tangents is."""
+    known, inputs, move = jnp.array([True, False]), jnp.array([1.0, 2.0]), jnp.array([1.0, -1.0])
+
+    def reached(x, known=known):
+        return jnp.sum(x**2) + nan_derivatives(x, known)[:, 0]
+
+    np.testing.assert_array_equal(jax.jvp(reached, (inputs,), (move,))[1], [-2.0, jnp.nan])
+    pull = jax.vjp(reached, inputs)[1]
+    np.testing.assert_array_equal(pull(jnp.array([1.0, 0.0]))[0], 2 * inputs)
+    for cotangent in ([0.0, 1e-30], [1.0, -1.0]):
+        assert np.isnan(pull(jnp.array(cotangent))[0]).all()
+    both = jax.vjp(lambda x: nan_derivatives(x, jnp.array([False, False])), inputs)[1]
+    assert np.isnan(both(move[:, None])[0]).all()
+    modes = jax.jacfwd, jax.jacrev
+
+    @jax.jit
+    def all_hessians(x, known):
+        return [second(first(reached))(x, known) for first in modes for second in modes]
+
+    for hessians in all_hessians(inputs, known):
+        np.testing.assert_array_equal(hessians[0], 2 * np.eye(2))  # as if both were known
+        assert np.isnan(hessians[1]).all()
 
 
-@pytest.mark.release
+@pytest.mark.release  # compiles programs of its own
 def test_runs_of_the_program_follow_each_other():
     dropped = 0.97, [0.1, 0.101, 0.102], [0.0] * 3, 5.0
     motion = stack(*dropped)
@@ -38,28 +61,7 @@ def test_runs_of_the_program_follow_each_other():
         np.testing.assert_allclose(row, all_rows[: CHUNK + 100], rtol=1e-9)  # another program
 
 
-def test_what_a_motion_does_not_reach_has_no_derivatives():
-    """NaN in both modes, unless its cotangent is 0; whatever the sum of the tangents is."""
-    known, inputs, move = jnp.array([True, False]), jnp.array([1.0, 2.0]), jnp.array([1.0, -1.0])
-
-    def reached(x):
-        return jnp.sum(x**2) + nan_derivatives(x, known)[:, 0]
-
-    np.testing.assert_array_equal(jax.jvp(reached, (inputs,), (move,))[1], [-2.0, jnp.nan])
-    pull = jax.vjp(reached, inputs)[1]
-    np.testing.assert_array_equal(pull(jnp.array([1.0, 0.0]))[0], 2 * inputs)
-    for cotangent in ([0.0, 1e-30], [1.0, -1.0]):
-        assert np.isnan(pull(jnp.array(cotangent))[0]).all()
-    both = jax.vjp(lambda x: nan_derivatives(x, jnp.array([False, False])), inputs)[1]
-    assert np.isnan(both(move[:, None])[0]).all()
-    modes = jax.jacfwd, jax.jacrev
-    for first in modes:
-        for second in modes:
-            hessians = second(first(reached))(inputs)
-            np.testing.assert_array_equal(hessians[0], 2 * np.eye(2))  # as if the other was known
-            assert np.isnan(hessians[1]).all()
-
-
+@pytest.mark.release  # compiles programs of its own
 def test_a_motion_back_in_time_is_reported():
     ball, start = (
         ji.System(ji.Column([1.0]), gravity=True),
@@ -75,6 +77,7 @@ A_BASE, W_BASE = 0.1, 2 * np.pi * 1.5  # of a plate at A sin(w t)
 PLATE = ji.System(ji.Column([2.0]), gravity=True, base=ji.HarmonicBase(A_BASE, 1.5))
 
 
+@pytest.mark.release  # compiles programs of its own
 def test_gaps_are_seen_from_the_base():
     """f = q - y_b, f' = v - y_b', and f'' = -y_b'' where q'' = 0."""
     t = 0.1
@@ -85,6 +88,7 @@ def test_gaps_are_seen_from_the_base():
     np.testing.assert_allclose(gap.drift, [W_BASE**2 * sine], rtol=1e-13)
 
 
+@pytest.mark.release  # compiles programs of its own
 def test_the_base_works_at_its_own_speed():
     """p u with p = m (1 + e) (u - v): T+ - T- is that and what restitution takes."""
     u, v, e = A_BASE * W_BASE, -1.0, 0.5
@@ -100,6 +104,7 @@ def test_the_base_works_at_its_own_speed():
     )
 
 
+@pytest.mark.release  # compiles programs of its own
 def test_several_motions_are_fitted_at_once(monkeypatch):
     """A motion of closed form in the place of the simulated one: heights of bounces, h e^2, ..."""
 
