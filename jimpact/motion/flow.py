@@ -17,6 +17,7 @@ from jimpact.motion.dynamics import (
     free_acceleration,
     gaps,
     kinematics,
+    kinetic,
     mass_at,
     not_rounding,
     recorded_gaps,
@@ -89,6 +90,11 @@ class Settings(NamedTuple):
     spatial: bool  # friction has two rows a contact
     duration: jax.Array
     accumulation: jax.Array  # `slow`: see `transitions.resolve`
+
+
+def speed_of(energy: jax.Array, w: jax.Array) -> jax.Array:
+    """The largest gap velocity () that a kinetic energy could give a contact, `sqrt(2 T W_jj)`."""
+    return jnp.sqrt(2 * energy * jnp.max(w))
 
 
 class Scales(NamedTuple):
@@ -320,7 +326,10 @@ class MechanicalFlow(MotionFlow):
         contacts = self.contacts(at)
         value, rate = contacts.normal.value, contacts.normal.rate
         most = max(not_rounding(JUMP, rate.dtype), MORE_THAN_STEPS * self.rtol)
-        jumps = const.active & (jnp.abs(rate) > most * self.scales.speed)
+        # a motion that began at rest has no speed before this step
+        energy, w = kinetic(self.system, at.q, at.v), jnp.diagonal(contacts.delassus)
+        speed = jnp.maximum(self.scales.speed, speed_of(energy, w[: len(rate)]))
+        jumps = const.active & (jnp.abs(rate) > most * speed)
         if contacts.tangent is not None:  # tangentially only velocities drift
             value = jnp.concatenate([value, jnp.zeros_like(contacts.tangent.rate)])
             rate = jnp.concatenate([rate, contacts.tangent.rate])

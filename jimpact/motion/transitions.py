@@ -15,7 +15,7 @@ from jimpact.motion.dynamics import (
     not_rounding,
     seen_from_base,
 )
-from jimpact.motion.flow import Scales, Settings, State, selected
+from jimpact.motion.flow import Scales, Settings, State, selected, speed_of
 from jimpact.motion.persistent_contact import (
     Contacts,
     ModeChoice,
@@ -465,7 +465,7 @@ def _grown(
     energy = jnp.maximum(kinetic(system, state.q, state.v), kinetic(system, state.q, relative))
     now = Scales(
         jnp.abs(contacts.normal.rate).max(),
-        jnp.sqrt(2 * energy * jnp.max(jnp.diagonal(contacts.delassus))),
+        speed_of(energy, jnp.diagonal(contacts.delassus)),
         jnp.abs(contacts.approach[:m]).max(),
     )
     return jax.lax.stop_gradient(jax.tree.map(jnp.maximum, scales, now))

@@ -56,7 +56,7 @@ def upright(theta, width=0.2, height=0.6):
     return [0.0, half, theta]
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_free_rocking_to_rest():
     """Each impact keeps e of the angular velocity; swings last as Housner's quadrature says."""
     e = float(ji.theory.housner_restitution(3.0))
