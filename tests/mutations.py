@@ -101,7 +101,7 @@ MUTATIONS = [
     Mutation("repeated readings taken for noise of 0", "_noise", "(whole == whole[0]).all()", "False", ("test_fit.py::test_readings_that_repeat_hide_the_noise",)),
     Mutation("kilometres an hour", "", "1 / 3.6", "1 / 36", ("test_experiments.py",)),
     Mutation("micrometres", "", "{'m': 1.0, 'cm': 0.01, 'mm': 0.001, 'um': 1e-06}", "{'m': 1.0, 'cm': 0.01, 'mm': 0.001, 'um': 0.001}", ("test_experiments.py::test_units_of_gaps",)),
-    Mutation("the seed of a chunk", "Plan._drawn", "jax.random.fold_in(key, np.uint32(task.number))", "key", ("test_montecarlo.py::test_random_parameters_velocities_and_their_analytic_moments", "test_montecarlo.py::test_each_sample_is_the_impact_of_its_gaps",)),
+    Mutation("the seed of a chunk", "Run._drawn", "jax.random.fold_in(key, np.uint32(task.number))", "key", ("test_montecarlo.py::test_random_parameters_velocities_and_their_analytic_moments", "test_montecarlo.py::test_each_sample_is_the_impact_of_its_gaps",)),
     Mutation("given samples of the next chunk", "Run.task", "values[number * size:(number + 1) * size]", "values[(number + 1) * size:(number + 2) * size]", ("test_montecarlo.py::test_given_samples_are_used_row_by_row",)),
     Mutation("normal gaps truncated at their mean", "Normal.sample", "-mean / std", "0 * mean", ("test_montecarlo.py::test_truncated_normal_gaps",)),
     Mutation("random parameters draw the same numbers", "RandomLaw.__call__", "jax.random.fold_in(key, i)", "key", ("test_montecarlo.py::test_random_parameters_are_independent",)),

@@ -16,7 +16,6 @@ from jimpact.montecarlo.statistics import (
     Chunk,
     bin_edges,
     binned_quantiles,
-    moments_of,
     named,
     part,
 )
@@ -180,12 +179,13 @@ def result_of(
     run: Run, total: Chunk, resumed: int, rate: float, gap_scale: np.ndarray | None
 ) -> MonteCarlo:
     """The result of a run from the statistics of all its chunks."""
-    n, bad, whole = len(total["ends"]), part(total, "bad"), moments_of(total)
-    mean, covariance = whole.mean, whole.covariance
+    n, count, bad = len(total["ends"]), int(total["used"]), part(total, "bad")
+    mean = total["mean"]
+    covariance = total["products"] / (count - 1 if count > 1 else np.nan)
     failed = zip(bad["index"], bad["status"], bad["gaps"], bad["velocity_before"])
     return MonteCarlo(
         samples=run.samples,
-        count=whole.count,
+        count=count,
         mean=mean[:n],
         covariance=covariance[:n, :n],
         minimum=total["low"],
@@ -193,7 +193,7 @@ def result_of(
         gap_mean=mean[n:],
         gap_covariance=covariance[n:, n:],
         cross_covariance=covariance[:n, n:],
-        edges=bin_edges(total["ends"], run.plan.bins),
+        edges=bin_edges(total["ends"], run.bins),
         counts=total["counts"],
         statuses=named(total["statuses"]),
         bad=tuple(BadSample(int(i), OUTCOMES[code].name, *rest) for i, code, *rest in failed),
