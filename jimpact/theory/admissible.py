@@ -117,9 +117,7 @@ class AdmissibleSet:
         ends = self.coordinates.arc()
         if ends is None:
             return np.zeros((0, self.scene.size))
-        angle = np.linspace(*ends, points)
-        u = self.coordinates.radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-        arc = self._velocity(u)
+        arc = self._velocity(self.coordinates.on_circle(np.linspace(*ends, points)))
         first = np.asarray(self.scene.normals)[:, int(np.argmax(self.scene.closed))]
         return arc[::-1] if arc[0] @ first > arc[-1] @ first else arc
 
@@ -137,7 +135,29 @@ class AdmissibleSet:
 
     def __str__(self) -> str:
         """A table of several lines."""
-        return _in_words(self)
+        closed = np.asarray(self.scene.closed)
+        approaching = np.asarray(gap_velocity(self.scene, self.velocity))[closed] < 0
+        head = f"closed contacts: {int(closed.sum())}, approaching: {int(approaching.sum())};"
+        smallest = _ZERO * max(1e-300, float(np.abs(self.velocity).max()))
+
+        def show(x: float, width: int = 0) -> str:
+            """A velocity; 0 within rounding."""
+            return f"{x if abs(x) > smallest else 0.0:{width}.6g}"
+
+        if self.dimension == 0:
+            return f"{head} one admissible outcome, v+ = ({', '.join(map(show, self.centre))})"
+        lines = [
+            f"{head} admissible outcomes of dimension {self.dimension}",
+            f"energy       from {self.least_energy:.6g} J (plastic) to {self.energy:.6g} J (T-)",
+            "coordinate          v-         least       plastic      greatest   [m/s]",
+        ]
+        columns = zip(self.velocity, self.bounds[:, 0], self.plastic, self.bounds[:, 1])
+        for i, (before, *after) in enumerate(columns):
+            lines.append(f"{i + 1:10d}{show(before, 12)}" + "".join(show(x, 14) for x in after))
+        if self.dimension == 2:
+            for name, v in zip("AB", self.conserving_arc(2)):
+                lines.append(f"T+ = T- at {name} ({', '.join(map(show, v))})")
+        return "\n".join(lines)
 
     @property
     def _size(self) -> float:
@@ -237,33 +257,3 @@ def _unconstrained(scene: Scene, root: np.ndarray, y: np.ndarray, tolerance: flo
             f"{np.linalg.norm(basis.T @ y):.3g} off in the kinetic norm."
         )
     return np.eye(len(y)) - basis @ basis.T
-
-
-def _in_words(outcomes: AdmissibleSet) -> str:
-    """The set as a table."""
-    closed = np.asarray(outcomes.scene.closed)
-    approaching = np.asarray(gap_velocity(outcomes.scene, outcomes.velocity))[closed] < 0
-    head = f"closed contacts: {int(closed.sum())}, approaching: {int(approaching.sum())};"
-    smallest = _ZERO * max(1e-300, float(np.abs(outcomes.velocity).max()))
-
-    def show(x: float, width: int = 0) -> str:
-        """A velocity; 0 within rounding."""
-        return f"{x if abs(x) > smallest else 0.0:{width}.6g}"
-
-    if outcomes.dimension == 0:
-        return f"{head} one admissible outcome, v+ = ({', '.join(map(show, outcomes.centre))})"
-    lines = [
-        f"{head} admissible outcomes of dimension {outcomes.dimension}",
-        f"energy       from {outcomes.least_energy:.6g} J (plastic) "
-        f"to {outcomes.energy:.6g} J (T-)",
-        "coordinate          v-         least       plastic      greatest   [m/s]",
-    ]
-    columns = np.column_stack(
-        [outcomes.velocity, outcomes.bounds[:, 0], outcomes.plastic, outcomes.bounds[:, 1]]
-    )
-    for i, row in enumerate(columns):
-        lines.append(f"{i + 1:10d}{show(row[0], 12)}" + "".join(show(x, 14) for x in row[1:]))
-    if outcomes.dimension == 2:
-        for name, v in zip("AB", outcomes.conserving_arc(2)):
-            lines.append(f"T+ = T- at {name} ({', '.join(map(show, v))})")
-    return "\n".join(lines)
