@@ -1,6 +1,6 @@
 """Pictures of error against time, of stability, of where laws are valid, and of advice."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -28,6 +28,7 @@ from jimpact.plot.style import (
     new_panels,
     side_by_side,
     styled,
+    velocities_by_unit,
     wrapped,
 )
 from jimpact.status import CODE, STATUS
@@ -349,51 +350,56 @@ def validity_map(result: ValidityMap, tolerance: float = 1e-2, title: str = "") 
 
 
 @styled(Advice)
-def advice(result: Advice, title: str = "") -> Figure:
+def advice(result: Advice, title: str = "", names: Sequence[str] = ()) -> Figure:
     """Outcomes of every law, with their range over the unknown ratios, above their errors.
 
     Args:
         result: what `ji.advise` returned.
         title: above the picture.
+        names: of the velocities with their units, as `body.velocity_names`: each unit has a panel
+            of its own. Without names those of a chain are in m/s; others stand times the root of
+            their inertia, in √J.
 
     Returns:
         A matplotlib figure: `.savefig(path)` writes it.
 
     Raises:
-        TypeError: something else.
+        TypeError: something else. ValueError: another number of names.
 
     >>> import jimpact as ji
     >>> result = ji.advise(ji.chain([1.0, 1.0]), [1.0, 0.0], restitution=0.9, timing=False)
     >>> len(ji.plot.advice(result).axes)
     2
     """
-    names, rows = list(result.candidates), list(result.candidates.values())
-    chain = result.scene.walls is not None
-    what, unit = ("body", "m/s") if chain else ("coordinate", "m/s, rad/s")
-    bodies, x = len(result.velocity), np.arange(len(names))
+    laws, rows = list(result.candidates), list(result.candidates.values())
+    units, x = velocities_by_unit(result.scene, names), np.arange(len(laws))
     verdict = f"{'within' if result.within else 'not within'} {share(result.tolerance)}"
-    figure, (top, bottom) = new_figure(6.5, "", 2, 1, sharex=True, height_ratios=(3, 2))
-    top.set_title(f"{title}\n{as_code(result.law)}: {verdict}", fontsize="large")
-    for i, offset in enumerate(side_by_side(bodies)):
-        label = f"{what} {i + 1}" if bodies <= len(COLOURS) else None
-        v, low, high = np.array([(c.velocity[i], c.low[i], c.high[i]) for c in rows]).T
-        top.vlines(x + offset, low, high, color=colour_of(i), lw=4, alpha=0.4)
-        top.plot(x + offset, v, "o", color=colour_of(i), label=label)
-    chosen = names.index(result.name)
-    for axes, label in ((top, None), (bottom, "advised")):
-        axes.axvspan(chosen - 0.5, chosen + 0.5, color=HIGHLIGHT, lw=0, label=label)
+    height, ratios = 4.5 + 2.0 * len(units), [3.0] * len(units) + [2.0]
+    figure, panels = new_figure(height, "", len(ratios), 1, sharex=True, height_ratios=ratios)
+    *tops, bottom = panels
+    tops[0].set_title(f"{title}\n{as_code(result.law)}: {verdict}", fontsize="large")
+    for top, (unit, velocities) in zip(tops, units.items()):
+        for (i, word, factor), offset in zip(velocities, side_by_side(len(velocities))):
+            label = word if len(velocities) <= len(COLOURS) else None
+            v, low, high = factor * np.array([(c.velocity[i], c.low[i], c.high[i]) for c in rows]).T
+            top.vlines(x + offset, low, high, color=colour_of(i), lw=4, alpha=0.4)
+            top.plot(x + offset, v, "o", color=colour_of(i), label=label)
+        top.set_ylabel(unit)
+    chosen = laws.index(result.name)
+    for axes in panels:
+        axes.axvspan(chosen - 0.5, chosen + 0.5, color=HIGHLIGHT, lw=0)
         axes.grid(False, axis="x")
     lowest = result.tolerance / 1000
     worst, median = np.maximum(np.array([(c.worst, c.median) for c in rows]).T, lowest)
+    bottom.patches[0].set_label("advised")
     bottom.vlines(x, median, worst, color=GREY, lw=1)
     bottom.plot(x, worst, "s", color="black", label="worst")
     bottom.plot(x, median, "_", color="black", ms=14, label="median")
     bottom.axhline(result.tolerance, color=COLOURS[1], lw=1, label="tolerance")
     bottom.set(yscale="log", ylim=(lowest / 2, 10))
     logarithmic(bottom, "y")
-    top.set_ylabel(f"velocity after the impact [{unit}]")
     bottom.set(xlabel="law", ylabel="error of v+ (energy norm)")
-    named = [f"{name}{'' if c.usable else f' ({c.status})'}" for name, c in zip(names, rows)]
+    named = [f"{name}{'' if c.usable else f' ({c.status})'}" for name, c in zip(laws, rows)]
     bottom.set_xticks(x, [wrapped(name.replace(" ", "_")) for name in named], fontsize=SMALL)
     legend_below(figure, 6)
     return figure

@@ -1,8 +1,7 @@
 """Pictures of laws side by side, of contact forces and of force histories."""
 
 import dataclasses
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +22,7 @@ from jimpact.plot.style import (
     new_figure,
     side_by_side,
     styled,
+    velocities_by_unit,
     wrapped,
     write,
 )
@@ -34,7 +34,12 @@ _OUTCOMES = 4000  # dots of a set of outcomes; ten times more would only be one 
 
 
 @styled(Comparison)
-def comparison(result: Comparison, measured: np.ndarray | None = None, title: str = "") -> Figure:
+def comparison(
+    result: Comparison,
+    measured: np.ndarray | None = None,
+    title: str = "",
+    names: Sequence[str] = (),
+) -> Figure:
     """Velocities after the impact by law, energy ratios T+/T- and dispersion indices.
 
     Measured velocities are horizontal lines, and the laws closest to them are highlighted; a law
@@ -44,12 +49,15 @@ def comparison(result: Comparison, measured: np.ndarray | None = None, title: st
         result: what `ji.compare` returned.
         measured: v+ (n,) [m/s]; None: those of `result`, if it has any.
         title: above the picture.
+        names: of the velocities with their units, as `body.velocity_names`: each unit has a panel
+            of its own. Without names those of a chain are in m/s; others stand times the root of
+            their inertia, in √J.
 
     Returns:
         A matplotlib figure: `.savefig(path)` writes it.
 
     Raises:
-        TypeError: something else.
+        TypeError: something else. ValueError: another number of names.
 
     >>> import jimpact as ji
     >>> result = ji.compare(ji.chain([1.0, 1.0]), [1.0, 0.0], {"Newton": ji.Newton(0.5)})
@@ -58,32 +66,31 @@ def comparison(result: Comparison, measured: np.ndarray | None = None, title: st
     """
     if measured is not None:
         result = dataclasses.replace(result, measured=np.asarray(measured))
-    entries, chain = list(result.entries.values()), result.scene.walls is not None
-    figure, panels = new_figure(6.0, title, 2, 1, sharex=True, height_ratios=(3, 1.4))
-    top, bottom = panels
-    velocity = np.array([entry.outcome.velocity for entry in entries])
-    laws, bodies = velocity.shape
-    at = np.arange(laws)
-    x = at[:, None] + side_by_side(bodies)
-    for i in range(bodies):
-        label = f"{'body' if chain else 'coordinate'} {i + 1}"
-        top.plot(x[:, i], velocity[:, i], "o", color=colour_of(i), label=label)
-        if result.measured is not None:
-            style: dict[str, Any] = {"lw": 1, "ls": "--", "zorder": 0, "color": colour_of(i)}
-            top.plot([-0.5, laws - 0.5], [result.measured[i]] * 2, **style)
-    top.axhline(0, color="black", lw=0.6)
-    if result.measured is not None:
-        top.plot([], [], color="black", lw=1, ls="--", label="measured")
+    entries, units = list(result.entries.values()), velocities_by_unit(result.scene, names)
+    height, ratios = 4.2 + 1.8 * len(units), [3.0] * len(units) + [1.4]
+    figure, panels = new_figure(height, title, len(ratios), 1, sharex=True, height_ratios=ratios)
+    *tops, bottom = panels
+    at, velocity = np.arange(len(entries)), np.array([x.outcome.velocity for x in entries])
     wrong = ~np.array([bool(entry.audit.consistent) for entry in entries])
+    for top, (unit, velocities) in zip(tops, units.items()):
+        for (i, label, factor), offset in zip(velocities, side_by_side(len(velocities))):
+            x, y, colour = at + offset, factor * velocity[:, i], colour_of(i)
+            top.plot(x, y, "o", color=colour, label=label)
+            top.plot(x[wrong], y[wrong], "x", color="black", ms=10)
+            if result.measured is not None:
+                level = [factor * result.measured[i]] * 2
+                top.plot([-0.5, len(at) - 0.5], level, "--", color=colour, lw=1, zorder=0)
+        top.axhline(0, color="black", lw=0.6)
+        top.set_ylabel(unit)
+    if result.measured is not None:
+        bottom.plot([], [], "--", color="black", lw=1, label="measured")
     if wrong.any():
-        crosses = x[wrong].ravel(), velocity[wrong].ravel()
-        top.plot(*crosses, "x", color="black", ms=10, label="audit failed")
-    top.set_ylabel(f"velocity after the impact [{'m/s' if chain else 'm/s, rad/s'}]")
+        bottom.plot([], [], "x", color="black", ms=10, label="audit failed")
     kept, spread = [x.energy_ratio for x in entries], [x.dispersion_index for x in entries]
     bottom.bar(at - 0.18, kept, 0.32, color=GREY, label="energy ratio T+/T-")
     bottom.bar(at + 0.18, spread, 0.32, color=COLOURS[4], label="dispersion index")
     bottom.set(xlabel="law", ylabel="ratio, index")
-    many = laws > _UPRIGHT
+    many = len(at) > _UPRIGHT
     labels = [name if many else wrapped(name) for name in result.entries]
     bottom.set_xticks(at, labels, fontsize=SMALL, rotation=90 if many else 0)
     for axes in panels:

@@ -2,7 +2,7 @@
 
 import functools
 import inspect
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
@@ -14,6 +14,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from jimpact._checks import check_kind
+from jimpact.bodies.base import split_name
+from jimpact.scene import Scene, dense_mass
 
 SHEET = Path(__file__).with_name("jimpact.mplstyle")
 _SETTINGS = matplotlib.rc_params_from_file(SHEET, use_default_template=False)
@@ -84,6 +86,29 @@ def new_panels(
     for spare in panels.ravel()[count:]:
         spare.remove()
     return figure, panels.ravel()[:count]
+
+
+def velocities_by_unit(
+    scene: Scene, names: Sequence[str]
+) -> dict[str, list[tuple[int, str, float]]]:
+    """Index, name and factor of the velocities of each unit, by the label of their axis.
+
+    Without names those of a chain are in m/s; others, which may turn or move, are comparable only
+    times the root of their inertia.
+    """
+    label, n = "velocity after the impact", scene.size
+    if names and len(names) != n:
+        raise ValueError(f"Argument `names` must have {n} names, one a velocity, but has {names}.")
+    if not names and scene.walls is not None:
+        return {f"{label} [m/s]": [(i, f"body {i + 1}", 1.0) for i in range(n)]}
+    if not names:
+        root = np.sqrt(np.diag(dense_mass(scene)))
+        each = [(i, f"coordinate {i + 1}", float(root[i])) for i in range(n)]
+        return {f"{label} · √inertia [√J]": each}
+    by_unit: dict[str, list[tuple[int, str, float]]] = {}
+    for i, (word, unit) in enumerate(map(split_name, names)):
+        by_unit.setdefault(f"{label} [{unit}]" if unit else label, []).append((i, word, 1.0))
+    return by_unit
 
 
 def side_by_side(bodies: int) -> np.ndarray:
