@@ -6,8 +6,6 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 
 from jimpact.fits.profiles import Contour
 from jimpact.fits.uncertainty import Fit
@@ -108,16 +106,13 @@ def contour(result: Contour, title: str = "") -> Figure:
     axes.contourf(result.x, result.y, d, [0.0, limit], colors=[COLOURS[0]], alpha=0.25)
     axes.contour(result.x, result.y, d, [limit], colors=[COLOURS[0]], linewidths=1.5)
     axes.contour(result.x, result.y, d, [limit / 4], colors=GREY, linewidths=0.7)
-    axes.plot(*result.best, "+", color="black", ms=9)
+    axes.plot(*result.best, "+", color="black", ms=9, label="fit")
     for which, log in zip("xy", result.log, strict=True):
         if log:
             logarithmic(axes, which)
     axes.set(xlabel=result.names[0], ylabel=result.names[1])
-    handles = [
-        Patch(color=COLOURS[0], alpha=0.25, label=f"{100 * result.level:g} % region"),
-        Line2D([], [], marker="+", ls="none", color="black", label="fit"),
-    ]
-    legend_below(figure, 2, handles)
+    axes.fill([], [], color=COLOURS[0], alpha=0.25, label=f"{100 * result.level:g} % region")
+    legend_below(figure, 2)
     return figure
 
 
@@ -155,17 +150,14 @@ def _legend(figure: Figure, fit: Fit, others: Mapping[str, Fit], has_bars: bool)
     bars = ""
     if has_bars:
         bars = ", ± noise" if fit.problem.sigma is None else ", ± sigma"
-    plain: dict[str, Any] = {"ls": "none", "color": "black"}
-    handles = [
-        Line2D([], [], marker="o", mfc="none", label=f"measured{bars}", **plain),
-        Line2D([], [], marker="_", ms=14, mew=2, label=f"{type(fit.law).__name__} fitted", **plain),
-    ]
+    fitted = f"{type(fit.law).__name__} fitted"
+    axes = figure.axes[0]
+    axes.plot([], [], "o", color="black", mfc="none", label=f"measured{bars}")
+    axes.plot([], [], "_", color="black", ms=14, mew=2, label=fitted)
     for j, label in enumerate(others):
-        handles.append(Line2D([], [], marker="x+*"[j % 3], ls="none", color=GREY, label=label))
+        axes.plot([], [], "x+*"[j % 3], color=GREY, label=label)
     shots, bodies = _in_rows(fit.predicted).shape
     if shots > 1 and bodies > 1:  # of a single shot the axis names the bodies
-        for i in range(min(bodies, len(COLOURS))):
-            handles.append(
-                Line2D([], [], marker="s", ls="none", color=COLOURS[i], label=f"body {i + 1}")
-            )
-    legend_below(figure, 4, handles)
+        for i, colour in enumerate(COLOURS[:bodies]):
+            axes.plot([], [], "s", color=colour, label=f"body {i + 1}")
+    legend_below(figure, 4)

@@ -162,9 +162,8 @@ def forces(histories: Mapping[str, History], contact: int = -1) -> Figure:
     """
     figure, axes = new_figure(4.2)
     unit, size = readable_unit("s", max(float(h.duration) for h in histories.values()))
-    for j, (name, h) in enumerate(histories.items()):
-        time, force = np.asarray(h.time) / size, np.asarray(h.force[:, contact])
-        axes.plot(time, force, color=colour_of(j), label=name)
+    for name, h in histories.items():
+        axes.plot(np.asarray(h.time) / size, h.force[:, contact], label=name)
     axes.set(xlabel=f"impact time [{unit}]", ylabel="force [N]")
     axes.set_ylim(bottom=0)
     axes.legend()
@@ -241,17 +240,18 @@ def history(result: History, title: str = "") -> Figure:
     """
     _check_one(result)
     unit, size = readable_unit("s", float(result.duration))
-    time, rows = np.asarray(result.time) / size, [result.force, result.gap_velocity, result.energy]
+    time, contacts = np.asarray(result.time) / size, result.force.shape[1]
     figure, panels = new_figure(6.8, title, 3, 1, sharex=True)
-    words = ("force [N]", "gap velocity [m/s]", "stored energy [J]")
-    for axes, values, label in zip(panels, rows, words, strict=True):
-        for j, y in enumerate(np.asarray(values).T):
-            axes.plot(time, y, color=colour_of(j), label=f"contact {j + 1}")
+    rows = {
+        "force [N]": result.force,
+        "gap velocity [m/s]": result.gap_velocity,
+        "stored energy [J]": result.energy,
+    }
+    for axes, (label, values) in zip(panels, rows.items(), strict=True):
+        axes.plot(time, values, label=[f"contact {j + 1}" for j in range(contacts)])
         axes.set_ylabel(label)
-    friction = np.asarray(result.tangential_force)
-    each = friction.shape[1] // result.force.shape[1]
-    for j, y in enumerate(friction.T):
-        colour = colour_of(j // each)
+    for j, y in enumerate(np.asarray(result.tangential_force).T):
+        colour = colour_of(j * contacts // result.tangential_force.shape[1])
         panels[0].plot(time, y, "--", color=colour, label="tangential" if j == 0 else None)
     panels[1].axhline(0, color=GREY, lw=0.8)
     panels[-1].set_xlabel(f"impact time [{unit}]")

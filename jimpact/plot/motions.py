@@ -87,11 +87,11 @@ def motion(
             count = len(which) if bodies is None else 0
             if count > _FEW:
                 which = _largest(which, [_range(values[:, i]) for i, _ in which])
-            for c, (i, word) in enumerate(which):
-                axes.plot(course.time, values[:, i], color=colour_of(c), label=word)
+            at, words = zip(*which, strict=True)
+            axes.plot(course.time, values[:, at], label=words)
             if j == 0 and unit == "m" and system is not None:
                 _moving_base(axes, system, motion)
-            what = which[0][1] if len(which) == 1 else ("coordinates", "velocities")[j]
+            what = words[0] if len(which) == 1 else ("coordinates", "velocities")[j]
             axes.set_ylabel(f"{what} [{unit}]" if unit else what)
             _finish(axes, scales.get(unit, 1.0), f"{_FEW} of {count}" if count > _FEW else "")
         for axes in panels[len(units) : -1, j]:
@@ -258,12 +258,12 @@ def _gaps(axes: Axes, motion: Motion, shown: list[int] | None) -> str:
         near = list(np.flatnonzero(least <= far))
         shown = _largest(near, [(closed[:, j].sum(), -least[j]) for j in near])
         note = f"{_FEW} of {values.shape[1]}" if len(near) > _FEW else ""
-    for c, j in enumerate(shown):
+    for j in shown:
         rows = closed[:, j]
         time = np.concatenate([motion.time, np.asarray(events.time)[rows]])
         order = np.argsort(time, kind="stable")
         gap = np.concatenate([values[:, j], np.zeros(rows.sum())])[order]
-        axes.plot(time[order], gap, color=colour_of(c), label=f"contact {j + 1}")
+        axes.plot(time[order], gap, label=f"contact {j + 1}")
     axes.set_ylabel("gaps [m]" if single else "least gap [m]")
     return note
 
@@ -375,15 +375,13 @@ def _range(values: np.ndarray) -> float:
 def draw_body(axes: Axes, body: Body, q: np.ndarray) -> None:
     """A body at q, with what it stands on."""
     point = POINT * (np.ptp(q) or 1.0)
-    curves = [body.outlines(q, point)]
-    floors, ground = [plane_of(*floor) for floor in body.floors], np.zeros((1, 2))
-    set_limits(axes, curves, ground, floors)
-    for points, colour in zip(curves[0], colours_of(body, q, point), strict=True):
+    curves, floors = body.outlines(q, point), [plane_of(*floor) for floor in body.floors]
+    set_limits(axes, [curves], np.zeros((1, 2)), floors)
+    for points, colour in zip(curves, colours_of(body, q, point), strict=True):
         axes.plot(*points.T, color=colour)
-    view = np.array([axes.get_xlim(), axes.get_ylim()])
-    for n, offset in floors:
-        axes.plot(*stretch_of(n, offset, view, ground[0]), color=GREY, lw=2)
-    axes.set(xlim=view[0], ylim=view[1])
+    for angle, offset in body.floors:
+        foot = (-offset * np.sin(angle), offset * np.cos(angle))
+        axes.axline(foot, slope=np.tan(angle), color=GREY, lw=2)
 
 
 def colours_of(body: Body, q: np.ndarray, point: float) -> list[str]:

@@ -16,7 +16,6 @@ from jimpact.plot.style import (
     GREY,
     SMALL,
     by_code,
-    colour_of,
     legend_below,
     mark,
     new_figure,
@@ -231,8 +230,7 @@ def rocking_dispersion(result: RockingDispersion, title: str = "") -> Figure:
     figure, panels = _panels(result, title, r"dispersion $|\dot y_A^+ / \dot y_B^-|$")
     theta, size = np.degrees(result.kinetic_angle), np.abs(result.dispersion)
     for j, axes in enumerate(panels):
-        for k, e in enumerate(np.asarray(result.restitution)):
-            axes.plot(theta, size[:, j, k], color=colour_of(k), lw=1.6, label=f"e = {e:g}")
+        axes.plot(theta, size[:, j], label=[f"e = {e:g}" for e in np.asarray(result.restitution)])
     _critical_lines(panels, result)
     panels[0].set_ylim(bottom=0)  # shared by all, so last
     legend_below(figure, 6)
