@@ -1,6 +1,7 @@
 """Pictures of error against time, of stability, of where laws are valid, and of advice."""
 
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -37,18 +38,9 @@ _LAW_MARKERS = "*phX8d"
 _LEAST = 1e-16  # smaller relative errors are drawn here: rounding
 _DEFAULT = "time"  # what `impact` does: a thick line
 
-# right, flagged, wrong, gains energy, stalls, does not end, not finite, unchecked: Okabe and Ito's
-# colours for returned results, greys for none
-CLASS_COLOURS = (
-    "#009E73",
-    "#56B4E9",
-    "#D55E00",
-    "#CC79A7",
-    "#E69F00",
-    "#999999",
-    "#000000",
-    "#DDDDDD",
-)
+# right, flagged, wrong, gains energy, stalls, does not end, not finite, unchecked: colours for
+# returned results, greys for none
+CLASS_COLOURS = (*(COLOURS[i] for i in (2, 4, 1, 3, 5)), "#999999", "#000000", "#DDDDDD")
 _LABELS = {
     "setting": "setting, 1 finest",
     "restitution": "restitution e",
@@ -111,19 +103,13 @@ def _styles(points: Mapping[str, tuple[Point, ...]]) -> dict[str, dict[str, Any]
     laws = [name for name, row in points.items() if row[0].setting is None]
     methods = [name for name in points if name not in laws]
     styles: dict[str, dict[str, Any]] = {}
-    for number, name in enumerate(methods):
-        default = name == _DEFAULT
-        styles[name] = {
-            "marker": MARKERS[number % len(MARKERS)],
-            "ms": 5,
-            "ls": "-" if number < len(COLOURS) else "--",
-            "lw": 2.6 if default else 1.2,
-            "color": colour_of(number),
-            "zorder": 3 if default else 2,
-        }
-    for number, name in enumerate(laws):
-        marker = _LAW_MARKERS[number % len(_LAW_MARKERS)]
+    for i, (name, marker) in enumerate(zip(methods, cycle(MARKERS))):
+        line = "-" if i < len(COLOURS) else "--"
+        styles[name] = {"marker": marker, "ms": 5, "ls": line, "lw": 1.2, "color": colour_of(i)}
+    for name, marker in zip(laws, cycle(_LAW_MARKERS)):
         styles[name] = {"marker": marker, "ms": 8, "ls": "none", "color": GREY}
+    if _DEFAULT in styles:
+        styles[_DEFAULT] |= {"lw": 2.6, "zorder": 3}
     return styles
 
 
@@ -139,22 +125,28 @@ def _draw(
     axes: Axes, row: tuple[Point, ...], quantity: str, against: str, style: dict[str, Any]
 ) -> None:
     """One line; none where no point has a time or a count, and an error."""
-    points, places, bars = [], [], []
-    for point in row:
-        x, spread = getattr(point, against), (0.0, 0.0)
-        if isinstance(x, Timing):
-            x, low, high = 1e6 * np.array(x)
-            spread = x - low, high - x
-        if x is not None and np.isfinite([x, point.error[quantity]]).all():
-            points.append(point)
-            places.append(x)
-            bars.append(spread)
-    if not points:
+    given = [getattr(point, against) for point in row]
+    spans = [
+        1e6 * np.array(x) if isinstance(x, Timing) else np.full(3, np.nan if x is None else x)
+        for x in given
+    ]
+    x, low, high = np.array(spans).T
+    y = np.maximum([point.error[quantity] for point in row], _LEAST)
+    known = np.isfinite(x) & np.isfinite(y)
+    if not known.any():
         return
-    x, y = np.array(places), np.maximum([p.error[quantity] for p in points], _LEAST)
-    timed = np.array(bars).T if np.any(bars) else None
-    axes.errorbar(x, y, xerr=timed, label=points[0].label, elinewidth=1, capsize=2, **style)
-    failed = np.array([STATUS[CODE[point.status]].failure for point in points])
+    bars = np.array([x - low, high - x])[:, known]
+    label = row[int(np.argmax(known))].label
+    axes.errorbar(
+        x[known],
+        y[known],
+        xerr=bars if bars.any() else None,
+        label=label,
+        elinewidth=1,
+        capsize=2,
+        **style,
+    )
+    failed = known & [STATUS[CODE[point.status]].failure for point in row]
     axes.plot(x[failed], y[failed], **style | {"ls": "none", "mfc": "white", "zorder": 4})
 
 
@@ -299,9 +291,9 @@ def _place(result: StabilityMap, name: str) -> float:
 def _legend_of_classes(figure: Figure, result: StabilityMap) -> None:
     """The classes that occur."""
     codes = [each.codes.ravel() for name in result.methods for each in result.slices[name]]
-    occurring = np.unique(np.concatenate(codes)).tolist()
-    rows = [(CLASS_COLOURS[i], _CLASS_LABELS.get(CLASSES[i], CLASSES[i])) for i in occurring]
-    legend_below(figure, 4, [Patch(color=colour, label=label) for colour, label in rows])
+    labels = [_CLASS_LABELS.get(name, name) for name in CLASSES]
+    occurring = np.unique(np.concatenate(codes))
+    legend_below(figure, 4, [Patch(color=CLASS_COLOURS[i], label=labels[i]) for i in occurring])
 
 
 @styled(ValidityMap)
@@ -399,7 +391,7 @@ def advice(result: Advice, title: str = "", names: Sequence[str] = ()) -> Figure
     bottom.set(yscale="log", ylim=(lowest / 2, 10))
     logarithmic(bottom, "y")
     bottom.set(xlabel="law", ylabel="error of v+ (energy norm)")
-    named = [f"{name}{'' if c.usable else f' ({c.status})'}" for name, c in zip(laws, rows)]
-    bottom.set_xticks(x, [wrapped(name.replace(" ", "_")) for name in named], fontsize=SMALL)
+    named = [name if c.usable else f"{name}_({c.status})" for name, c in zip(laws, rows)]
+    bottom.set_xticks(x, map(wrapped, named), fontsize=SMALL)
     legend_below(figure, 6)
     return figure
