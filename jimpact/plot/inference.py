@@ -11,7 +11,7 @@ from scipy.special import chdtri, ndtri
 
 from jimpact._checks import check_choice, check_kind
 from jimpact.fits.uncertainty import Fit, Profile
-from jimpact.plot.style import COLOURS, GREY, SMALL, new_figure, new_panels, styled
+from jimpact.plot.style import COLOURS, GREY, SMALL, new_figure, new_panels, styled, write
 
 _TITLE = 45  # letters of a line of a panel's title
 _TOP = 3.0  # of a profile's axis, over the limit: only what is below matters
@@ -88,10 +88,8 @@ def correlation(fit: Fit) -> Figure:
     axes.set_yticks(range(count), fit.names)
     if count <= 8:
         for i, j in np.argwhere(np.isfinite(fit.correlation)):
-            dark = abs(fit.correlation[i, j]) > 0.6
-            text = f"{fit.correlation[i, j]:.2f}"
-            colour = "white" if dark else "black"
-            axes.text(j, i, text, ha="center", va="center", color=colour, size=SMALL)
+            colour = "white" if abs(fit.correlation[i, j]) > 0.6 else "black"
+            write(axes, (j, i), f"{fit.correlation[i, j]:.2f}", color=colour)
     figure.colorbar(image, ax=axes, shrink=0.8, label="correlation")
     return figure
 
@@ -127,9 +125,8 @@ def residuals(fit: Fit) -> Figure:
     scaled = fit.residual[here] / (noise if known else 1.0)
     unit = "standard errors" if known else "as measured"
     figure, (first, second, third) = new_panels(3, 3.0)
-    values = (
-        "" if fit.experiments is None else f" [{', '.join(dict.fromkeys(fit.experiments.units))}]"
-    )
+    units = [] if fit.experiments is None else dict.fromkeys(fit.experiments.units)
+    values = f" [{', '.join(units)}]" if units else ""
     style: dict[str, Any] = {"ls": "none", "marker": "o", "mfc": "none", "ms": 4}
     first.axline((float(measured[here].mean()),) * 2, slope=1.0, color=GREY, lw=0.8)
     first.plot(fit.predicted[here], measured[here], color=COLOURS[0], **style)
@@ -194,16 +191,12 @@ def corner(fit: Fit, draws: Any = None, names: Sequence[str] | None = None) -> F
     count = len(shown)
     height = float(np.clip(1.6 * count + 0.8, 3.0, 7.2))
     figure, grid = new_figure(height, "", count, count, squeeze=False, sharex="col")
-    for row, i in enumerate(shown):
-        for column, j in enumerate(shown):
-            axes = grid[row, column]
-            if column > row:
-                axes.remove()
-                continue
-            if column == row:
-                _one(axes, fit, i, values)
-            else:
-                _pair(axes, fit, j, i, values)
+    for above in grid[np.triu_indices(count, 1)]:
+        above.remove()
+    for k, i in enumerate(shown):
+        _one(grid[k, k], fit, i, values)
+        for axes, j in zip(grid[k, :k], shown):
+            _pair(axes, fit, j, i, values)
     for axes, i in zip(grid[-1], shown):
         axes.set_xlabel(fit.names[i])
     for axes, name in zip(grid[:, 0], ["density", *(fit.names[i] for i in shown[1:])]):
@@ -227,12 +220,11 @@ def _drawn(fit: Fit, draws: Any) -> np.ndarray:
 
 def _one(axes: Axes, fit: Fit, i: int, values: np.ndarray | None) -> None:
     """The density of one parameter."""
-    x = fit.value[i] + fit.standard_error[i] * np.linspace(-_WIDE, _WIDE, 121)
-    z = (x - fit.value[i]) / fit.standard_error[i]
-    density = np.exp(-0.5 * z**2) / (fit.standard_error[i] * np.sqrt(2 * np.pi))
+    z, error = np.linspace(-_WIDE, _WIDE, 121), fit.standard_error[i]
+    density = np.exp(-0.5 * z**2) / (error * np.sqrt(2 * np.pi))
     if values is not None:
         axes.hist(values[:, i], bins="auto", density=True, color=COLOURS[4], alpha=0.5)
-    axes.plot(x, density, color=COLOURS[0], lw=1.2)
+    axes.plot(fit.value[i] + error * z, density, color=COLOURS[0], lw=1.2)
     axes.set_yticks([])
 
 

@@ -13,7 +13,7 @@ from jimpact.bodies.assembly import Bodies
 from jimpact.bodies.base import Body, projected
 from jimpact.motion.system import System
 from jimpact.plot.motions import draw_body
-from jimpact.plot.style import COLOURS, GREY, SMALL, colour_of, new_figure, styled
+from jimpact.plot.style import COLOURS, GREY, colour_of, new_figure, styled, write
 from jimpact.scene import PairNormals, Scene, as_velocity
 
 _GAP = 0.5  # how wide an open contact is drawn, in radii of the largest body
@@ -108,9 +108,8 @@ def force_chains(pile: Bodies, q: Any, scene: Scene, impulse: Any, title: str = 
     lines = np.stack([centres[first], ends], axis=1)[drawn]
     lines = lines if d == 2 else projected(lines)
     widths = _THICKEST * size[drawn]
-    axes.add_collection(
-        LineCollection(list(lines), linewidths=widths, colors=COLOURS[0], alpha=0.8)
-    )
+    chains = LineCollection(list(lines), linewidths=widths, colors=COLOURS[0], alpha=0.8)
+    axes.add_collection(chains)
     axes.autoscale_view()
     axes.set(xlabel="x [m]", ylabel="height [m]", aspect="equal")
     return figure
@@ -144,9 +143,9 @@ def _row(axes: Axes, scene: Scene, velocity: np.ndarray) -> None:
     for i, (x, r, v) in enumerate(zip(centre, radius, velocity, strict=True)):
         colour = colour_of(i)
         axes.add_patch(Circle((x, 0.0), r, fc=colour, alpha=0.35, ec=colour))
-        axes.text(x, 0.0, f"{i + 1}", ha="center", va="center")
-        axes.text(x, -1.35, f"{mass[i]:.3g} kg", ha="center", va="center", fontsize=SMALL)
-        axes.text(x, 1.75, f"{v:.3g} m/s", ha="center", va="center", fontsize=SMALL)
+        write(axes, (x, 0.0), f"{i + 1}", fontsize="medium")
+        write(axes, (x, -1.35), f"{mass[i]:.3g} kg")
+        write(axes, (x, 1.75), f"{v:.3g} m/s")
         if v:
             tip = x + _ARROW * v / fastest / 2
             arrow = {"arrowstyle": "-|>", "color": colour, "lw": 2}

@@ -70,15 +70,13 @@ def admissible_set(
     >>> len(ji.plot.admissible_set(result, {"Newton's cradle": [0.0, 0.0, 1.0]}).axes)
     1
     """
-    marked = {}
-    for name, velocity in (outcomes or {}).items():
-        v = np.asarray(velocity, float)
+    marked = {name: np.asarray(v, float) for name, v in (outcomes or {}).items()}
+    for name, v in marked.items():
         if v.shape != (result.scene.size,):
             raise ValueError(
                 f"Argument `outcomes` must have arrays of shape ({result.scene.size},), but "
                 f"{name!r} has shape {v.shape}."
             )
-        marked[name] = v
     closed = np.flatnonzero(np.asarray(result.scene.closed))
     plane = result.dimension == 2 and len(closed) == 2
     closed = closed if len(closed) else np.arange(result.scene.contacts)
@@ -173,24 +171,24 @@ def _projections(
     """Samples of the set in pairs of normalized gap velocities."""
     contacts = closed[:_MOST_CONTACTS]
     samples = result.sample(0, _SAMPLES)
-    unit = np.asarray(result.scene.normals / kinetic_norm(result.scene)[None, :], float)[
-        :, contacts
-    ]
+    norm = np.asarray(kinetic_norm(result.scene), float)
+    unit = (np.asarray(result.scene.normals, float) / norm)[:, contacts]
     cloud, energies = samples @ unit, _energy_ratio(result, samples)
     pairs = list(combinations(range(len(contacts)), 2)) or [(0, 0)]
     figure, grid = new_panels(len(pairs), 3.1, 0.8, title)
+    energy = "energy ratio $T^+ / T^-$"
     for axes, (i, j) in zip(grid, pairs):
         single = i == j
         y = energies if single else cloud[:, j]
-        dots = axes.scatter(cloud[:, i], y, c=energies, s=5, cmap="viridis", lw=0, vmin=0, vmax=1)
+        dots = axes.scatter(cloud[:, i], y, c=energies, s=5, lw=0, vmin=0, vmax=1)
         for k, (name, v) in enumerate(marked.items()):
             point = v @ unit
             height = _energy_ratio(result, v) if single else point[j]
             mark(axes, (point[i], height), name, k, bool(result.contains(v)))
-        axes.set_xlabel(_gap_label(contacts[i]), fontsize=SMALL)
-        energy = "energy ratio $T^+ / T^-$"
-        axes.set_ylabel(energy if single else _gap_label(contacts[j]), fontsize=SMALL)
-    figure.colorbar(dots, ax=grid.tolist(), label="energy ratio $T^+ / T^-$")
+        labels = [f"normalized gap velocity {contacts[c] + 1} after [√J]" for c in (i, j)]
+        axes.set_xlabel(labels[0], fontsize=SMALL)
+        axes.set_ylabel(energy if single else labels[1], fontsize=SMALL)
+    figure.colorbar(dots, ax=grid.tolist(), label=energy)
     legend_below(figure, 4)
     return figure
 
@@ -199,11 +197,6 @@ def _energy_ratio(result: AdmissibleSet, velocity: np.ndarray) -> np.ndarray:
     """T+ / T- (...,) of velocities (..., n)."""
     energy = 0.5 * np.sum(velocity @ dense_mass(result.scene) * velocity, axis=-1)
     return energy / result.energy if result.energy else np.ones_like(energy)
-
-
-def _gap_label(contact: int) -> str:
-    """The label of an axis."""
-    return f"normalized gap velocity {contact + 1} after [√J]"
 
 
 @styled(RockingDispersion)
