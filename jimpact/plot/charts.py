@@ -27,10 +27,9 @@ from jimpact.plot.style import (
     logarithmic,
     new_figure,
     new_panels,
+    panels_of_laws,
     side_by_side,
     styled,
-    velocities_by_unit,
-    wrapped,
 )
 from jimpact.status import CODE, STATUS
 
@@ -364,34 +363,29 @@ def advice(result: Advice, title: str = "", names: Sequence[str] = ()) -> Figure
     2
     """
     laws, rows = list(result.candidates), list(result.candidates.values())
-    units, x = velocities_by_unit(result.scene, names), np.arange(len(laws))
+    named = [name if c.usable else f"{name}_({c.status})" for name, c in zip(laws, rows)]
+    figure, tops, bottom = panels_of_laws(named, result.scene, names, "", 1.8)
     verdict = f"{'within' if result.within else 'not within'} {share(result.tolerance)}"
-    height, ratios = 4.5 + 2.0 * len(units), [3.0] * len(units) + [2.0]
-    figure, panels = new_figure(height, "", len(ratios), 1, sharex=True, height_ratios=ratios)
-    *tops, bottom = panels
-    tops[0].set_title(f"{title}\n{as_code(result.law)}: {verdict}", fontsize="large")
-    for top, (unit, velocities) in zip(tops, units.items()):
+    figure.axes[0].set_title(f"{title}\n{as_code(result.law)}: {verdict}", fontsize="large")
+    x = np.arange(len(laws))
+    for top, velocities in tops:
         for (i, word, factor), offset in zip(velocities, side_by_side(len(velocities))):
             label = word if len(velocities) <= len(COLOURS) else None
             v, low, high = factor * np.array([(c.velocity[i], c.low[i], c.high[i]) for c in rows]).T
             top.vlines(x + offset, low, high, color=colour_of(i), lw=4, alpha=0.4)
             top.plot(x + offset, v, "o", color=colour_of(i), label=label)
-        top.set_ylabel(unit)
     chosen = laws.index(result.name)
-    for axes in panels:
-        axes.axvspan(chosen - 0.5, chosen + 0.5, color=HIGHLIGHT, lw=0)
-        axes.grid(False, axis="x")
+    for axes in figure.axes:
+        label = "advised" if axes is bottom else None
+        axes.axvspan(chosen - 0.5, chosen + 0.5, color=HIGHLIGHT, lw=0, label=label)
     lowest = result.tolerance / 1000
     worst, median = np.maximum(np.array([(c.worst, c.median) for c in rows]).T, lowest)
-    bottom.patches[0].set_label("advised")
     bottom.vlines(x, median, worst, color=GREY, lw=1)
     bottom.plot(x, worst, "s", color="black", label="worst")
     bottom.plot(x, median, "_", color="black", ms=14, label="median")
     bottom.axhline(result.tolerance, color=COLOURS[1], lw=1, label="tolerance")
     bottom.set(yscale="log", ylim=(lowest / 2, 10))
     logarithmic(bottom, "y")
-    bottom.set(xlabel="law", ylabel="error of v+ (energy norm)")
-    named = [name if c.usable else f"{name}_({c.status})" for name, c in zip(laws, rows)]
-    bottom.set_xticks(x, map(wrapped, named), fontsize=SMALL)
+    bottom.set_ylabel("error of v+ (energy norm)")
     legend_below(figure, 6)
     return figure

@@ -15,21 +15,18 @@ from jimpact.plot.style import (
     COLOURS,
     GREY,
     HIGHLIGHT,
-    SMALL,
     colour_of,
     legend_below,
     mark,
     new_figure,
+    panels_of_laws,
     side_by_side,
     styled,
-    velocities_by_unit,
-    wrapped,
     write,
 )
 from jimpact.theory.admissible import admissible_set
 from jimpact.theory.dispersion import energy_dispersion, energy_ratio
 
-_UPRIGHT = 8  # names that stand side by side, at most
 _OUTCOMES = 4000  # dots of a set of outcomes; ten times more would only be one area
 
 
@@ -66,13 +63,11 @@ def comparison(
     """
     if measured is not None:
         result = dataclasses.replace(result, measured=np.asarray(measured))
-    entries, units = list(result.entries.values()), velocities_by_unit(result.scene, names)
-    height, ratios = 4.2 + 1.8 * len(units), [3.0] * len(units) + [1.4]
-    figure, panels = new_figure(height, title, len(ratios), 1, sharex=True, height_ratios=ratios)
-    *tops, bottom = panels
+    laws, entries = list(result.entries), list(result.entries.values())
+    figure, tops, bottom = panels_of_laws(laws, result.scene, names, title, 1.2)
     at, velocity = np.arange(len(entries)), np.array([x.outcome.velocity for x in entries])
     wrong = ~np.array([bool(entry.audit.consistent) for entry in entries])
-    for top, (unit, velocities) in zip(tops, units.items()):
+    for top, velocities in tops:
         for (i, label, factor), offset in zip(velocities, side_by_side(len(velocities))):
             x, y, colour = at + offset, factor * velocity[:, i], colour_of(i)
             top.plot(x, y, "o", color=colour, label=label)
@@ -81,7 +76,6 @@ def comparison(
                 level = [factor * result.measured[i]] * 2
                 top.plot([-0.5, len(at) - 0.5], level, "--", color=colour, lw=1, zorder=0)
         top.axhline(0, color="black", lw=0.6)
-        top.set_ylabel(unit)
     if result.measured is not None:
         bottom.plot([], [], "--", color="black", lw=1, label="measured")
     if wrong.any():
@@ -89,14 +83,10 @@ def comparison(
     kept, spread = [x.energy_ratio for x in entries], [x.dispersion_index for x in entries]
     bottom.bar(at - 0.18, kept, 0.32, color=GREY, label="energy ratio T+/T-")
     bottom.bar(at + 0.18, spread, 0.32, color=COLOURS[4], label="dispersion index")
-    bottom.set(xlabel="law", ylabel="ratio, index")
-    many = len(at) > _UPRIGHT
-    labels = [name if many else wrapped(name) for name in result.entries]
-    bottom.set_xticks(at, labels, fontsize=SMALL, rotation=90 if many else 0)
-    for axes in panels:
-        axes.grid(False, axis="x")
-        for name in result.closest:
-            place, label = list(result.entries).index(name), "closest to the measured velocities"
+    bottom.set_ylabel("ratio, index")
+    for place in map(laws.index, result.closest):
+        label = "closest to the measured velocities"
+        for axes in figure.axes:
             axes.axvspan(place - 0.48, place + 0.48, color=HIGHLIGHT, lw=0, zorder=-1, label=label)
     legend_below(figure, 4)
     return figure
