@@ -9,7 +9,7 @@ import numpy as np
 from jimpact._checks import check_values
 from jimpact.files.records import Column, Table, Tabular, as_data, fields_as_data
 from jimpact.law import Law
-from jimpact.montecarlo.plan import Run
+from jimpact.montecarlo.samples import Run
 from jimpact.montecarlo.statistics import (
     IN_MEMORY,
     OUTCOMES,

@@ -18,8 +18,8 @@ import numpy as np
 from jimpact._checks import check_executor, in_common_dtype, needed
 from jimpact.law import Law
 from jimpact.montecarlo.gaps import gap_scale
-from jimpact.montecarlo.plan import Run, Sources, planned_run
 from jimpact.montecarlo.result import MonteCarlo, result_of
+from jimpact.montecarlo.samples import Run, Sources, planned_run
 from jimpact.montecarlo.statistics import Chunk, Task, joined
 from jimpact.montecarlo.store import Store
 from jimpact.progress import counting_bar

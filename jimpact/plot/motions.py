@@ -202,16 +202,14 @@ class _Course(NamedTuple):
 def course_of(motion: Motion) -> _Course:
     """The samples and events of a motion in the order of time."""
     events, rows = motion.events, np.asarray(motion.events.kind) > 0
-    at, place = np.asarray(events.time)[rows], np.asarray(events.q)[rows]
-    jumps = [np.asarray(x)[rows] for x in (events.velocity_before, events.velocity_after)]
-    time = np.concatenate([motion.time, at, at])
-    q = np.concatenate([motion.q, place, place])
-    v = np.concatenate([motion.velocity, *jumps])
-    state = np.repeat([0, 1, 2], [len(motion.time), rows.sum(), rows.sum()])
-    # events at one time: before and after of the first, then of the second
-    number = np.concatenate([np.full(len(motion.time), -1), *(2 * [np.arange(rows.sum())])])
-    order = np.lexsort((state, number, time))
-    return _Course(time[order], q[order], v[order], state[order] == 2)
+    jumps = np.stack([events.velocity_before, events.velocity_after], axis=1)[rows]
+    time = np.concatenate([motion.time, np.repeat(np.asarray(events.time)[rows], 2)])
+    q = np.concatenate([motion.q, np.repeat(np.asarray(events.q)[rows], 2, axis=0)])
+    v = np.concatenate([motion.velocity, jumps.reshape(-1, jumps.shape[-1])])
+    after = np.arange(len(time)) - len(motion.time) + 1
+    # stable: of events at one time before and after of the first, then of the second
+    order = np.argsort(time, kind="stable")
+    return _Course(time[order], q[order], v[order], (after[order] > 0) & (after[order] % 2 == 0))
 
 
 def base_path(system: System, time: np.ndarray) -> np.ndarray:
