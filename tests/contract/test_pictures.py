@@ -6,10 +6,7 @@ costs seconds.
 
 import numpy as np
 import pytest
-from pictures_cases import force_chains, samples
-
-import jimpact as ji
-from jimpact.methods.advice_report import Advice, Candidate
+from pictures_cases import block_and_its_pictures, force_chains, samples
 
 
 def test_force_chains_are_as_thick_as_impulses():
@@ -24,20 +21,6 @@ def test_force_chains_are_as_thick_as_impulses():
 def test_a_histogram_is_in_per_cent():
     bars = samples(True).axes[0].patches[0].get_data().values
     assert bars.sum() == pytest.approx(100.0)
-
-
-def block_and_its_pictures():
-    """A block on both corners, which turns and moves, and the pictures of one law for it."""
-    block, before = ji.Block(0.2, 0.6, corners="base"), np.array([0.5, -1.0, 2.0])
-    scene, law = block.scene(), ji.Newton(0.5)
-    comparison = ji.compare(scene, before, {"newton": law})
-    after = np.asarray(comparison.entries["newton"].outcome.velocity)
-    row, none = Candidate(law, scene, after, after, after, 0.1, 0.2, "ok"), np.zeros(2)
-    advice = Advice(
-        "newton", 0.5, True, "newton", before, none, {"newton": row}, (), none, (), 1, None
-    )
-    pictures = (ji.plot.comparison, comparison), (ji.plot.advice, advice)
-    return block, scene, after, pictures
 
 
 def test_metres_and_radians_a_second_have_axes_of_their_own():
