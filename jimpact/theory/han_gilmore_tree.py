@@ -78,24 +78,20 @@ class _Problem:
         return float(np.max(-node.state[: self.contacts][self.closed], initial=0.0))
 
 
-class _VisitedStates:
-    """Velocities visited so far, sorted into cells by a generic weighted sum."""
+Cells = dict[int, list[np.ndarray]]
 
-    def __init__(self, first: np.ndarray):
-        """With one state."""
-        self._weights = np.sqrt(np.arange(2.0, len(first) + 2))
-        self._width = 2 * ZERO * float(self._weights.sum())  # equal ones are in adjacent cells
-        self._cells: dict[int, list[np.ndarray]] = {}
-        self.add(first)
 
-    def add(self, qn: np.ndarray) -> bool:
-        """Whether `qn` is new; then it is added."""
-        cell = int(np.floor(qn @ self._weights / self._width))
-        near = [old for k in (cell - 1, cell, cell + 1) for old in self._cells.get(k, [])]
-        if any(np.abs(old - qn).max() <= ZERO for old in near):
-            return False
-        self._cells.setdefault(cell, []).append(qn)
-        return True
+def _is_new(state: np.ndarray, visited: Cells) -> bool:
+    """Whether a state was not visited; it is now. Cells are those of a generic weighted sum."""
+    weights = np.sqrt(np.arange(2.0, len(state) + 2))
+    cell = int(
+        np.floor(state @ weights / (2 * ZERO * weights.sum()))
+    )  # that of equal ones, or next to it
+    near = [old for k in (cell - 1, cell, cell + 1) for old in visited.get(k, [])]
+    if any(np.abs(old - state).max() <= ZERO for old in near):
+        return False
+    visited.setdefault(cell, []).append(state)
+    return True
 
 
 def han_gilmore(
@@ -156,13 +152,14 @@ def han_gilmore(
         return [HanGilmoreOutcome(v, start.p[:m], (), start.p[m:])]
     start.state = state / size
     found: list[_Node] = []
-    frontier, visited = [start], _VisitedStates(start.state)
+    frontier, visited = [start], Cells()
+    _is_new(start.state, visited)
     while frontier:
         following: list[_Node] = []
         for node in frontier:
             for child in _impacts(problem, node):
                 approach = problem.approach(child)
-                if visited.add(child.state):
+                if _is_new(child.state, visited):
                     (found if approach <= ZERO else following).append(child)
                 if ROUNDING < approach <= ZERO:
                     for other in found:

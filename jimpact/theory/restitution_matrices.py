@@ -68,7 +68,8 @@ def margin(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
     fixed = jax.lax.stop_gradient(q)
     largest = jnp.abs(fixed).max()
     fixed = fixed / jnp.where(largest > 0, largest, 1.0)
-    supports = _supports(m).astype(q.dtype)
+    # all nonempty sets of indices, as rows of zeros and ones
+    supports = ((np.arange(1, 2**m)[:, None] >> np.arange(m)) & 1).astype(q.dtype)
     inside = supports[:, :, None] * supports[:, None, :]
     outside = (m + 1.0) * (1 - supports)  # above every eigenvalue of Q_SS, which are at most m
     blocks = inside * fixed[None] + outside[:, :, None] * jnp.eye(m, dtype=q.dtype)[None]
@@ -126,11 +127,6 @@ def _size(matrix: jax.Array) -> int:
             f"enumerated, but has {shape[0]}."
         )
     return int(shape[0])
-
-
-def _supports(m: int) -> np.ndarray:
-    """All nonempty subsets of m indices as rows of zeros and ones."""
-    return (np.arange(1, 2**m)[:, None] >> np.arange(m)[None, :]) & 1
 
 
 _compiled_margin = jax.jit(margin)
