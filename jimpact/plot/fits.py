@@ -27,7 +27,7 @@ def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> F
     """Velocities after every shot, or what else was measured, and fitted, above the residuals.
 
     Error bars are sigma where the data state it, else the estimated noise. `others` are further
-    fits of the same data, by label, drawn in grey.
+    fits of the same data, by label, drawn in grey. Each unit has a column of its own.
 
     Args:
         fit: of shots, of a motion, or of what else was measured.
@@ -52,26 +52,31 @@ def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> F
     dodge = side_by_side(bodies)
     x = np.arange(shots)[:, None] + dodge[None, :]
     size = float(np.clip(220 / (shots * bodies), 3, 8))
-    unit = "" if data is None else " m/s"
-    heading = title or f"{type(fit.law).__name__}, rms {fit.rms:.3g}{unit}"
-    figure, (top, bottom) = new_figure(6.0, heading, 2, 1, sharex=True, height_ratios=(3, 1.4))
-    error = _error_bars(fit)
-    for i in range(bodies):
-        colour = colour_of(i)
-        bars = None if error is None else error[:, i]
-        style: dict[str, Any] = {"fmt": "o", "mfc": "none", "color": colour, "ms": size, "lw": 1}
-        top.errorbar(x[:, i], measured[:, i], bars, **style)
-        top.plot(x[:, i], predicted[:, i], "_", color=colour, ms=2.2 * size, mew=2)
-        bottom.errorbar(x[:, i], (measured - predicted)[:, i], bars, **style)
-    for j, other in enumerate((others or {}).values()):
-        top.plot(x, _in_rows(other.predicted), "x+*"[j % 3], color=GREY, ms=0.8 * size)
-    units = "" if data is None else f" [{', '.join(dict.fromkeys(data.units))}]"
-    top.set_ylabel(f"{'measured value' if data is None else 'velocity after the impact'}{units}")
-    bottom.set_ylabel(f"measured − fitted{units}")
-    bottom.axhline(0, color=GREY, lw=0.8)
-    _shot_axis(bottom, fit, dodge)
+    speed = "" if data is None else " m/s"
+    heading = title or f"{type(fit.law).__name__}, rms {fit.rms:.3g}{speed}"
+    what = "measured value" if data is None else "velocity after the impact"
+    each = [""] * bodies if data is None else list(data.units)
+    units, error = list(dict.fromkeys(each)), _error_bars(fit)
+    grid: Any = {"sharex": True, "squeeze": False, "height_ratios": (3, 1.4)}
+    figure, panels = new_figure(6.0, heading, 2, len(units), **grid)
+    for (top, bottom), unit in zip(panels.T, units):
+        members = [i for i, own in enumerate(each) if own == unit]
+        for i in members:
+            bars = None if error is None else error[:, i]
+            style: dict[str, Any] = {"fmt": "o", "mfc": "none", "ms": size, "lw": 1}
+            style["color"] = colour_of(i)
+            top.errorbar(x[:, i], measured[:, i], bars, **style)
+            top.plot(x[:, i], predicted[:, i], "_", color=colour_of(i), ms=2.2 * size, mew=2)
+            bottom.errorbar(x[:, i], (measured - predicted)[:, i], bars, **style)
+        for j, other in enumerate((others or {}).values()):
+            values = _in_rows(other.predicted)[:, members]
+            top.plot(x[:, members], values, "x+*"[j % 3], color=GREY, ms=0.8 * size)
+        top.set_ylabel(f"{what} [{unit}]" if unit else what)
+        bottom.set_ylabel(f"measured − fitted [{unit}]" if unit else "measured − fitted")
+        bottom.axhline(0, color=GREY, lw=0.8)
+        _shot_axis(bottom, fit, dodge)
     _legend(figure, fit, others or {}, error is not None)
-    for axes in (top, bottom):
+    for axes in figure.axes:
         axes.grid(False, axis="x")
     return figure
 

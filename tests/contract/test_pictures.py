@@ -6,7 +6,10 @@ costs seconds.
 
 import numpy as np
 import pytest
+from canned import canned
 from pictures_cases import block_and_its_pictures, force_chains, samples
+
+import jimpact as ji
 
 
 def test_force_chains_are_as_thick_as_impulses():
@@ -38,3 +41,12 @@ def test_metres_and_radians_a_second_have_axes_of_their_own():
             np.testing.assert_allclose(drawn, wanted)
         with pytest.raises(ValueError, match="`names` must have 3 names"):
             picture(result, names=["x [m]"])
+
+
+def test_measured_metres_and_radians_a_second_have_columns_of_their_own():
+    data = ji.Experiments([1.0, 0.0], [0.2, 0.8], units=["m/s", "rad/s"])
+    problem = ji.FitProblem.from_shots(ji.Newton(0.5), ji.chain([1.0, 1.0]), data)
+    moves, turns, *residuals = ji.plot.fit(canned(1, problem=problem)).axes
+    for axes, unit in ((moves, "m/s"), (turns, "rad/s")):
+        assert axes.get_ylabel() == f"velocity after the impact [{unit}]"
+    assert residuals[1].get_ylabel() == "measured − fitted [rad/s]"
