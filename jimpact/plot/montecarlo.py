@@ -19,8 +19,9 @@ def monte_carlo(result: MonteCarlo, title: str = "") -> Figure:
     """Histograms of every body, and the first samples over two gaps, coloured by the outcome.
 
     Gaps are over the indentation of the contact (delta_c of `ji.theory.gap_scale`), where it is
-    known. The map shows the two gaps that vary most and the most scattered velocity; with one
-    random gap, that velocity against it; without, no map.
+    known. The velocities of a chain share an axis; others may be in m/s or in rad/s. The map shows
+    the two gaps that vary most and the most scattered velocity; with one random gap, that velocity
+    against it; without, no map.
 
     Args:
         result: what `ji.monte_carlo` returned.
@@ -46,15 +47,22 @@ def monte_carlo(result: MonteCarlo, title: str = "") -> Figure:
     figure = Figure(figsize=(WIDTH, max(4.8, 1.5 * len(bodies))))
     figure.suptitle(title or textwrap.fill(result.description, 80), x=0.01, ha="left")
     panels = figure.subplot_mosaic(mosaic)
+    unit = _unit(result)
     for body in bodies:
         axes = panels[str(body)]
-        axes.sharex(panels[str(bodies[0])])
+        if unit == "m/s":
+            axes.sharex(panels[str(bodies[0])])
+            axes.tick_params(labelbottom=body == bodies[-1])
         _histogram(axes, result, body)
-        axes.tick_params(labelbottom=body == bodies[-1])
-    axes.set_xlabel("velocity after the impact [m/s]\n(dot: mean, bar: 5 % to 95 %)")
+    axes.set_xlabel(f"velocity after the impact [{unit}]\n(dot: mean, bar: 5 % to 95 %)")
     if mapped:
         _map(panels["map"], result, int(scattered[0]))
     return figure
+
+
+def _unit(result: MonteCarlo) -> str:
+    """Of velocities: m/s of a chain; others may turn."""
+    return "m/s" if result.run.scene.walls is not None else "m/s or rad/s"
 
 
 def _histogram(axes: Axes, result: MonteCarlo, body: int) -> None:
@@ -73,7 +81,7 @@ def _histogram(axes: Axes, result: MonteCarlo, body: int) -> None:
     axes.plot([low, high], [height, height], "|-", color="black", ms=7, lw=1)
     axes.plot(mean, height, "o", color="black", ms=4)  # it may lie outside that range
     axes.set_ylim(0, 1.12 * height)
-    label = f"body {body + 1}: mean {mean:.3f}, std {result.std[body]:.3f} m/s"
+    label = f"body {body + 1}: mean {mean:.3f}, std {result.std[body]:.3f} {_unit(result)}"
     axes.set_title(label, fontsize=SMALL, color=colour)
     axes.set_ylabel("samples [%]")
     axes.grid(False, axis="x")
@@ -90,7 +98,7 @@ def _map(axes: Axes, result: MonteCarlo, body: int) -> None:
     axes.set_xlabel(x[0][1])
     axes.set_title(f"{fine.sum():,} samples", fontsize=SMALL)
     axes.grid(False)
-    label = f"velocity of body {body + 1} [m/s]"
+    label = f"velocity of body {body + 1} [{_unit(result)}]"
     if len(gaps) == 1:
         axes.plot(x[0][0], velocity, ".", ms=3, color=colour_of(body))
         axes.set_ylabel(label)

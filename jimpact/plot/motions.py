@@ -120,13 +120,12 @@ def _finish(axes: Axes, scale: float, note: str = "") -> None:
 
 def _scales(labels: list[str], motion: Motion) -> dict[str, float]:
     """Sizes of the values of each unit; of rates what would change these over the motion."""
-    scales = {"rad": 1.0, "m": float(np.nanmax(np.abs(motion.gaps), initial=0.0))}
-    for label, values in zip(labels, np.asarray(motion.q).T, strict=True):
+    scales = {"m": float(np.nanmax(np.abs(motion.gaps), initial=0.0))}
+    sizes = np.nanmax(np.abs(motion.q), axis=0, initial=0.0).tolist()
+    for label, size in zip(labels, sizes, strict=True):
         unit = split_name(label)[1]
-        if unit != "rad":
-            largest = float(np.nanmax(np.abs(values), initial=0.0))
-            scales[unit] = max(scales.get(unit, 0.0), largest)
-    scales = {unit: size or 1.0 for unit, size in scales.items()}
+        scales[unit] = max(scales.get(unit, 0.0), size)
+    scales = {unit: size or 1.0 for unit, size in scales.items()} | {"rad": 1.0}
     duration = _range(np.asarray(motion.time)) or 1.0
     return scales | {f"{unit}/s": size / duration for unit, size in scales.items()}
 
