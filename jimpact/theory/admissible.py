@@ -1,7 +1,7 @@
 """All outcomes of an impact that mechanics allows, whatever the law."""
 
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -217,11 +217,10 @@ def admissible_set(scene: Scene, velocity: Any) -> AdmissibleSet:
     unit = unit / np.linalg.norm(unit, axis=0)
     approach = unit.T @ y < -_APPROACH * np.finfo(scene.mass.dtype).eps * np.linalg.norm(y)
     energy = 0.5 * float(y @ y)
+    outcomes = partial(AdmissibleSet, scene, start, energy=energy, tolerance=tolerance)
     if not approach.any():
         alone = CappedPolyhedron(np.zeros((0, 0)), np.zeros(0), 0.0)
-        return AdmissibleSet(
-            scene, start, start, np.zeros((len(start), 0)), alone, energy, tolerance
-        )
+        return outcomes(centre=start, axes=np.zeros((len(start), 0)), coordinates=alone)
     unit = free @ unit
     floor = _SINGULAR * np.finfo(scene.mass.dtype).eps * unit.shape[1]
     unit = unit[:, np.sum(unit**2, axis=0) > floor]  # not what the constraints hold anyway
@@ -235,15 +234,8 @@ def admissible_set(scene: Scene, velocity: Any) -> AdmissibleSet:
     redundant = basis.shape[1] < unit.shape[1]
     part, centre, axes = capped_polyhedron(rows, offset, float(np.linalg.norm(before)), redundant)
     rest = y - basis @ before + basis @ centre
-    return AdmissibleSet(
-        scene,
-        start,
-        np.linalg.solve(root.T, rest),
-        np.linalg.solve(root.T, basis @ axes),
-        part,
-        energy,
-        tolerance,
-    )
+    centre, axes = np.linalg.solve(root.T, rest), np.linalg.solve(root.T, basis @ axes)
+    return outcomes(centre=centre, axes=axes, coordinates=part)
 
 
 def _unconstrained(scene: Scene, root: np.ndarray, y: np.ndarray, tolerance: float) -> np.ndarray:

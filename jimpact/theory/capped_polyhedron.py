@@ -231,12 +231,10 @@ def cone_facets(generators: np.ndarray) -> np.ndarray:
     if rank == 1:  # hulls begin with two dimensions
         return unit[:, :1] if np.ptp(unit) == 0 else np.zeros((0, 1))
     outward = ConvexHull(np.vstack([np.zeros(rank), unit.T])).equations
-    through_origin = outward[np.abs(outward[:, -1]) <= _INDEPENDENT, :-1]
-    facets: list[np.ndarray] = []
-    for normal in -through_origin:  # a facet that is no simplex is reported in parts
-        if not any(np.linalg.norm(normal - known) <= _INDEPENDENT for known in facets):
-            facets.append(normal)
-    return np.array(facets).reshape(-1, rank)
+    normals = -outward[np.abs(outward[:, -1]) <= _INDEPENDENT, :-1]
+    # a facet that is no simplex is reported in parts; one that stays twice does no harm
+    _, first = np.unique(np.round(normals / _INDEPENDENT), axis=0, return_index=True)
+    return normals[np.sort(first)]
 
 
 def _chord(points: np.ndarray, steps: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
