@@ -46,8 +46,10 @@ class Sources(eqx.Module):
     @property
     def random(self) -> dict[str, bool]:
         """Which of the sources differ from sample to sample."""
-        constant = type(None), jax.Array, Law
-        return {name: not isinstance(x, constant) for name, x in vars(self).items()}
+        return {
+            name: not (x is None or isinstance(x, Law) or getattr(x, "ndim", 0) == 1)
+            for name, x in vars(self).items()
+        }
 
 
 @precise_jit
