@@ -155,13 +155,12 @@ class MonteCarlo(Tabular):
         lines = []
         for j, mean in enumerate(self.gap_mean):
             std = np.sqrt(self.gap_covariance[j, j])
-            line = f"gap {j + 1}: mean {mean:.4g} m, std {std:.4g} m"
+            lines.append(f"gap {j + 1}: mean {mean:.4g} m, std {std:.4g} m")
             if self.gap_scale is not None:
                 scale = self.gap_scale[j]
-                line += f"; in units of delta_c = {scale:.3g} m: "
-                line += f"{mean / scale:.3g} and {std / scale:.3g}"
-            lines.append(line)
-        return lines if self.gap_scale is None or not lines else [*lines, DELTA_C]
+                lines[-1] += f"; in units of delta_c = {scale:.3g} m: "
+                lines[-1] += f"{mean / scale:.3g} and {std / scale:.3g}"
+        return [*lines, DELTA_C] if lines and self.gap_scale is not None else lines
 
     def _status_lines(self) -> list[str]:
         """How often each status occurred, and the first failed samples."""
