@@ -193,8 +193,8 @@ def stability_map(result: StabilityMap, title: str = "") -> Figure:
     for i, (axes, name) in enumerate(zip(grid, names)):
         _draw_classes(axes, np.array([result.slices[method][i].codes for method in result.methods]))
         _ticks(axes, "x", name, result.axes[name])
-        labels = result.methods if i % COLUMNS == 0 else [""] * len(result.methods)
-        axes.set_yticks(range(len(result.methods)), labels, fontsize=SMALL)
+        axes.set_yticks(range(len(result.methods)), result.methods, fontsize=SMALL)
+        axes.tick_params(labelleft=i % COLUMNS == 0)
         axes.plot(_place(result, name), -0.62, "v", color="black", ms=5, clip_on=False)
         axes.set_ylim(len(result.methods) - 0.5, -0.5)
     _legend_of_classes(figure, result)
@@ -231,19 +231,20 @@ def stability_pairs(result: StabilityMap, method: str, title: str = "") -> Figur
     figure, grid = new_figure(1.6 + 1.5 * size, title or method, size, size, squeeze=False)
     for each in pairs:
         column, row = (names.index(name) for name in each.axes)
-        _pair(grid[row - 1, column], result, each, row == size, column == 0)
+        _pair(grid[row - 1, column], result, each)
     for above in grid[np.triu_indices(size, 1)]:
         above.remove()
     _legend_of_classes(figure, result)
     return figure
 
 
-def _pair(axes: Axes, result: StabilityMap, each: Slice, bottom: bool, left: bool) -> None:
+def _pair(axes: Axes, result: StabilityMap, each: Slice) -> None:
     """The classes over two axes; a ring marks the base point."""
     _draw_classes(axes, each.codes.T)
     axes.invert_yaxis()
-    for which, name, labelled in (("x", each.axes[0], bottom), ("y", each.axes[1], left)):
-        _ticks(axes, which, name, result.axes[name], labelled, 3)
+    for which, name in zip("xy", each.axes):
+        _ticks(axes, which, name, result.axes[name], 3)
+    axes.label_outer()
     x, y = (_place(result, name) for name in each.axes)
     axes.plot(x, y, "o", ms=7, mfc="none", mec="white", mew=2.5)
     axes.plot(x, y, "o", ms=7, mfc="none", mec="black", mew=1.2)
@@ -261,22 +262,12 @@ def _draw_classes(axes: Axes, codes: np.ndarray) -> None:
     axes.spines[:].set_visible(False)
 
 
-def _ticks(
-    axes: Axes,
-    which: str,
-    name: str,
-    values: np.ndarray,
-    labelled: bool = True,
-    most: int = 5,
-) -> None:
-    """Values of a map's axis as ticks of a panel's axis 'x' or 'y'."""
-    step = -(-len(values) // most)
-    at = range(0, len(values), step)
-    labels = [in_words(float(f"{values[i]:.2g}")) if labelled else "" for i in at]
+def _ticks(axes: Axes, which: str, name: str, values: np.ndarray, most: int = 5) -> None:
+    """At most so many values of a map's axis as ticks of a panel's axis 'x' or 'y'."""
+    at = range(0, len(values), -(-len(values) // most))
     axis = axes.xaxis if which == "x" else axes.yaxis
-    axis.set_ticks(at, labels, fontsize=SMALL)
-    word = _LABELS.get(name, name.replace("_", " ")) if labelled else ""
-    axis.set_label_text(word, fontsize=SMALL)
+    axis.set_ticks(at, [in_words(float(f"{values[i]:.2g}")) for i in at], fontsize=SMALL)
+    axis.set_label_text(_LABELS.get(name, name.replace("_", " ")), fontsize=SMALL)
 
 
 def _place(result: StabilityMap, name: str) -> float:
