@@ -122,14 +122,14 @@ class Normal(Distribution):
             )
 
 
-class Rows(eqx.Module):
-    """Given samples (S, size): sample i is row i."""
+class GivenRows(eqx.Module):
+    """Given samples, `count` of them: sample i is row i."""
 
-    values: Any
+    count: int
 
     def __repr__(self) -> str:
         """How many rows they are."""
-        return f"{len(self.values)} given rows"
+        return f"{self.count} given rows"
 
 
 class RandomLaw(eqx.Module):
@@ -187,7 +187,7 @@ class RandomLaw(eqx.Module):
 
 
 def as_source(name: str, value: Any, size: int, non_negative: bool) -> Any:
-    """A distribution, a function of a key, rows, or a constant (size,); checked on the host."""
+    """A distribution, a function of a key, rows (S, size), or a constant (size,); checked."""
     if isinstance(value, Distribution):
         value.check(name, size, non_negative)
         return value
@@ -205,7 +205,7 @@ def as_source(name: str, value: Any, size: int, non_negative: bool) -> Any:
             f"Argument `{name}` must not be negative, but has value "
             f"{float(array[tuple(where)]):g} at index {where}; {OVERLAP}"
         )
-    return Rows(np.asarray(array)) if several else array
+    return array
 
 
 def _check_domain(name: str, drawn: Distribution, domain: Domain) -> None:

@@ -9,14 +9,13 @@ import numpy as np
 from jimpact._checks import check_values
 from jimpact.files.records import Column, Table, Tabular, as_data, fields_as_data
 from jimpact.law import Law
-from jimpact.montecarlo.plan import Run
+from jimpact.montecarlo.samples import Run
 from jimpact.montecarlo.statistics import (
     IN_MEMORY,
     OUTCOMES,
     Chunk,
     bin_edges,
     binned_quantiles,
-    moments_of,
     named,
     part,
 )
@@ -156,13 +155,12 @@ class MonteCarlo(Tabular):
         lines = []
         for j, mean in enumerate(self.gap_mean):
             std = np.sqrt(self.gap_covariance[j, j])
-            line = f"gap {j + 1}: mean {mean:.4g} m, std {std:.4g} m"
+            lines.append(f"gap {j + 1}: mean {mean:.4g} m, std {std:.4g} m")
             if self.gap_scale is not None:
                 scale = self.gap_scale[j]
-                line += f"; in units of delta_c = {scale:.3g} m: "
-                line += f"{mean / scale:.3g} and {std / scale:.3g}"
-            lines.append(line)
-        return lines if self.gap_scale is None or not lines else [*lines, DELTA_C]
+                lines[-1] += f"; in units of delta_c = {scale:.3g} m: "
+                lines[-1] += f"{mean / scale:.3g} and {std / scale:.3g}"
+        return [*lines, DELTA_C] if lines and self.gap_scale is not None else lines
 
     def _status_lines(self) -> list[str]:
         """How often each status occurred, and the first failed samples."""
@@ -180,12 +178,13 @@ def result_of(
     run: Run, total: Chunk, resumed: int, rate: float, gap_scale: np.ndarray | None
 ) -> MonteCarlo:
     """The result of a run from the statistics of all its chunks."""
-    n, bad, whole = len(total["ends"]), part(total, "bad"), moments_of(total)
-    mean, covariance = whole.mean, whole.covariance
+    n, count, bad = len(total["ends"]), int(total["used"]), part(total, "bad")
+    mean = total["mean"]
+    covariance = total["products"] / (count - 1 if count > 1 else np.nan)
     failed = zip(bad["index"], bad["status"], bad["gaps"], bad["velocity_before"])
     return MonteCarlo(
         samples=run.samples,
-        count=whole.count,
+        count=count,
         mean=mean[:n],
         covariance=covariance[:n, :n],
         minimum=total["low"],
@@ -193,7 +192,7 @@ def result_of(
         gap_mean=mean[n:],
         gap_covariance=covariance[n:, n:],
         cross_covariance=covariance[:n, n:],
-        edges=bin_edges(total["ends"], run.plan.bins),
+        edges=bin_edges(total["ends"], run.bins),
         counts=total["counts"],
         statuses=named(total["statuses"]),
         bad=tuple(BadSample(int(i), OUTCOMES[code].name, *rest) for i, code, *rest in failed),

@@ -3,12 +3,12 @@
 import functools
 import itertools
 import pickle
-import queue
 import time
 import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,8 @@ import numpy as np
 from jimpact._checks import check_executor, in_common_dtype, needed
 from jimpact.law import Law
 from jimpact.montecarlo.gaps import gap_scale
-from jimpact.montecarlo.plan import Plan, Run, Sources, planned_run
 from jimpact.montecarlo.result import MonteCarlo, result_of
+from jimpact.montecarlo.samples import Run, Sources, planned_run
 from jimpact.montecarlo.statistics import Chunk, Task, joined
 from jimpact.montecarlo.store import Store
 from jimpact.progress import counting_bar
@@ -101,7 +101,7 @@ def monte_carlo(
         raise ValueError("Argument `folder` must be given to keep samples, but is None.")
     store = None if folder is None else Store(folder, run.identity)
     total, resumed, rate = _total(run, executor, store, progress)
-    result = result_of(run, total, resumed, rate, _gap_scale(run.plan.sources, scene))
+    result = result_of(run, total, resumed, rate, _gap_scale(run.sources, scene))
     failed = result.samples - result.count
     if failed:
         text = ", ".join(f"{count} {name}" for name, count in result.statuses.items())
@@ -120,22 +120,19 @@ def _total(
 
     The first chunk that is computed compiles the program: it does not count for the rate.
     """
-    counts = [run.task(number).count for number in range(run.chunks)]
 
     def read(number: int) -> Chunk | None:
         """The chunk as it is stored, if it is."""
-        if store is None:
-            return None
-        return store.read(number, counts[number], run.plan.keep_samples)
+        return store.read(number, run.count(number), run.keep_samples) if store else None
 
-    stored = {number for number in range(run.chunks) if read(number) is not None}
-    resumed = finished = sum(counts[number] for number in stored)
+    stored = {number for number in range(run.chunks) if read(number)}
+    resumed = finished = sum(map(run.count, stored))
     times = [(resumed, time.perf_counter())]
 
     def new(chunk: Chunk) -> Chunk:
         """A computed chunk, stored and counted."""
         nonlocal finished
-        if store is not None:
+        if store:
             store.write(chunk)
         finished += int(chunk["count"])
         times.append((finished, time.perf_counter()))
@@ -144,10 +141,10 @@ def _total(
 
     try:
         with counting_bar(run.samples, "samples", progress, resumed) as advance:
-            total = read(0) or new(run.plan(run.task(0)))  # it sets the histograms
+            total = read(0) or new(run(run.task(0)))  # it sets the histograms
             missing = (n for n in range(1, run.chunks) if n not in stored)
             tasks = (run.task(number, total["ends"]) for number in missing)
-            with closing(_computed(executor, run.plan, tasks)) as chunks:
+            with closing(_computed(executor, run, tasks)) as chunks:
                 for number in range(1, run.chunks):
                     chunk = read(number) if number in stored else new(next(chunks))
                     if chunk is None:
@@ -180,47 +177,36 @@ def _gap_scale(sources: Sources, scene: Scene) -> np.ndarray | None:
 # ------------------------------------------ where chunks are computed, which changes no result
 
 
-def _computed(executor: Any, plan: Plan, tasks: Iterable[Task]) -> Generator[Chunk]:
-    """`plan(task)` for every task, in order."""
+def _computed(executor: Any, run: Run, tasks: Iterable[Task]) -> Generator[Chunk]:
+    """`run(task)` for every task, in order."""
     remaining = iter(tasks)
-    with _opened(executor, plan) as (mapped, work):
+    with _opened(executor, run) as (mapped, work):
         while window := list(itertools.islice(remaining, WINDOW)):
             for each in mapped(work, window):
                 yield each.result() if hasattr(each, "result") else each  # Dask maps to futures
 
 
 @contextmanager
-def _opened(executor: Any, plan: Plan) -> Iterator[tuple[Callable[..., Any], Work]]:
+def _opened(executor: Any, run: Run) -> Iterator[tuple[Callable[..., Any], Work]]:
     """The `map` of an executor, and what it maps tasks by."""
     if executor == "serial":
-        yield map, plan
+        yield map, run
     elif executor == "devices":
-        free: queue.SimpleQueue[jax.Device] = queue.SimpleQueue()
-        for device in jax.devices():
-            free.put(device)
-
-        def compute(task: Task) -> Chunk:
-            """One chunk, on a device that is free; each device compiles the program once."""
-            device = free.get()
-            try:
-                return plan(task, device)
-            finally:
-                free.put(device)
-
-        with ThreadPoolExecutor(free.qsize()) as pool:
-            yield pool.map, compute
+        devices = jax.devices()  # each compiles the program once
+        with ThreadPoolExecutor(len(devices)) as pool:
+            yield pool.map, lambda task: run(task, devices[task.number % len(devices)])
     elif isinstance(executor, str):
         distributed = needed("distributed", "pip install 'jimpact[distributed]'")
         here = {"threads_per_worker": 1, "dashboard_address": None}  # processes on this machine
         options = here if executor == "dask" else {"address": executor}
         with distributed.Client(**options) as client:
-            yield client.map, _shipped(plan)
+            yield client.map, _shipped(run)
     else:
-        yield executor.map, _shipped(plan)
+        yield executor.map, _shipped(run)
 
 
-def _shipped(plan: Plan) -> Work:
-    """A plan that other processes can compute with; as it is where it cannot be pickled.
+def _shipped(run: Run) -> Work:
+    """A run that other processes can compute with; as it is where it cannot be pickled.
 
     Functions in it are pickled where cloudpickle is installed, which Dask brings.
     """
@@ -229,18 +215,18 @@ def _shipped(plan: Plan) -> Work:
     except ImportError:
         dumps = pickle.dumps
     try:
-        return functools.partial(_compute, dumps(plan), plan.x64)
+        return functools.partial(_compute, dumps(replace(run, rows={})), run.x64)
     except Exception:  # objects refuse to be pickled in many ways; threads need no pickle
-        return plan
+        return run
 
 
-def _compute(plan: bytes, x64: bool, task: Task) -> Chunk:
-    """One chunk of a pickled plan."""
-    return _unpacked(plan, x64)(task)
+def _compute(run: bytes, x64: bool, task: Task) -> Chunk:
+    """One chunk of a pickled run."""
+    return _unpacked(run, x64)(task)
 
 
 @functools.lru_cache(maxsize=4)
-def _unpacked(plan: bytes, x64: bool) -> Plan:
+def _unpacked(run: bytes, x64: bool) -> Run:
     """The same object for the same bytes, so that a worker compiles a run only once."""
     with jax.enable_x64(x64):  # else a worker would read float64 arrays as float32
-        return pickle.loads(plan)
+        return pickle.loads(run)

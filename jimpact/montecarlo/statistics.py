@@ -47,39 +47,24 @@ def part(chunk: Chunk, prefix: str) -> Chunk:
     return {k.removeprefix(start): v for k, v in chunk.items() if k.startswith(start)}
 
 
-@dataclass(frozen=True)
-class Moments:
-    """Count, mean (d,) and the sum of products of deviations from the mean (d, d)."""
-
-    count: int
-    mean: np.ndarray
-    products: np.ndarray
-
-    @property
-    def covariance(self) -> np.ndarray:
-        """Sample covariance (d, d), divided by count - 1; NaN for fewer than two."""
-        if self.count < 2:
-            return np.full(self.products.shape, np.nan)
-        return self.products / (self.count - 1)
-
-
-def moments(values: np.ndarray) -> Moments:
+def moments(values: np.ndarray) -> Chunk:
     """Of `values` (d, count), one row a quantity; in float64 whatever their type.
 
     >>> import numpy as np
     >>> from jimpact.montecarlo.statistics import moments
-    >>> moments(np.array([[1.0, 2.0, 3.0]])).covariance.tolist()
-    [[1.0]]
+    >>> {name: x.tolist() for name, x in moments(np.array([[1.0, 2.0, 3.0]])).items()}
+    {'used': 3, 'mean': [2.0], 'products': [[2.0]]}
     """
     values = np.ascontiguousarray(values, dtype=np.float64)
     count = values.shape[1]
     mean = values.sum(axis=1) / max(count, 1)  # along contiguous rows: pairwise
     deviation = values - mean[:, None]
     # not BLAS: its summation order depends on the number of threads
-    return Moments(count, mean, np.einsum("ik,jk->ij", deviation, deviation))
+    products = np.einsum("ik,jk->ij", deviation, deviation)
+    return {"used": np.array(count), "mean": mean, "products": products}
 
 
-def merged(a: Moments, b: Moments) -> Moments:
+def merged(a: Chunk, b: Chunk) -> Chunk:
     """Moments of both together.
 
     Equation: `mean = mean_a + d n_b / n`, `S = S_a + S_b + d d^T n_a n_b / n`, with
@@ -89,16 +74,17 @@ def merged(a: Moments, b: Moments) -> Moments:
 
     >>> import numpy as np
     >>> from jimpact.montecarlo.statistics import merged, moments
-    >>> whole = merged(moments(np.array([[1.0]])), moments(np.array([[3.0]])))
-    >>> whole.count, whole.mean.tolist(), whole.covariance.tolist()
-    (2, [2.0], [[2.0]])
+    >>> both = merged(moments(np.array([[1.0]])), moments(np.array([[3.0]])))
+    >>> {name: x.tolist() for name, x in both.items()}
+    {'used': 2, 'mean': [2.0], 'products': [[2.0]]}
     """
-    if a.count == 0 or b.count == 0:
-        return a if b.count == 0 else b
-    count = a.count + b.count
-    d = b.mean - a.mean
-    products = a.products + b.products + np.outer(d, d) * (a.count * b.count / count)
-    return Moments(count, a.mean + d * (b.count / count), products)
+    used = a["used"] + b["used"]
+    n = max(used, 1)
+    d = b["mean"] - a["mean"]
+    products = a["products"] + b["products"] + np.outer(d, d) * (a["used"] * b["used"] / n)
+    # without samples a mean is 0
+    mean = a["mean"] + d * (b["used"] / n)
+    return {"used": np.array(used), "mean": mean, "products": products}
 
 
 def bin_range(values: np.ndarray) -> np.ndarray:
@@ -167,14 +153,11 @@ def reduced(task: Task, samples: Chunk, bins: int, keep_samples: bool) -> Chunk:
     used = values[:, :count][:, fine[:count]]
     lanes = np.flatnonzero(~fine[:count])[:LISTED]
     raw = count if keep_samples else min(count, IN_MEMORY) if task.number == 0 else 0
-    whole = moments(used)
     return {
         "number": np.array(task.number),
         "count": np.array(count),
         "statuses": np.bincount(status[:count], minlength=len(FAILURE)),
-        "used": np.array(whole.count),
-        "mean": whole.mean,
-        "products": whole.products,
+        **moments(used),
         "low": used[:n].min(axis=1, initial=np.inf),
         "high": used[:n].max(axis=1, initial=-np.inf),
         "ends": ends,
@@ -185,25 +168,19 @@ def reduced(task: Task, samples: Chunk, bins: int, keep_samples: bool) -> Chunk:
     }
 
 
-def moments_of(chunk: Chunk) -> Moments:
-    """The moments of a chunk."""
-    return Moments(int(chunk["used"]), chunk["mean"], chunk["products"])
-
-
 def joined(before: Chunk, chunk: Chunk) -> Chunk:
     """The statistics of all chunks before and of the next one, with the first ones' samples."""
     assert chunk["number"] == before["number"] + 1  # floating-point sums depend on the order
-    whole = merged(moments_of(before), moments_of(chunk))
-    sums = {name: before[name] + chunk[name] for name in ("count", "statuses", "counts")}
     bad = {k: np.concatenate([v, chunk[k]])[:LISTED] for k, v in before.items() if k[:4] == "bad."}
-    return (
-        before
-        | sums
-        | bad
-        | {"used": np.array(whole.count), "mean": whole.mean, "products": whole.products}
-        | {"low": np.minimum(before["low"], chunk["low"]), "number": chunk["number"]}
-        | {"high": np.maximum(before["high"], chunk["high"])}
-    )
+    return {
+        **before,
+        **bad,
+        **merged(before, chunk),
+        **{name: before[name] + chunk[name] for name in ("count", "statuses", "counts")},
+        "number": chunk["number"],
+        "low": np.minimum(before["low"], chunk["low"]),
+        "high": np.maximum(before["high"], chunk["high"]),
+    }
 
 
 def named(counts: np.ndarray) -> dict[str, int]:

@@ -1,6 +1,7 @@
 """Pictures of error against time, of stability, of where laws are valid, and of advice."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -26,28 +27,18 @@ from jimpact.plot.style import (
     logarithmic,
     new_figure,
     new_panels,
+    panels_of_laws,
     side_by_side,
     styled,
-    wrapped,
 )
 from jimpact.status import CODE, STATUS
 
-_LAW_MARKERS = "*phX8d"
 _LEAST = 1e-16  # smaller relative errors are drawn here: rounding
 _DEFAULT = "time"  # what `impact` does: a thick line
 
-# right, flagged, wrong, gains energy, stalls, does not end, not finite, unchecked: Okabe and Ito's
-# colours for returned results, greys for none
-CLASS_COLOURS = (
-    "#009E73",
-    "#56B4E9",
-    "#D55E00",
-    "#CC79A7",
-    "#E69F00",
-    "#999999",
-    "#000000",
-    "#DDDDDD",
-)
+# right, flagged, wrong, gains energy, stalls, does not end, not finite, unchecked: colours for
+# returned results, greys for none
+CLASS_COLOURS = (*(COLOURS[i] for i in (2, 4, 1, 3, 5)), "#999999", "#000000", "#DDDDDD")
 _LABELS = {
     "setting": "setting, 1 finest",
     "restitution": "restitution e",
@@ -59,7 +50,6 @@ _CLASS_LABELS = {  # where the name of a class does not say why
     "unchecked": "unchecked: no reference",
     "wrong": "wrong, unnoticed",
 }
-_TICKS = 5  # labelled values along an axis, at most
 _STYLES = {"moreau": "--", "binary": ":"}
 
 
@@ -110,19 +100,13 @@ def _styles(points: Mapping[str, tuple[Point, ...]]) -> dict[str, dict[str, Any]
     laws = [name for name, row in points.items() if row[0].setting is None]
     methods = [name for name in points if name not in laws]
     styles: dict[str, dict[str, Any]] = {}
-    for number, name in enumerate(methods):
-        default = name == _DEFAULT
-        styles[name] = {
-            "marker": MARKERS[number % len(MARKERS)],
-            "ms": 5,
-            "ls": "-" if number < len(COLOURS) else "--",
-            "lw": 2.6 if default else 1.2,
-            "color": colour_of(number),
-            "zorder": 3 if default else 2,
-        }
-    for number, name in enumerate(laws):
-        marker = _LAW_MARKERS[number % len(_LAW_MARKERS)]
+    for i, (name, marker) in enumerate(zip(methods, cycle(MARKERS))):
+        line = "-" if i < len(COLOURS) else "--"
+        styles[name] = {"marker": marker, "ms": 5, "ls": line, "lw": 1.2, "color": colour_of(i)}
+    for name, marker in zip(laws, cycle("*phX8d")):
         styles[name] = {"marker": marker, "ms": 8, "ls": "none", "color": GREY}
+    if _DEFAULT in styles:
+        styles[_DEFAULT] |= {"lw": 2.6, "zorder": 3}
     return styles
 
 
@@ -138,22 +122,28 @@ def _draw(
     axes: Axes, row: tuple[Point, ...], quantity: str, against: str, style: dict[str, Any]
 ) -> None:
     """One line; none where no point has a time or a count, and an error."""
-    points, places, bars = [], [], []
-    for point in row:
-        x, spread = getattr(point, against), (0.0, 0.0)
-        if isinstance(x, Timing):
-            x, low, high = 1e6 * np.array(x)
-            spread = x - low, high - x
-        if x is not None and np.isfinite([x, point.error[quantity]]).all():
-            points.append(point)
-            places.append(x)
-            bars.append(spread)
-    if not points:
+    given = [getattr(point, against) for point in row]
+    spans = [
+        1e6 * np.array(x) if isinstance(x, Timing) else np.full(3, np.nan if x is None else x)
+        for x in given
+    ]
+    x, low, high = np.array(spans).T
+    y = np.maximum([point.error[quantity] for point in row], _LEAST)
+    known = np.isfinite(x) & np.isfinite(y)
+    if not known.any():
         return
-    x, y = np.array(places), np.maximum([p.error[quantity] for p in points], _LEAST)
-    timed = np.array(bars).T if np.any(bars) else None
-    axes.errorbar(x, y, xerr=timed, label=points[0].label, elinewidth=1, capsize=2, **style)
-    failed = np.array([STATUS[CODE[point.status]].failure for point in points])
+    bars = np.array([x - low, high - x])[:, known]
+    label = row[int(np.argmax(known))].label
+    axes.errorbar(
+        x[known],
+        y[known],
+        xerr=bars if bars.any() else None,
+        label=label,
+        elinewidth=1,
+        capsize=2,
+        **style,
+    )
+    failed = known & [STATUS[CODE[point.status]].failure for point in row]
     axes.plot(x[failed], y[failed], **style | {"ls": "none", "mfc": "white", "zorder": 4})
 
 
@@ -203,8 +193,8 @@ def stability_map(result: StabilityMap, title: str = "") -> Figure:
     for i, (axes, name) in enumerate(zip(grid, names)):
         _draw_classes(axes, np.array([result.slices[method][i].codes for method in result.methods]))
         _ticks(axes, "x", name, result.axes[name])
-        labels = result.methods if i % COLUMNS == 0 else [""] * len(result.methods)
-        axes.set_yticks(range(len(result.methods)), labels, fontsize=SMALL)
+        axes.set_yticks(range(len(result.methods)), result.methods, fontsize=SMALL)
+        axes.tick_params(labelleft=i % COLUMNS == 0)
         axes.plot(_place(result, name), -0.62, "v", color="black", ms=5, clip_on=False)
         axes.set_ylim(len(result.methods) - 0.5, -0.5)
     _legend_of_classes(figure, result)
@@ -241,19 +231,20 @@ def stability_pairs(result: StabilityMap, method: str, title: str = "") -> Figur
     figure, grid = new_figure(1.6 + 1.5 * size, title or method, size, size, squeeze=False)
     for each in pairs:
         column, row = (names.index(name) for name in each.axes)
-        _pair(grid[row - 1, column], result, each, row == size, column == 0)
+        _pair(grid[row - 1, column], result, each)
     for above in grid[np.triu_indices(size, 1)]:
         above.remove()
     _legend_of_classes(figure, result)
     return figure
 
 
-def _pair(axes: Axes, result: StabilityMap, each: Slice, bottom: bool, left: bool) -> None:
+def _pair(axes: Axes, result: StabilityMap, each: Slice) -> None:
     """The classes over two axes; a ring marks the base point."""
     _draw_classes(axes, each.codes.T)
     axes.invert_yaxis()
-    for which, name, labelled in (("x", each.axes[0], bottom), ("y", each.axes[1], left)):
-        _ticks(axes, which, name, result.axes[name], labelled, 3)
+    for which, name in zip("xy", each.axes):
+        _ticks(axes, which, name, result.axes[name], 3)
+    axes.label_outer()
     x, y = (_place(result, name) for name in each.axes)
     axes.plot(x, y, "o", ms=7, mfc="none", mec="white", mew=2.5)
     axes.plot(x, y, "o", ms=7, mfc="none", mec="black", mew=1.2)
@@ -271,22 +262,12 @@ def _draw_classes(axes: Axes, codes: np.ndarray) -> None:
     axes.spines[:].set_visible(False)
 
 
-def _ticks(
-    axes: Axes,
-    which: str,
-    name: str,
-    values: np.ndarray,
-    labelled: bool = True,
-    most: int = _TICKS,
-) -> None:
-    """Values of a map's axis as ticks of a panel's axis 'x' or 'y'."""
-    step = -(-len(values) // most)
-    at = range(0, len(values), step)
-    labels = [in_words(float(f"{values[i]:.2g}")) if labelled else "" for i in at]
+def _ticks(axes: Axes, which: str, name: str, values: np.ndarray, most: int = 5) -> None:
+    """At most so many values of a map's axis as ticks of a panel's axis 'x' or 'y'."""
+    at = range(0, len(values), -(-len(values) // most))
     axis = axes.xaxis if which == "x" else axes.yaxis
-    axis.set_ticks(at, labels, fontsize=SMALL)
-    word = _LABELS.get(name, name.replace("_", " ")) if labelled else ""
-    axis.set_label_text(word, fontsize=SMALL)
+    axis.set_ticks(at, [in_words(float(f"{values[i]:.2g}")) for i in at], fontsize=SMALL)
+    axis.set_label_text(_LABELS.get(name, name.replace("_", " ")), fontsize=SMALL)
 
 
 def _place(result: StabilityMap, name: str) -> float:
@@ -298,9 +279,9 @@ def _place(result: StabilityMap, name: str) -> float:
 def _legend_of_classes(figure: Figure, result: StabilityMap) -> None:
     """The classes that occur."""
     codes = [each.codes.ravel() for name in result.methods for each in result.slices[name]]
-    occurring = np.unique(np.concatenate(codes)).tolist()
-    rows = [(CLASS_COLOURS[i], _CLASS_LABELS.get(CLASSES[i], CLASSES[i])) for i in occurring]
-    legend_below(figure, 4, [Patch(color=colour, label=label) for colour, label in rows])
+    labels = [_CLASS_LABELS.get(name, name) for name in CLASSES]
+    occurring = np.unique(np.concatenate(codes))
+    legend_below(figure, 4, [Patch(color=CLASS_COLOURS[i], label=labels[i]) for i in occurring])
 
 
 @styled(ValidityMap)
@@ -349,40 +330,43 @@ def validity_map(result: ValidityMap, tolerance: float = 1e-2, title: str = "") 
 
 
 @styled(Advice)
-def advice(result: Advice, title: str = "") -> Figure:
+def advice(result: Advice, title: str = "", names: Sequence[str] = ()) -> Figure:
     """Outcomes of every law, with their range over the unknown ratios, above their errors.
 
     Args:
         result: what `ji.advise` returned.
         title: above the picture.
+        names: of the velocities with their units, as `body.velocity_names`: each unit has a panel
+            of its own. Without names those of a chain are in m/s; others stand times the root of
+            their inertia, in √J.
 
     Returns:
         A matplotlib figure: `.savefig(path)` writes it.
 
     Raises:
-        TypeError: something else.
+        TypeError: something else. ValueError: another number of names.
 
     >>> import jimpact as ji
     >>> result = ji.advise(ji.chain([1.0, 1.0]), [1.0, 0.0], restitution=0.9, timing=False)
     >>> len(ji.plot.advice(result).axes)
     2
     """
-    names, rows = list(result.candidates), list(result.candidates.values())
-    chain = result.scene.walls is not None
-    what, unit = ("body", "m/s") if chain else ("coordinate", "m/s, rad/s")
-    bodies, x = len(result.velocity), np.arange(len(names))
+    laws, rows = list(result.candidates), list(result.candidates.values())
+    named = [name if c.usable else f"{name}_({c.status})" for name, c in zip(laws, rows)]
+    figure, tops, bottom = panels_of_laws(named, result.scene, names, "", 1.8)
     verdict = f"{'within' if result.within else 'not within'} {share(result.tolerance)}"
-    figure, (top, bottom) = new_figure(6.5, "", 2, 1, sharex=True, height_ratios=(3, 2))
-    top.set_title(f"{title}\n{as_code(result.law)}: {verdict}", fontsize="large")
-    for i, offset in enumerate(side_by_side(bodies)):
-        label = f"{what} {i + 1}" if bodies <= len(COLOURS) else None
-        v, low, high = np.array([(c.velocity[i], c.low[i], c.high[i]) for c in rows]).T
-        top.vlines(x + offset, low, high, color=colour_of(i), lw=4, alpha=0.4)
-        top.plot(x + offset, v, "o", color=colour_of(i), label=label)
-    chosen = names.index(result.name)
-    for axes, label in ((top, None), (bottom, "advised")):
+    figure.axes[0].set_title(f"{title}\n{as_code(result.law)}: {verdict}", fontsize="large")
+    x = np.arange(len(laws))
+    for top, velocities in tops:
+        for (i, word, factor), offset in zip(velocities, side_by_side(len(velocities))):
+            label = word if len(velocities) <= len(COLOURS) else None
+            v, low, high = factor * np.array([(c.velocity[i], c.low[i], c.high[i]) for c in rows]).T
+            top.vlines(x + offset, low, high, color=colour_of(i), lw=4, alpha=0.4)
+            top.plot(x + offset, v, "o", color=colour_of(i), label=label)
+    chosen = laws.index(result.name)
+    for axes in figure.axes:
+        label = "advised" if axes is bottom else None
         axes.axvspan(chosen - 0.5, chosen + 0.5, color=HIGHLIGHT, lw=0, label=label)
-        axes.grid(False, axis="x")
     lowest = result.tolerance / 1000
     worst, median = np.maximum(np.array([(c.worst, c.median) for c in rows]).T, lowest)
     bottom.vlines(x, median, worst, color=GREY, lw=1)
@@ -391,9 +375,6 @@ def advice(result: Advice, title: str = "") -> Figure:
     bottom.axhline(result.tolerance, color=COLOURS[1], lw=1, label="tolerance")
     bottom.set(yscale="log", ylim=(lowest / 2, 10))
     logarithmic(bottom, "y")
-    top.set_ylabel(f"velocity after the impact [{unit}]")
-    bottom.set(xlabel="law", ylabel="error of v+ (energy norm)")
-    named = [f"{name}{'' if c.usable else f' ({c.status})'}" for name, c in zip(names, rows)]
-    bottom.set_xticks(x, [wrapped(name.replace(" ", "_")) for name in named], fontsize=SMALL)
+    bottom.set_ylabel("error of v+ (energy norm)")
     legend_below(figure, 6)
     return figure

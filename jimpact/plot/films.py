@@ -1,9 +1,8 @@
 """Motions as films in real time: GIF, MP4, or a page that plays them."""
 
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +12,7 @@ from matplotlib.animation import FFMpegWriter, FuncAnimation, PillowWriter
 from matplotlib.figure import Figure
 
 from jimpact._checks import check_values
-from jimpact.bodies.base import projected
+from jimpact.bodies.base import Body, projected
 from jimpact.motion.dynamics import seen_from_base
 from jimpact.motion.record import Motion
 from jimpact.motion.system import System
@@ -38,9 +37,6 @@ _GIF_CLOCK, _GIF_LEAST = 100.0, 2.0  # a GIF counts in 1/100 s; viewers do not s
 # [s] Frames last a little longer, because whole milliseconds are cut off the rounded numbers of a
 # GIF; a thousand times more would slow films down.
 _CUT_OFF = 1e-6
-_PLACE = (0.12, 0.08, 0.84, 0.8)  # of the axes in a film, for all frames
-# [MB] Largest page with its frames. matplotlib's own limit, 20, leaves out the end of a long film.
-_LARGEST_PAGE = 1000
 
 
 def animation(
@@ -98,30 +94,20 @@ def animation(
         )
     if path.suffix == ".gif":
         frames_per_second = _GIF_CLOCK / max(round(_GIF_CLOCK / frames_per_second), _GIF_LEAST)
-    film = _film(system, motion, title, speed, frames_per_second)
+    count, frames = _frames(system, motion, title, speed, frames_per_second)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with counting_bar(len(film.time), "frames", progress) as advance:
-        _write(film, path, advance)
+    with counting_bar(count, "frames", progress) as advance:
+        if path.suffix == ".html":
+            # [MB] matplotlib's own limit, 20, leaves out the end of a long film
+            with rc_context({"animation.embed_limit": 1000}):
+                page = frames.to_jshtml(fps=round(frames_per_second))
+            path.write_text(page, encoding="utf-8")
+            advance(count)
+        else:  # both writers take fractions
+            kind: Any = PillowWriter if path.suffix == ".gif" else FFMpegWriter
+            writer = kind(fps=1 / (1 / frames_per_second + _CUT_OFF))
+            frames.save(path, writer=writer, progress_callback=lambda i, n: advance(1))
     return path
-
-
-class _Film(NamedTuple):
-    """What all kinds of films show."""
-
-    title: str
-    time: np.ndarray  # (K,) of frames [s]
-    speed: float
-    rate: float  # frames in a second
-    curves: list[list[np.ndarray]]  # of each frame
-    colours: list[str]  # of the curves of a frame
-    floors: list[tuple[np.ndarray, float]]  # normal, offset
-    ground: np.ndarray  # (K, 2) displacement of the base
-
-    def caption(self, k: int) -> str:
-        """The time of a frame, to the digits in which frames differ."""
-        digits = max(2, int(np.ceil(-np.log10(self.speed / self.rate))))
-        slow = "" if self.speed == 1 else f" (speed {self.speed:g})"
-        return f"{self.time[k]:.{digits}f} s{slow}"
 
 
 def readable_speed(duration: float) -> float:
@@ -138,8 +124,10 @@ def readable_speed(duration: float) -> float:
     return float(max(x for x in (1.0, 2.0, 5.0) if x * power <= wanted * (1 + 1e-9))) * power
 
 
-def _film(system: System, motion: Motion, title: str, speed: float | None, rate: float) -> _Film:
-    """The frames of a motion."""
+def _frames(
+    system: System, motion: Motion, title: str, speed: float | None, rate: float
+) -> tuple[int, FuncAnimation]:
+    """How many frames a motion has, and these."""
     course, body = course_of(motion), system.body
     known = np.isfinite(course.q).all(axis=1) & np.isfinite(course.v).all(axis=1)
     at, q, v = course.time[known], course.q[known], course.v[known]
@@ -159,9 +147,34 @@ def _film(system: System, motion: Motion, title: str, speed: float | None, rate:
         elif ground.shape[1] == 1:
             ground = np.insert(ground, 0, 0.0, axis=1)
     curves = [[curve + moved for curve in body.outlines(x, point)] for x, moved in zip(q, ground)]
-    floors = [plane_of(angle, offset) for angle, offset in body.floors]
-    colours = colours_of(body, q[0], point)
-    return _Film(title, time, speed, rate, curves, colours, floors, ground)
+    digits = max(2, int(np.ceil(-np.log10(speed / rate))))  # in which frames differ
+    slow = "" if speed == 1 else f" (speed {speed:g})"
+    captions = [f"{title}\n{t:.{digits}f} s{slow}".lstrip() for t in time]
+    return count, _drawn(body, curves, colours_of(body, q[0], point), ground, captions)
+
+
+def _drawn(
+    body: Body, curves: Any, colours: list[str], ground: np.ndarray, captions: list[str]
+) -> FuncAnimation:
+    """Curves, planes and a caption, frame by frame."""
+    figure = Figure(figsize=(4.8, 4.8), dpi=80)
+    axes = figure.add_axes((0.12, 0.08, 0.84, 0.8))  # for all frames
+    floors = [plane_of(*floor) for floor in body.floors]
+    set_limits(axes, curves, ground, floors)
+    lines = [axes.plot([], [], color=colour)[0] for colour in colours]
+    planes = [axes.plot([], [], color=GREY, lw=2)[0] for _ in floors]
+    view = np.array([axes.get_xlim(), axes.get_ylim()])
+
+    def draw(k: int) -> list[Any]:
+        """Frame k."""
+        for line, points in zip(lines, curves[k], strict=True):
+            line.set_data(*points.T)
+        for line, floor in zip(planes, floors, strict=True):
+            line.set_data(*stretch_of(*floor, view, ground[k]))
+        axes.set_title(captions[k], loc="left")
+        return [*lines, *planes]
+
+    return FuncAnimation(figure, draw, frames=len(captions))
 
 
 def positions(at: np.ndarray, q: np.ndarray, slopes: np.ndarray, time: np.ndarray) -> np.ndarray:
@@ -181,32 +194,3 @@ def positions(at: np.ndarray, q: np.ndarray, slopes: np.ndarray, time: np.ndarra
     begin, end = (1 + 2 * s) * (1 - s) ** 2, s**2 * (3 - 2 * s)
     turns = s * (1 - s) ** 2 * h * slopes[k] - s**2 * (1 - s) * h * slopes[k + 1]
     return begin * q[k] + end * q[k + 1] + turns
-
-
-def _write(film: _Film, path: Path, advance: Callable[[int], None]) -> None:
-    """Frame by frame, by matplotlib."""
-    figure = Figure(figsize=(4.8, 4.8), dpi=80)
-    axes = figure.add_axes(_PLACE)
-    set_limits(axes, film.curves, film.ground, film.floors)
-    lines = [axes.plot([], [], color=colour)[0] for colour in film.colours]
-    drawn = [axes.plot([], [], color=GREY, lw=2)[0] for _ in film.floors]
-    view = np.array([axes.get_xlim(), axes.get_ylim()])
-
-    def draw(k: int) -> list[Any]:
-        """Frame k."""
-        for line, points in zip(lines, film.curves[k], strict=True):
-            line.set_data(points[:, 0], points[:, 1])
-        for line, (n, offset) in zip(drawn, film.floors, strict=True):
-            line.set_data(*stretch_of(n, offset, view, film.ground[k]))
-        axes.set_title(f"{film.title}\n{film.caption(k)}".lstrip(), loc="left")
-        return [*lines, *drawn]
-
-    frames = FuncAnimation(figure, draw, frames=len(film.time))
-    if path.suffix == ".html":
-        with rc_context({"animation.embed_limit": _LARGEST_PAGE}):
-            path.write_text(frames.to_jshtml(fps=round(film.rate)), encoding="utf-8")
-        advance(len(film.time))
-        return
-    kind: Any = PillowWriter if path.suffix == ".gif" else FFMpegWriter  # both take fractions
-    writer = kind(fps=1 / (1 / film.rate + _CUT_OFF))
-    frames.save(path, writer=writer, progress_callback=lambda i, n: advance(1))

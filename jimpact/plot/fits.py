@@ -6,8 +6,6 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 
 from jimpact.fits.profiles import Contour
 from jimpact.fits.uncertainty import Fit
@@ -23,15 +21,13 @@ from jimpact.plot.style import (
     styled,
 )
 
-_LABELLED = 16  # up to this number of shots each has a label
-
 
 @styled(Fit)
 def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> Figure:
     """Velocities after every shot, or what else was measured, and fitted, above the residuals.
 
     Error bars are sigma where the data state it, else the estimated noise. `others` are further
-    fits of the same data, by label, drawn in grey.
+    fits of the same data, by label, drawn in grey. Each unit has a column of its own.
 
     Args:
         fit: of shots, of a motion, or of what else was measured.
@@ -56,26 +52,31 @@ def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> F
     dodge = side_by_side(bodies)
     x = np.arange(shots)[:, None] + dodge[None, :]
     size = float(np.clip(220 / (shots * bodies), 3, 8))
-    unit = "" if data is None else " m/s"
-    heading = title or f"{type(fit.law).__name__}, rms {fit.rms:.3g}{unit}"
-    figure, (top, bottom) = new_figure(6.0, heading, 2, 1, sharex=True, height_ratios=(3, 1.4))
-    error = _error_bars(fit)
-    for i in range(bodies):
-        colour = colour_of(i)
-        bars = None if error is None else error[:, i]
-        style: dict[str, Any] = {"fmt": "o", "mfc": "none", "color": colour, "ms": size, "lw": 1}
-        top.errorbar(x[:, i], measured[:, i], bars, **style)
-        top.plot(x[:, i], predicted[:, i], "_", color=colour, ms=2.2 * size, mew=2)
-        bottom.errorbar(x[:, i], (measured - predicted)[:, i], bars, **style)
-    for j, other in enumerate((others or {}).values()):
-        top.plot(x, _in_rows(other.predicted), "x+*"[j % 3], color=GREY, ms=0.8 * size)
-    units = "" if data is None else f" [{', '.join(dict.fromkeys(data.units))}]"
-    top.set_ylabel(f"{'measured value' if data is None else 'velocity after the impact'}{units}")
-    bottom.set_ylabel(f"measured − fitted{units}")
-    bottom.axhline(0, color=GREY, lw=0.8)
-    _shot_axis(bottom, fit, dodge)
+    speed = "" if data is None else " m/s"
+    heading = title or f"{type(fit.law).__name__}, rms {fit.rms:.3g}{speed}"
+    what = "measured value" if data is None else "velocity after the impact"
+    each = [""] * bodies if data is None else list(data.units)
+    units, error = list(dict.fromkeys(each)), _error_bars(fit)
+    grid: Any = {"sharex": True, "squeeze": False, "height_ratios": (3, 1.4)}
+    figure, panels = new_figure(6.0, heading, 2, len(units), **grid)
+    for (top, bottom), unit in zip(panels.T, units):
+        members = [i for i, own in enumerate(each) if own == unit]
+        for i in members:
+            bars = None if error is None else error[:, i]
+            style: dict[str, Any] = {"fmt": "o", "mfc": "none", "ms": size, "lw": 1}
+            style["color"] = colour_of(i)
+            top.errorbar(x[:, i], measured[:, i], bars, **style)
+            top.plot(x[:, i], predicted[:, i], "_", color=colour_of(i), ms=2.2 * size, mew=2)
+            bottom.errorbar(x[:, i], (measured - predicted)[:, i], bars, **style)
+        for j, other in enumerate((others or {}).values()):
+            values = _in_rows(other.predicted)[:, members]
+            top.plot(x[:, members], values, "x+*"[j % 3], color=GREY, ms=0.8 * size)
+        top.set_ylabel(f"{what} [{unit}]" if unit else what)
+        bottom.set_ylabel(f"measured − fitted [{unit}]" if unit else "measured − fitted")
+        bottom.axhline(0, color=GREY, lw=0.8)
+        _shot_axis(bottom, fit, dodge)
     _legend(figure, fit, others or {}, error is not None)
-    for axes in (top, bottom):
+    for axes in figure.axes:
         axes.grid(False, axis="x")
     return figure
 
@@ -108,16 +109,13 @@ def contour(result: Contour, title: str = "") -> Figure:
     axes.contourf(result.x, result.y, d, [0.0, limit], colors=[COLOURS[0]], alpha=0.25)
     axes.contour(result.x, result.y, d, [limit], colors=[COLOURS[0]], linewidths=1.5)
     axes.contour(result.x, result.y, d, [limit / 4], colors=GREY, linewidths=0.7)
-    axes.plot(*result.best, "+", color="black", ms=9)
+    axes.plot(*result.best, "+", color="black", ms=9, label="fit")
     for which, log in zip("xy", result.log, strict=True):
         if log:
             logarithmic(axes, which)
     axes.set(xlabel=result.names[0], ylabel=result.names[1])
-    handles = [
-        Patch(color=COLOURS[0], alpha=0.25, label=f"{100 * result.level:g} % region"),
-        Line2D([], [], marker="+", ls="none", color="black", label="fit"),
-    ]
-    legend_below(figure, 2, handles)
+    axes.fill([], [], color=COLOURS[0], alpha=0.25, label=f"{100 * result.level:g} % region")
+    legend_below(figure, 2)
     return figure
 
 
@@ -143,7 +141,7 @@ def _shot_axis(axes: Axes, fit: Fit, dodge: np.ndarray) -> None:
         axes.set_xlabel("body")
         axes.set_xlim(-SPREAD * 0.5, SPREAD * 0.5)
         return
-    ticks = range(0, len(labels), -(-len(labels) // _LABELLED))
+    ticks = range(0, len(labels), -(-len(labels) // 16))  # so many are legible
     longest = max(len(labels[k]) for k in ticks)
     axes.set_xticks(list(ticks), [labels[k] for k in ticks], rotation=90 if longest > 4 else 0)
     axes.set_xlabel("shot" if data is not None else "value")
@@ -155,17 +153,14 @@ def _legend(figure: Figure, fit: Fit, others: Mapping[str, Fit], has_bars: bool)
     bars = ""
     if has_bars:
         bars = ", ± noise" if fit.problem.sigma is None else ", ± sigma"
-    plain: dict[str, Any] = {"ls": "none", "color": "black"}
-    handles = [
-        Line2D([], [], marker="o", mfc="none", label=f"measured{bars}", **plain),
-        Line2D([], [], marker="_", ms=14, mew=2, label=f"{type(fit.law).__name__} fitted", **plain),
-    ]
+    fitted = f"{type(fit.law).__name__} fitted"
+    axes = figure.axes[0]
+    axes.plot([], [], "o", color="black", mfc="none", label=f"measured{bars}")
+    axes.plot([], [], "_", color="black", ms=14, mew=2, label=fitted)
     for j, label in enumerate(others):
-        handles.append(Line2D([], [], marker="x+*"[j % 3], ls="none", color=GREY, label=label))
+        axes.plot([], [], "x+*"[j % 3], color=GREY, label=label)
     shots, bodies = _in_rows(fit.predicted).shape
     if shots > 1 and bodies > 1:  # of a single shot the axis names the bodies
-        for i in range(min(bodies, len(COLOURS))):
-            handles.append(
-                Line2D([], [], marker="s", ls="none", color=COLOURS[i], label=f"body {i + 1}")
-            )
-    legend_below(figure, 4, handles)
+        for i, colour in enumerate(COLOURS[:bodies]):
+            axes.plot([], [], "s", color=colour, label=f"body {i + 1}")
+    legend_below(figure, 4)

@@ -11,14 +11,9 @@ from scipy.special import chdtri, ndtri
 
 from jimpact._checks import check_choice, check_kind
 from jimpact.fits.uncertainty import Fit, Profile
-from jimpact.plot.style import COLOURS, GREY, SMALL, new_figure, new_panels, styled
+from jimpact.plot.style import COLOURS, GREY, SMALL, new_figure, new_panels, styled, write
 
-_TITLE = 45  # letters of a line of a panel's title
-_TOP = 3.0  # of a profile's axis, over the limit: only what is below matters
 MOST = 6  # parameters of a corner plot: more panels could not be read
-_WIDE = 3.5  # standard errors to each side in a corner plot
-_SHARES = (0.68, 0.95)  # of the regions in it
-_TWO_SIDED = 1.96  # standard errors: 95 % of normal noise lies within
 
 
 @styled()
@@ -48,15 +43,14 @@ def profiles(result: tuple[Profile, ...] | list[Profile]) -> Figure:
         axes.axhline(each.limit, color=GREY, lw=0.8, ls="--")
         for low, high in each.intervals:
             axes.axvspan(low, high, color=COLOURS[4], alpha=0.25, lw=0)
-        near = each.value[each.deviance <= _TOP * each.limit]
+        top = 3 * each.limit  # only what is below matters
+        near = each.value[each.deviance <= top]
         if np.ptp(near) > 0:
             edge = 0.15 * np.ptp(near)
             axes.set_xlim(near.min() - edge, near.max() + edge)
-        axes.set_ylim(0, _TOP * each.limit)
-        axes.set_xlabel(each.name)
+        axes.set(ylim=(0, top), xlabel=each.name, ylabel="deviance")
         words = f"{each.words} ({100 * each.level:g} %)"
-        axes.set_title(fill(words, _TITLE), fontsize=SMALL)
-        axes.set_ylabel("deviance")
+        axes.set_title(fill(words, 45), fontsize=SMALL)  # letters of a line
     return figure
 
 
@@ -88,10 +82,8 @@ def correlation(fit: Fit) -> Figure:
     axes.set_yticks(range(count), fit.names)
     if count <= 8:
         for i, j in np.argwhere(np.isfinite(fit.correlation)):
-            dark = abs(fit.correlation[i, j]) > 0.6
-            text = f"{fit.correlation[i, j]:.2f}"
-            colour = "white" if dark else "black"
-            axes.text(j, i, text, ha="center", va="center", color=colour, size=SMALL)
+            colour = "white" if abs(fit.correlation[i, j]) > 0.6 else "black"
+            write(axes, (j, i), f"{fit.correlation[i, j]:.2f}", color=colour)
     figure.colorbar(image, ax=axes, shrink=0.8, label="correlation")
     return figure
 
@@ -127,9 +119,8 @@ def residuals(fit: Fit) -> Figure:
     scaled = fit.residual[here] / (noise if known else 1.0)
     unit = "standard errors" if known else "as measured"
     figure, (first, second, third) = new_panels(3, 3.0)
-    values = (
-        "" if fit.experiments is None else f" [{', '.join(dict.fromkeys(fit.experiments.units))}]"
-    )
+    units = [] if fit.experiments is None else dict.fromkeys(fit.experiments.units)
+    values = f" [{', '.join(units)}]" if units else ""
     style: dict[str, Any] = {"ls": "none", "marker": "o", "mfc": "none", "ms": 4}
     first.axline((float(measured[here].mean()),) * 2, slope=1.0, color=GREY, lw=0.8)
     first.plot(fit.predicted[here], measured[here], color=COLOURS[0], **style)
@@ -144,7 +135,7 @@ def residuals(fit: Fit) -> Figure:
     third.axline((0.0, 0.0), slope=1.0 if known else float(np.std(scaled)) or 1.0, color=GREY)
     third.set(xlabel="normal quantile [standard errors]", ylabel=f"residual [{unit}]")
     if known:
-        for y in (-_TWO_SIDED, _TWO_SIDED):
+        for y in (-1.96, 1.96):  # standard errors: 95 % of normal noise lies within
             second.axhline(y, color=GREY, lw=0.6, ls="--")
     return figure
 
@@ -194,16 +185,12 @@ def corner(fit: Fit, draws: Any = None, names: Sequence[str] | None = None) -> F
     count = len(shown)
     height = float(np.clip(1.6 * count + 0.8, 3.0, 7.2))
     figure, grid = new_figure(height, "", count, count, squeeze=False, sharex="col")
-    for row, i in enumerate(shown):
-        for column, j in enumerate(shown):
-            axes = grid[row, column]
-            if column > row:
-                axes.remove()
-                continue
-            if column == row:
-                _one(axes, fit, i, values)
-            else:
-                _pair(axes, fit, j, i, values)
+    for above in grid[np.triu_indices(count, 1)]:
+        above.remove()
+    for k, i in enumerate(shown):
+        _one(grid[k, k], fit, i, values)
+        for axes, j in zip(grid[k, :k], shown):
+            _pair(axes, fit, j, i, values)
     for axes, i in zip(grid[-1], shown):
         axes.set_xlabel(fit.names[i])
     for axes, name in zip(grid[:, 0], ["density", *(fit.names[i] for i in shown[1:])]):
@@ -227,12 +214,11 @@ def _drawn(fit: Fit, draws: Any) -> np.ndarray:
 
 def _one(axes: Axes, fit: Fit, i: int, values: np.ndarray | None) -> None:
     """The density of one parameter."""
-    x = fit.value[i] + fit.standard_error[i] * np.linspace(-_WIDE, _WIDE, 121)
-    z = (x - fit.value[i]) / fit.standard_error[i]
-    density = np.exp(-0.5 * z**2) / (fit.standard_error[i] * np.sqrt(2 * np.pi))
+    z, error = np.linspace(-3.5, 3.5, 121), fit.standard_error[i]
+    density = np.exp(-0.5 * z**2) / (error * np.sqrt(2 * np.pi))
     if values is not None:
         axes.hist(values[:, i], bins="auto", density=True, color=COLOURS[4], alpha=0.5)
-    axes.plot(x, density, color=COLOURS[0], lw=1.2)
+    axes.plot(fit.value[i] + error * z, density, color=COLOURS[0], lw=1.2)
     axes.set_yticks([])
 
 
@@ -243,7 +229,7 @@ def _pair(axes: Axes, fit: Fit, i: int, j: int, values: np.ndarray | None) -> No
     factor = np.linalg.cholesky(fit.covariance[np.ix_([i, j], [i, j])])
     angle = np.linspace(0, 2 * np.pi, 181)
     circle = np.stack([np.cos(angle), np.sin(angle)])
-    for share in _SHARES:
+    for share in (0.68, 0.95):
         edge = np.sqrt(chdtri(2, 1 - share)) * factor @ circle
         axes.plot(fit.value[i] + edge[0], fit.value[j] + edge[1], color=COLOURS[0], lw=1.2)
     axes.plot(fit.value[i], fit.value[j], "+", color="black", ms=7)

@@ -1,8 +1,7 @@
 """Pictures of laws side by side, of contact forces and of force histories."""
 
 import dataclasses
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -16,25 +15,26 @@ from jimpact.plot.style import (
     COLOURS,
     GREY,
     HIGHLIGHT,
-    SMALL,
     colour_of,
     legend_below,
     mark,
     new_figure,
+    panels_of_laws,
     side_by_side,
     styled,
-    wrapped,
     write,
 )
 from jimpact.theory.admissible import admissible_set
 from jimpact.theory.dispersion import energy_dispersion, energy_ratio
 
-_UPRIGHT = 8  # names that stand side by side, at most
-_OUTCOMES = 4000  # dots of a set of outcomes; ten times more would only be one area
-
 
 @styled(Comparison)
-def comparison(result: Comparison, measured: np.ndarray | None = None, title: str = "") -> Figure:
+def comparison(
+    result: Comparison,
+    measured: np.ndarray | None = None,
+    title: str = "",
+    names: Sequence[str] = (),
+) -> Figure:
     """Velocities after the impact by law, energy ratios T+/T- and dispersion indices.
 
     Measured velocities are horizontal lines, and the laws closest to them are highlighted; a law
@@ -44,12 +44,15 @@ def comparison(result: Comparison, measured: np.ndarray | None = None, title: st
         result: what `ji.compare` returned.
         measured: v+ (n,) [m/s]; None: those of `result`, if it has any.
         title: above the picture.
+        names: of the velocities with their units, as `body.velocity_names`: each unit has a panel
+            of its own. Without names those of a chain are in m/s; others stand times the root of
+            their inertia, in √J.
 
     Returns:
         A matplotlib figure: `.savefig(path)` writes it.
 
     Raises:
-        TypeError: something else.
+        TypeError: something else. ValueError: another number of names.
 
     >>> import jimpact as ji
     >>> result = ji.compare(ji.chain([1.0, 1.0]), [1.0, 0.0], {"Newton": ji.Newton(0.5)})
@@ -58,38 +61,30 @@ def comparison(result: Comparison, measured: np.ndarray | None = None, title: st
     """
     if measured is not None:
         result = dataclasses.replace(result, measured=np.asarray(measured))
-    entries, chain = list(result.entries.values()), result.scene.walls is not None
-    figure, panels = new_figure(6.0, title, 2, 1, sharex=True, height_ratios=(3, 1.4))
-    top, bottom = panels
-    velocity = np.array([entry.outcome.velocity for entry in entries])
-    laws, bodies = velocity.shape
-    at = np.arange(laws)
-    x = at[:, None] + side_by_side(bodies)
-    for i in range(bodies):
-        label = f"{'body' if chain else 'coordinate'} {i + 1}"
-        top.plot(x[:, i], velocity[:, i], "o", color=colour_of(i), label=label)
-        if result.measured is not None:
-            style: dict[str, Any] = {"lw": 1, "ls": "--", "zorder": 0, "color": colour_of(i)}
-            top.plot([-0.5, laws - 0.5], [result.measured[i]] * 2, **style)
-    top.axhline(0, color="black", lw=0.6)
-    if result.measured is not None:
-        top.plot([], [], color="black", lw=1, ls="--", label="measured")
+    laws, entries = list(result.entries), list(result.entries.values())
+    figure, tops, bottom = panels_of_laws(laws, result.scene, names, title, 1.2)
+    at, velocity = np.arange(len(entries)), np.array([x.outcome.velocity for x in entries])
     wrong = ~np.array([bool(entry.audit.consistent) for entry in entries])
+    for top, velocities in tops:
+        for (i, label, factor), offset in zip(velocities, side_by_side(len(velocities))):
+            x, y, colour = at + offset, factor * velocity[:, i], colour_of(i)
+            top.plot(x, y, "o", color=colour, label=label)
+            top.plot(x[wrong], y[wrong], "x", color="black", ms=10)
+            if result.measured is not None:
+                level = [factor * result.measured[i]] * 2
+                top.plot([-0.5, len(at) - 0.5], level, "--", color=colour, lw=1, zorder=0)
+        top.axhline(0, color="black", lw=0.6)
+    if result.measured is not None:
+        bottom.plot([], [], "--", color="black", lw=1, label="measured")
     if wrong.any():
-        crosses = x[wrong].ravel(), velocity[wrong].ravel()
-        top.plot(*crosses, "x", color="black", ms=10, label="audit failed")
-    top.set_ylabel(f"velocity after the impact [{'m/s' if chain else 'm/s, rad/s'}]")
+        bottom.plot([], [], "x", color="black", ms=10, label="audit failed")
     kept, spread = [x.energy_ratio for x in entries], [x.dispersion_index for x in entries]
     bottom.bar(at - 0.18, kept, 0.32, color=GREY, label="energy ratio T+/T-")
     bottom.bar(at + 0.18, spread, 0.32, color=COLOURS[4], label="dispersion index")
-    bottom.set(xlabel="law", ylabel="ratio, index")
-    many = laws > _UPRIGHT
-    labels = [name if many else wrapped(name) for name in result.entries]
-    bottom.set_xticks(at, labels, fontsize=SMALL, rotation=90 if many else 0)
-    for axes in panels:
-        axes.grid(False, axis="x")
-        for name in result.closest:
-            place, label = list(result.entries).index(name), "closest to the measured velocities"
+    bottom.set_ylabel("ratio, index")
+    for place in map(laws.index, result.closest):
+        label = "closest to the measured velocities"
+        for axes in figure.axes:
             axes.axvspan(place - 0.48, place + 0.48, color=HIGHLIGHT, lw=0, zorder=-1, label=label)
     legend_below(figure, 4)
     return figure
@@ -118,7 +113,8 @@ def energy_plane(result: Comparison, title: str = "") -> Figure:
     'energy ratio K_ER = T+/T-'
     """
     figure, axes = new_figure(5.4, title)
-    allowed = admissible_set(result.scene, result.velocity).sample(0, _OUTCOMES)
+    # dots; ten times more would only be one area
+    allowed = admissible_set(result.scene, result.velocity).sample(0, 4000)
     axes.plot(
         *_kept_and_spread(result, allowed), ".", color=COLOURS[4], alpha=0.3, ms=3, label="allowed"
     )
@@ -155,9 +151,8 @@ def forces(histories: Mapping[str, History], contact: int = -1) -> Figure:
     """
     figure, axes = new_figure(4.2)
     unit, size = readable_unit("s", max(float(h.duration) for h in histories.values()))
-    for j, (name, h) in enumerate(histories.items()):
-        time, force = np.asarray(h.time) / size, np.asarray(h.force[:, contact])
-        axes.plot(time, force, color=colour_of(j), label=name)
+    for name, h in histories.items():
+        axes.plot(np.asarray(h.time) / size, h.force[:, contact], label=name)
     axes.set(xlabel=f"impact time [{unit}]", ylabel="force [N]")
     axes.set_ylim(bottom=0)
     axes.legend()
@@ -234,17 +229,18 @@ def history(result: History, title: str = "") -> Figure:
     """
     _check_one(result)
     unit, size = readable_unit("s", float(result.duration))
-    time, rows = np.asarray(result.time) / size, [result.force, result.gap_velocity, result.energy]
+    time, contacts = np.asarray(result.time) / size, result.force.shape[1]
     figure, panels = new_figure(6.8, title, 3, 1, sharex=True)
-    words = ("force [N]", "gap velocity [m/s]", "stored energy [J]")
-    for axes, values, label in zip(panels, rows, words, strict=True):
-        for j, y in enumerate(np.asarray(values).T):
-            axes.plot(time, y, color=colour_of(j), label=f"contact {j + 1}")
+    rows = {
+        "force [N]": result.force,
+        "gap velocity [m/s]": result.gap_velocity,
+        "stored energy [J]": result.energy,
+    }
+    for axes, (label, values) in zip(panels, rows.items(), strict=True):
+        axes.plot(time, values, label=[f"contact {j + 1}" for j in range(contacts)])
         axes.set_ylabel(label)
-    friction = np.asarray(result.tangential_force)
-    each = friction.shape[1] // result.force.shape[1]
-    for j, y in enumerate(friction.T):
-        colour = colour_of(j // each)
+    for j, y in enumerate(np.asarray(result.tangential_force).T):
+        colour = colour_of(j * contacts // result.tangential_force.shape[1])
         panels[0].plot(time, y, "--", color=colour, label="tangential" if j == 0 else None)
     panels[1].axhline(0, color=GREY, lw=0.8)
     panels[-1].set_xlabel(f"impact time [{unit}]")

@@ -13,20 +13,15 @@ from jimpact.montecarlo.result import MonteCarlo
 from jimpact.montecarlo.statistics import FAILURE
 from jimpact.plot.style import SMALL, WIDTH, colour_of, styled
 
-_BARS = 30  # of a histogram: each is several pixels wide
-_MEAN_AT, _TOP = 1.12, 1.25  # height of the mean, and of the axis, over that of the highest bar
-_BODIES = 6  # histograms; of more bodies only the most scattered are drawn
-_DOT = 4.0  # area of a sample in the map [points^2]
-_TITLE = 80  # letters of a line of the title
-
 
 @styled(MonteCarlo)
 def monte_carlo(result: MonteCarlo, title: str = "") -> Figure:
     """Histograms of every body, and the first samples over two gaps, coloured by the outcome.
 
     Gaps are over the indentation of the contact (delta_c of `ji.theory.gap_scale`), where it is
-    known. The map shows the two gaps that vary most and the most scattered velocity; with one
-    random gap, that velocity against it; without, no map.
+    known. The velocities of a chain share an axis; others may be in m/s or in rad/s. The map shows
+    the two gaps that vary most and the most scattered velocity; with one random gap, that velocity
+    against it; without, no map.
 
     Args:
         result: what `ji.monte_carlo` returned.
@@ -46,27 +41,34 @@ def monte_carlo(result: MonteCarlo, title: str = "") -> Figure:
     5
     """
     scattered = np.argsort(-result.std, kind="stable")
-    bodies = sorted(scattered[:_BODIES].tolist())
+    bodies = sorted(scattered[:6].tolist())  # of more bodies the most scattered
     mapped = result.first["gaps"].shape[1] > 0
     mosaic: Any = [[str(body), "map"] if mapped else [str(body)] for body in bodies]
     figure = Figure(figsize=(WIDTH, max(4.8, 1.5 * len(bodies))))
-    figure.suptitle(title or textwrap.fill(result.description, _TITLE), x=0.01, ha="left")
+    figure.suptitle(title or textwrap.fill(result.description, 80), x=0.01, ha="left")
     panels = figure.subplot_mosaic(mosaic)
+    unit = _unit(result)
     for body in bodies:
         axes = panels[str(body)]
-        axes.sharex(panels[str(bodies[0])])
+        if unit == "m/s":
+            axes.sharex(panels[str(bodies[0])])
+            axes.tick_params(labelbottom=body == bodies[-1])
         _histogram(axes, result, body)
-        axes.tick_params(labelbottom=body == bodies[-1])
-    axes.set_xlabel("velocity after the impact [m/s]\n(dot: mean, bar: 5 % to 95 %)")
+    axes.set_xlabel(f"velocity after the impact [{unit}]\n(dot: mean, bar: 5 % to 95 %)")
     if mapped:
         _map(panels["map"], result, int(scattered[0]))
     return figure
 
 
+def _unit(result: MonteCarlo) -> str:
+    """Of velocities: m/s of a chain; others may turn."""
+    return "m/s" if result.run.scene.walls is not None else "m/s or rad/s"
+
+
 def _histogram(axes: Axes, result: MonteCarlo, body: int) -> None:
     """Share of the samples by velocity; above it mean, and the 5 % and 95 % quantiles."""
     counts, edges = result.counts[body, 1:-1], result.edges[body]
-    each = max(1, len(counts) // _BARS)
+    each = max(1, len(counts) // 30)  # bars, each several pixels wide
     whole = len(counts) // each * each
     bars = counts[:whole].reshape(-1, each).sum(axis=1)
     bars[-1] += counts[whole:].sum()
@@ -74,13 +76,12 @@ def _histogram(axes: Axes, result: MonteCarlo, body: int) -> None:
     colour = colour_of(body)
     ends = np.append(edges[:whole:each], edges[-1])
     axes.stairs(share, ends, color=colour, fill=True)
-    top = float(share.max())
     mean, (low, high) = result.mean[body], result.quantile([0.05, 0.95])[:, body]
-    height = _MEAN_AT * top
+    height = 1.12 * float(share.max())  # above the highest bar
     axes.plot([low, high], [height, height], "|-", color="black", ms=7, lw=1)
     axes.plot(mean, height, "o", color="black", ms=4)  # it may lie outside that range
-    axes.set_ylim(0, _TOP * top)
-    label = f"body {body + 1}: mean {mean:.3f}, std {result.std[body]:.3f} m/s"
+    axes.set_ylim(0, 1.12 * height)
+    label = f"body {body + 1}: mean {mean:.3f}, std {result.std[body]:.3f} {_unit(result)}"
     axes.set_title(label, fontsize=SMALL, color=colour)
     axes.set_ylabel("samples [%]")
     axes.grid(False, axis="x")
@@ -97,14 +98,14 @@ def _map(axes: Axes, result: MonteCarlo, body: int) -> None:
     axes.set_xlabel(x[0][1])
     axes.set_title(f"{fine.sum():,} samples", fontsize=SMALL)
     axes.grid(False)
-    label = f"velocity of body {body + 1} [m/s]"
+    label = f"velocity of body {body + 1} [{_unit(result)}]"
     if len(gaps) == 1:
         axes.plot(x[0][0], velocity, ".", ms=3, color=colour_of(body))
         axes.set_ylabel(label)
         return
     axes.set_ylabel(x[1][1])
     colours = matplotlib.colormaps["cividis"]
-    dots = axes.scatter(x[0][0], x[1][0], s=_DOT, c=velocity, cmap=colours, lw=0, rasterized=True)
+    dots = axes.scatter(x[0][0], x[1][0], s=4, c=velocity, cmap=colours, lw=0, rasterized=True)
     axes.figure.colorbar(dots, ax=axes, label=label)
     axes.set_aspect("equal" if _alike(x[0][0], x[1][0]) else "auto")
 

@@ -21,7 +21,6 @@ from jimpact.plot.style import COLOURS, GREY, colour_of, new_figure, styled
 POINT = 0.02  # radius in which a point mass is drawn, of the range of its coordinates
 _MARKED = ("accumulation", "detachment", "friction")  # events with a line style of their kind
 _MANY = 20  # up to this number of impacts each is marked by a line; more are a grey block
-_BASEPOINTS = 1000  # at which a base is drawn
 _FEW = 6  # curves that one panel shows by default, each with its entry in the legend
 # Share of the scale of its unit below which what a panel shows is rounding. Ten times more would
 # flatten motions that a thousandth of a hair's width is a lot for.
@@ -87,11 +86,11 @@ def motion(
             count = len(which) if bodies is None else 0
             if count > _FEW:
                 which = _largest(which, [_range(values[:, i]) for i, _ in which])
-            for c, (i, word) in enumerate(which):
-                axes.plot(course.time, values[:, i], color=colour_of(c), label=word)
+            at, words = zip(*which, strict=True)
+            axes.plot(course.time, values[:, at], label=words)
             if j == 0 and unit == "m" and system is not None:
                 _moving_base(axes, system, motion)
-            what = which[0][1] if len(which) == 1 else ("coordinates", "velocities")[j]
+            what = words[0] if len(which) == 1 else ("coordinates", "velocities")[j]
             axes.set_ylabel(f"{what} [{unit}]" if unit else what)
             _finish(axes, scales.get(unit, 1.0), f"{_FEW} of {count}" if count > _FEW else "")
         for axes in panels[len(units) : -1, j]:
@@ -121,13 +120,12 @@ def _finish(axes: Axes, scale: float, note: str = "") -> None:
 
 def _scales(labels: list[str], motion: Motion) -> dict[str, float]:
     """Sizes of the values of each unit; of rates what would change these over the motion."""
-    scales = {"rad": 1.0, "m": float(np.nanmax(np.abs(motion.gaps), initial=0.0))}
-    for label, values in zip(labels, np.asarray(motion.q).T, strict=True):
+    scales = {"m": float(np.nanmax(np.abs(motion.gaps), initial=0.0))}
+    sizes = np.nanmax(np.abs(motion.q), axis=0, initial=0.0).tolist()
+    for label, size in zip(labels, sizes, strict=True):
         unit = split_name(label)[1]
-        if unit != "rad":
-            largest = float(np.nanmax(np.abs(values), initial=0.0))
-            scales[unit] = max(scales.get(unit, 0.0), largest)
-    scales = {unit: size or 1.0 for unit, size in scales.items()}
+        scales[unit] = max(scales.get(unit, 0.0), size)
+    scales = {unit: size or 1.0 for unit, size in scales.items()} | {"rad": 1.0}
     duration = _range(np.asarray(motion.time)) or 1.0
     return scales | {f"{unit}/s": size / duration for unit, size in scales.items()}
 
@@ -202,16 +200,14 @@ class _Course(NamedTuple):
 def course_of(motion: Motion) -> _Course:
     """The samples and events of a motion in the order of time."""
     events, rows = motion.events, np.asarray(motion.events.kind) > 0
-    at, place = np.asarray(events.time)[rows], np.asarray(events.q)[rows]
-    jumps = [np.asarray(x)[rows] for x in (events.velocity_before, events.velocity_after)]
-    time = np.concatenate([motion.time, at, at])
-    q = np.concatenate([motion.q, place, place])
-    v = np.concatenate([motion.velocity, *jumps])
-    state = np.repeat([0, 1, 2], [len(motion.time), rows.sum(), rows.sum()])
-    # events at one time: before and after of the first, then of the second
-    number = np.concatenate([np.full(len(motion.time), -1), *(2 * [np.arange(rows.sum())])])
-    order = np.lexsort((state, number, time))
-    return _Course(time[order], q[order], v[order], state[order] == 2)
+    jumps = np.stack([events.velocity_before, events.velocity_after], axis=1)[rows]
+    time = np.concatenate([motion.time, np.repeat(np.asarray(events.time)[rows], 2)])
+    q = np.concatenate([motion.q, np.repeat(np.asarray(events.q)[rows], 2, axis=0)])
+    v = np.concatenate([motion.velocity, jumps.reshape(-1, jumps.shape[-1])])
+    after = np.arange(len(time)) - len(motion.time) + 1
+    # stable: of events at one time before and after of the first, then of the second
+    order = np.argsort(time, kind="stable")
+    return _Course(time[order], q[order], v[order], (after[order] > 0) & (after[order] % 2 == 0))
 
 
 def base_path(system: System, time: np.ndarray) -> np.ndarray:
@@ -232,7 +228,7 @@ def _moving_base(axes: Axes, system: System, motion: Motion) -> None:
     reached = np.asarray(motion.time)[np.isfinite(np.asarray(motion.energy))]
     if not len(reached):
         return
-    time = np.linspace(reached[0], reached[-1], _BASEPOINTS)
+    time = np.linspace(reached[0], reached[-1], 1000)
     path = base_path(system, time)
     words = ("",) if path.shape[1] == 1 else (" x", " y", " z")
     for values, word, style in zip(path.T, words, ("--", ":", "-."), strict=False):
@@ -258,12 +254,12 @@ def _gaps(axes: Axes, motion: Motion, shown: list[int] | None) -> str:
         near = list(np.flatnonzero(least <= far))
         shown = _largest(near, [(closed[:, j].sum(), -least[j]) for j in near])
         note = f"{_FEW} of {values.shape[1]}" if len(near) > _FEW else ""
-    for c, j in enumerate(shown):
+    for j in shown:
         rows = closed[:, j]
         time = np.concatenate([motion.time, np.asarray(events.time)[rows]])
         order = np.argsort(time, kind="stable")
         gap = np.concatenate([values[:, j], np.zeros(rows.sum())])[order]
-        axes.plot(time[order], gap, color=colour_of(c), label=f"contact {j + 1}")
+        axes.plot(time[order], gap, label=f"contact {j + 1}")
     axes.set_ylabel("gaps [m]" if single else "least gap [m]")
     return note
 
@@ -375,15 +371,13 @@ def _range(values: np.ndarray) -> float:
 def draw_body(axes: Axes, body: Body, q: np.ndarray) -> None:
     """A body at q, with what it stands on."""
     point = POINT * (np.ptp(q) or 1.0)
-    curves = [body.outlines(q, point)]
-    floors, ground = [plane_of(*floor) for floor in body.floors], np.zeros((1, 2))
-    set_limits(axes, curves, ground, floors)
-    for points, colour in zip(curves[0], colours_of(body, q, point), strict=True):
+    curves, floors = body.outlines(q, point), [plane_of(*floor) for floor in body.floors]
+    set_limits(axes, [curves], np.zeros((1, 2)), floors)
+    for points, colour in zip(curves, colours_of(body, q, point), strict=True):
         axes.plot(*points.T, color=colour)
-    view = np.array([axes.get_xlim(), axes.get_ylim()])
-    for n, offset in floors:
-        axes.plot(*stretch_of(n, offset, view, ground[0]), color=GREY, lw=2)
-    axes.set(xlim=view[0], ylim=view[1])
+    for angle, offset in body.floors:
+        foot = (-offset * np.sin(angle), offset * np.cos(angle))
+        axes.axline(foot, slope=np.tan(angle), color=GREY, lw=2)
 
 
 def colours_of(body: Body, q: np.ndarray, point: float) -> list[str]:

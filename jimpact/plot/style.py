@@ -2,7 +2,7 @@
 
 import functools
 import inspect
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
@@ -14,6 +14,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from jimpact._checks import check_kind
+from jimpact.bodies.base import split_name
+from jimpact.scene import Scene, dense_mass
 
 SHEET = Path(__file__).with_name("jimpact.mplstyle")
 _SETTINGS = matplotlib.rc_params_from_file(SHEET, use_default_template=False)
@@ -27,7 +29,6 @@ SPREAD = 0.6  # width that the bodies of one group take, of the distance between
 WIDTH = 7.2  # of every picture [in]: legible at half a page's width
 COLUMNS = 2  # panels side by side
 
-_DECADES = 100.0  # an axis that spans less is labelled within its decades, too
 _PLAIN = (1e-3, 1e5)  # numbers within are written without a power of ten
 
 P = ParamSpec("P")
@@ -86,6 +87,50 @@ def new_panels(
     return figure, panels.ravel()[:count]
 
 
+Velocity = tuple[int, str, float]  # index, name, and what it is multiplied by
+
+
+def velocities_by_unit(scene: Scene, names: Sequence[str]) -> dict[str, list[Velocity]]:
+    """The velocities of each unit, by the label of their axis.
+
+    Without names those of a chain are in m/s; others, which may turn or move, are comparable only
+    times the root of their inertia.
+    """
+    label, n = "velocity after the impact", scene.size
+    if names and len(names) != n:
+        raise ValueError(f"Argument `names` must have {n} names, one a velocity, but has {names}.")
+    if not names and scene.walls is not None:
+        return {f"{label} [m/s]": [(i, f"body {i + 1}", 1.0) for i in range(n)]}
+    if not names:
+        root = np.sqrt(np.diag(dense_mass(scene))).tolist()
+        each = [(i, f"coordinate {i + 1}", root[i]) for i in range(n)]
+        return {f"{label} · √inertia [√J]": each}
+    by_unit: dict[str, list[Velocity]] = {}
+    for i, (word, unit) in enumerate(map(split_name, names)):
+        by_unit.setdefault(f"{label} [{unit}]" if unit else label, []).append((i, word, 1.0))
+    return by_unit
+
+
+def panels_of_laws(
+    laws: Sequence[str], scene: Scene, names: Sequence[str], title: str, lowest: float
+) -> tuple[Figure, list[tuple[Axes, list[Velocity]]], Axes]:
+    """Laws side by side: a panel for the velocities of each unit, one of `lowest` [in] below."""
+    units = velocities_by_unit(scene, names)
+    heights = [2.6] * len(units) + [lowest]
+    grid: Any = {"sharex": True, "height_ratios": heights}
+    figure, panels = new_figure(sum(heights) + 2.2, title, len(heights), 1, **grid)
+    for axes, label in zip(panels, units):
+        axes.set_ylabel(label)
+    for axes in panels:
+        axes.grid(False, axis="x")
+    many = len(laws) > 8
+    words = laws if many else [law.replace(", ", ",\n").replace("_", "\n") for law in laws]
+    at = range(len(laws))
+    panels[-1].set_xticks(at, words, fontsize=SMALL, rotation=90 if many else 0)
+    panels[-1].set_xlabel("law")
+    return figure, list(zip(panels, units.values())), panels[-1]
+
+
 def side_by_side(bodies: int) -> np.ndarray:
     """Offsets (bodies,) of the bodies of one group from its place."""
     return (np.arange(bodies) - (bodies - 1) / 2) * SPREAD / bodies
@@ -132,7 +177,7 @@ def logarithmic(axes: Axes, which: str) -> None:
     if high / low < 5:
         axis.set_major_locator(MaxNLocator(4))
     else:
-        few = high / low < _DECADES
+        few = high / low < 100  # labelled within its decades, too
         axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,), numticks=7))
     axis.set_major_formatter(FuncFormatter(lambda x, _: in_words(x)))
     axis.set_minor_formatter(NullFormatter())
@@ -146,8 +191,3 @@ def in_words(x: float) -> str:
     factor = x / 10.0**power
     head = "" if abs(factor - 1) < 1e-6 else f"{factor:.3g}\\cdot"
     return f"${head}10^{{{power}}}$"
-
-
-def wrapped(name: str) -> str:
-    """A label in lines, for a narrow place."""
-    return name.replace(", ", ",\n").replace("_", "\n")

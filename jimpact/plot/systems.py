@@ -13,14 +13,8 @@ from jimpact.bodies.assembly import Bodies
 from jimpact.bodies.base import Body, projected
 from jimpact.motion.system import System
 from jimpact.plot.motions import draw_body
-from jimpact.plot.style import COLOURS, GREY, SMALL, colour_of, new_figure, styled
+from jimpact.plot.style import COLOURS, GREY, colour_of, new_figure, styled, write
 from jimpact.scene import PairNormals, Scene, as_velocity
-
-_GAP = 0.5  # how wide an open contact is drawn, in radii of the largest body
-_LEAST = 0.35  # radius of a small body, likewise
-_ARROW = 2.2  # length of the fastest velocity, likewise
-_THICKEST = 8.0  # line of the largest impulse [points]; ten times more hides the bodies
-_FAINT = 1e-3  # impulses over the largest one that are not drawn; ten times more breaks chains
 
 
 @styled()
@@ -100,17 +94,16 @@ def force_chains(pile: Bodies, q: Any, scene: Scene, impulse: Any, title: str = 
     first, second = scene.pairs.neighbours.bodies.T
     ends = np.where((second < 0)[:, None], _on_walls(pile, scene.pairs, centres), centres[second])
     size = np.abs(p) / (np.abs(p).max() or 1.0)
-    drawn = np.flatnonzero(size > _FAINT)
+    drawn = np.flatnonzero(size > 1e-3)  # ten times more breaks chains
     drawn = drawn[np.argsort(size[drawn])]
     figure, axes = new_figure(5.0, title)
     for outline in pile.outlines(np.asarray(q, float), 0.0):
         axes.plot(*outline.T, color=GREY, lw=0.4, alpha=0.5)
     lines = np.stack([centres[first], ends], axis=1)[drawn]
     lines = lines if d == 2 else projected(lines)
-    widths = _THICKEST * size[drawn]
-    axes.add_collection(
-        LineCollection(list(lines), linewidths=widths, colors=COLOURS[0], alpha=0.8)
-    )
+    widths = 8 * size[drawn]  # points; ten times more hides the bodies
+    chains = LineCollection(list(lines), linewidths=widths, colors=COLOURS[0], alpha=0.8)
+    axes.add_collection(chains)
     axes.autoscale_view()
     axes.set(xlabel="x [m]", ylabel="height [m]", aspect="equal")
     return figure
@@ -134,9 +127,10 @@ def _on_walls(pile: Bodies, pairs: PairNormals, centres: np.ndarray) -> np.ndarr
 def _row(axes: Axes, scene: Scene, velocity: np.ndarray) -> None:
     """A chain as a row of circles with arrows."""
     mass = np.asarray(scene.mass, float)
-    radius = np.maximum((mass / mass.max()) ** 0.5, _LEAST)
+    radius = np.maximum((mass / mass.max()) ** 0.5, 0.35)  # small ones are drawn larger
     left, right = scene.walls or (False, False)
-    apart = np.where(np.asarray(scene.closed), 0.0, _GAP)
+    # in radii of the largest body, as all lengths here
+    apart = np.where(np.asarray(scene.closed), 0.0, 0.5)
     before = np.concatenate([apart[:1] if left else [0.0], apart[left : len(mass) - 1 + left]])
     centre = np.cumsum(before + np.concatenate([radius[:1], radius[:-1] + radius[1:]]))
     end = centre[-1] + radius[-1]
@@ -144,11 +138,11 @@ def _row(axes: Axes, scene: Scene, velocity: np.ndarray) -> None:
     for i, (x, r, v) in enumerate(zip(centre, radius, velocity, strict=True)):
         colour = colour_of(i)
         axes.add_patch(Circle((x, 0.0), r, fc=colour, alpha=0.35, ec=colour))
-        axes.text(x, 0.0, f"{i + 1}", ha="center", va="center")
-        axes.text(x, -1.35, f"{mass[i]:.3g} kg", ha="center", va="center", fontsize=SMALL)
-        axes.text(x, 1.75, f"{v:.3g} m/s", ha="center", va="center", fontsize=SMALL)
+        write(axes, (x, 0.0), f"{i + 1}", fontsize="medium")
+        write(axes, (x, -1.35), f"{mass[i]:.3g} kg")
+        write(axes, (x, 1.75), f"{v:.3g} m/s")
         if v:
-            tip = x + _ARROW * v / fastest / 2
+            tip = x + 2.2 * v / fastest / 2
             arrow = {"arrowstyle": "-|>", "color": colour, "lw": 2}
             axes.annotate("", (tip, 1.3), (2 * x - tip, 1.3), arrowprops=arrow)
     for wall, x in ((left, -0.3), (right, end + (apart[-1] if right else 0.0))):

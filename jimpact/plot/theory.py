@@ -16,7 +16,6 @@ from jimpact.plot.style import (
     GREY,
     SMALL,
     by_code,
-    colour_of,
     legend_below,
     mark,
     new_figure,
@@ -35,10 +34,6 @@ from jimpact.theory.rocking import (
 )
 
 _FILL = "#DCE9F3"
-# Beyond two contacts: projections onto pairs of the first ones up to this number.
-_MOST_CONTACTS = 4
-_SAMPLES = 2000  # points drawn of a set of outcomes
-_SHORTEST = 0.5  # sides shorter than this part of the radius are not drawn: no space for a name
 
 _OUTCOME_COLOURS = ("#999999", "#009E73", "#E69F00", "#56B4E9", "#EEEEEE")  # as OUTCOMES
 
@@ -71,15 +66,13 @@ def admissible_set(
     >>> len(ji.plot.admissible_set(result, {"Newton's cradle": [0.0, 0.0, 1.0]}).axes)
     1
     """
-    marked = {}
-    for name, velocity in (outcomes or {}).items():
-        v = np.asarray(velocity, float)
+    marked = {name: np.asarray(v, float) for name, v in (outcomes or {}).items()}
+    for name, v in marked.items():
         if v.shape != (result.scene.size,):
             raise ValueError(
                 f"Argument `outcomes` must have arrays of shape ({result.scene.size},), but "
                 f"{name!r} has shape {v.shape}."
             )
-        marked[name] = v
     closed = np.flatnonzero(np.asarray(result.scene.closed))
     plane = result.dimension == 2 and len(closed) == 2
     closed = closed if len(closed) else np.arange(result.scene.contacts)
@@ -158,7 +151,7 @@ def _line(
     b = start @ direction
     length = -b + np.sqrt(max(b * b + frame.radius**2 - start @ start, 0.0))
     end = start + length * direction
-    if length < _SHORTEST * frame.radius:
+    if length < 0.5 * frame.radius:  # no space for a name
         return
     axes.plot(*np.stack([start, end]).T, color=GREY, lw=1.0, ls=style)
     angle = np.degrees(np.arctan2(direction[1], direction[0]))
@@ -172,26 +165,26 @@ def _projections(
     result: AdmissibleSet, marked: Mapping[str, np.ndarray], closed: np.ndarray, title: str
 ) -> Figure:
     """Samples of the set in pairs of normalized gap velocities."""
-    contacts = closed[:_MOST_CONTACTS]
-    samples = result.sample(0, _SAMPLES)
-    unit = np.asarray(result.scene.normals / kinetic_norm(result.scene)[None, :], float)[
-        :, contacts
-    ]
+    contacts = closed[:4]  # projections onto pairs of the first ones
+    samples = result.sample(0, 2000)
+    norm = np.asarray(kinetic_norm(result.scene), float)
+    unit = (np.asarray(result.scene.normals, float) / norm)[:, contacts]
     cloud, energies = samples @ unit, _energy_ratio(result, samples)
     pairs = list(combinations(range(len(contacts)), 2)) or [(0, 0)]
     figure, grid = new_panels(len(pairs), 3.1, 0.8, title)
+    energy = "energy ratio $T^+ / T^-$"
     for axes, (i, j) in zip(grid, pairs):
         single = i == j
         y = energies if single else cloud[:, j]
-        dots = axes.scatter(cloud[:, i], y, c=energies, s=5, cmap="viridis", lw=0, vmin=0, vmax=1)
+        dots = axes.scatter(cloud[:, i], y, c=energies, s=5, lw=0, vmin=0, vmax=1)
         for k, (name, v) in enumerate(marked.items()):
             point = v @ unit
             height = _energy_ratio(result, v) if single else point[j]
             mark(axes, (point[i], height), name, k, bool(result.contains(v)))
-        axes.set_xlabel(_gap_label(contacts[i]), fontsize=SMALL)
-        energy = "energy ratio $T^+ / T^-$"
-        axes.set_ylabel(energy if single else _gap_label(contacts[j]), fontsize=SMALL)
-    figure.colorbar(dots, ax=grid.tolist(), label="energy ratio $T^+ / T^-$")
+        labels = [f"normalized gap velocity {contacts[c] + 1} after [√J]" for c in (i, j)]
+        axes.set_xlabel(labels[0], fontsize=SMALL)
+        axes.set_ylabel(energy if single else labels[1], fontsize=SMALL)
+    figure.colorbar(dots, ax=grid.tolist(), label=energy)
     legend_below(figure, 4)
     return figure
 
@@ -200,11 +193,6 @@ def _energy_ratio(result: AdmissibleSet, velocity: np.ndarray) -> np.ndarray:
     """T+ / T- (...,) of velocities (..., n)."""
     energy = 0.5 * np.sum(velocity @ dense_mass(result.scene) * velocity, axis=-1)
     return energy / result.energy if result.energy else np.ones_like(energy)
-
-
-def _gap_label(contact: int) -> str:
-    """The label of an axis."""
-    return f"normalized gap velocity {contact + 1} after [√J]"
 
 
 @styled(RockingDispersion)
@@ -231,8 +219,7 @@ def rocking_dispersion(result: RockingDispersion, title: str = "") -> Figure:
     figure, panels = _panels(result, title, r"dispersion $|\dot y_A^+ / \dot y_B^-|$")
     theta, size = np.degrees(result.kinetic_angle), np.abs(result.dispersion)
     for j, axes in enumerate(panels):
-        for k, e in enumerate(np.asarray(result.restitution)):
-            axes.plot(theta, size[:, j, k], color=colour_of(k), lw=1.6, label=f"e = {e:g}")
+        axes.plot(theta, size[:, j], label=[f"e = {e:g}" for e in np.asarray(result.restitution)])
     _critical_lines(panels, result)
     panels[0].set_ylim(bottom=0)  # shared by all, so last
     legend_below(figure, 6)

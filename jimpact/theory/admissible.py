@@ -1,7 +1,7 @@
 """All outcomes of an impact that mechanics allows, whatever the law."""
 
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -117,9 +117,7 @@ class AdmissibleSet:
         ends = self.coordinates.arc()
         if ends is None:
             return np.zeros((0, self.scene.size))
-        angle = np.linspace(*ends, points)
-        u = self.coordinates.radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-        arc = self._velocity(u)
+        arc = self._velocity(self.coordinates.on_circle(np.linspace(*ends, points)))
         first = np.asarray(self.scene.normals)[:, int(np.argmax(self.scene.closed))]
         return arc[::-1] if arc[0] @ first > arc[-1] @ first else arc
 
@@ -137,7 +135,29 @@ class AdmissibleSet:
 
     def __str__(self) -> str:
         """A table of several lines."""
-        return _in_words(self)
+        closed = np.asarray(self.scene.closed)
+        approaching = np.asarray(gap_velocity(self.scene, self.velocity))[closed] < 0
+        head = f"closed contacts: {int(closed.sum())}, approaching: {int(approaching.sum())};"
+        smallest = _ZERO * max(1e-300, float(np.abs(self.velocity).max()))
+
+        def show(x: float, width: int = 0) -> str:
+            """A velocity; 0 within rounding."""
+            return f"{x if abs(x) > smallest else 0.0:{width}.6g}"
+
+        if self.dimension == 0:
+            return f"{head} one admissible outcome, v+ = ({', '.join(map(show, self.centre))})"
+        lines = [
+            f"{head} admissible outcomes of dimension {self.dimension}",
+            f"energy       from {self.least_energy:.6g} J (plastic) to {self.energy:.6g} J (T-)",
+            "coordinate          v-         least       plastic      greatest   [m/s]",
+        ]
+        columns = zip(self.velocity, self.bounds[:, 0], self.plastic, self.bounds[:, 1])
+        for i, (before, *after) in enumerate(columns):
+            lines.append(f"{i + 1:10d}{show(before, 12)}" + "".join(show(x, 14) for x in after))
+        if self.dimension == 2:
+            for name, v in zip("AB", self.conserving_arc(2)):
+                lines.append(f"T+ = T- at {name} ({', '.join(map(show, v))})")
+        return "\n".join(lines)
 
     @property
     def _size(self) -> float:
@@ -197,11 +217,10 @@ def admissible_set(scene: Scene, velocity: Any) -> AdmissibleSet:
     unit = unit / np.linalg.norm(unit, axis=0)
     approach = unit.T @ y < -_APPROACH * np.finfo(scene.mass.dtype).eps * np.linalg.norm(y)
     energy = 0.5 * float(y @ y)
+    outcomes = partial(AdmissibleSet, scene, start, energy=energy, tolerance=tolerance)
     if not approach.any():
         alone = CappedPolyhedron(np.zeros((0, 0)), np.zeros(0), 0.0)
-        return AdmissibleSet(
-            scene, start, start, np.zeros((len(start), 0)), alone, energy, tolerance
-        )
+        return outcomes(centre=start, axes=np.zeros((len(start), 0)), coordinates=alone)
     unit = free @ unit
     floor = _SINGULAR * np.finfo(scene.mass.dtype).eps * unit.shape[1]
     unit = unit[:, np.sum(unit**2, axis=0) > floor]  # not what the constraints hold anyway
@@ -215,15 +234,8 @@ def admissible_set(scene: Scene, velocity: Any) -> AdmissibleSet:
     redundant = basis.shape[1] < unit.shape[1]
     part, centre, axes = capped_polyhedron(rows, offset, float(np.linalg.norm(before)), redundant)
     rest = y - basis @ before + basis @ centre
-    return AdmissibleSet(
-        scene,
-        start,
-        np.linalg.solve(root.T, rest),
-        np.linalg.solve(root.T, basis @ axes),
-        part,
-        energy,
-        tolerance,
-    )
+    centre, axes = np.linalg.solve(root.T, rest), np.linalg.solve(root.T, basis @ axes)
+    return outcomes(centre=centre, axes=axes, coordinates=part)
 
 
 def _unconstrained(scene: Scene, root: np.ndarray, y: np.ndarray, tolerance: float) -> np.ndarray:
@@ -237,33 +249,3 @@ def _unconstrained(scene: Scene, root: np.ndarray, y: np.ndarray, tolerance: flo
             f"{np.linalg.norm(basis.T @ y):.3g} off in the kinetic norm."
         )
     return np.eye(len(y)) - basis @ basis.T
-
-
-def _in_words(outcomes: AdmissibleSet) -> str:
-    """The set as a table."""
-    closed = np.asarray(outcomes.scene.closed)
-    approaching = np.asarray(gap_velocity(outcomes.scene, outcomes.velocity))[closed] < 0
-    head = f"closed contacts: {int(closed.sum())}, approaching: {int(approaching.sum())};"
-    smallest = _ZERO * max(1e-300, float(np.abs(outcomes.velocity).max()))
-
-    def show(x: float, width: int = 0) -> str:
-        """A velocity; 0 within rounding."""
-        return f"{x if abs(x) > smallest else 0.0:{width}.6g}"
-
-    if outcomes.dimension == 0:
-        return f"{head} one admissible outcome, v+ = ({', '.join(map(show, outcomes.centre))})"
-    lines = [
-        f"{head} admissible outcomes of dimension {outcomes.dimension}",
-        f"energy       from {outcomes.least_energy:.6g} J (plastic) "
-        f"to {outcomes.energy:.6g} J (T-)",
-        "coordinate          v-         least       plastic      greatest   [m/s]",
-    ]
-    columns = np.column_stack(
-        [outcomes.velocity, outcomes.bounds[:, 0], outcomes.plastic, outcomes.bounds[:, 1]]
-    )
-    for i, row in enumerate(columns):
-        lines.append(f"{i + 1:10d}{show(row[0], 12)}" + "".join(show(x, 14) for x in row[1:]))
-    if outcomes.dimension == 2:
-        for name, v in zip("AB", outcomes.conserving_arc(2)):
-            lines.append(f"T+ = T- at {name} ({', '.join(map(show, v))})")
-    return "\n".join(lines)

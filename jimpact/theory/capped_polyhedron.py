@@ -103,25 +103,23 @@ class CappedPolyhedron(NamedTuple):
     def arc(self) -> tuple[float, float] | None:
         """First and last angle of the part of the circle |w| = r inside; d = 2 only.
 
-        The set is expected to have one such part; of several, the longest is returned.
+        The set is expected to have one such part; of several, one is returned.
         """
         angle = np.arctan2(self.rows[:, 1], self.rows[:, 0])
         cut = np.abs(self.offset) <= self.radius
         half = np.arccos(self.offset[cut] / self.radius)
         ends = np.sort(np.concatenate([angle[cut] - half, angle[cut] + half]) % (2 * np.pi))
         if len(ends) == 0:
-            inside = self.excess(self._on_circle(np.zeros(1)))[0] <= _ROUNDING * self.radius
+            inside = self.excess(self.on_circle(np.zeros(1)))[0] <= _ROUNDING * self.radius
             return (0.0, 2 * np.pi) if inside else None
         width = np.diff(np.append(ends, ends[0] + 2 * np.pi))
-        feasible = self.excess(self._on_circle(ends + 0.5 * width)) <= _ROUNDING * self.radius
+        feasible = self.excess(self.on_circle(ends + 0.5 * width)) <= _ROUNDING * self.radius
         if feasible.all():
             return 0.0, 2 * np.pi
-        pieces = []
-        for first in np.flatnonzero(feasible & ~np.roll(feasible, 1)):
-            run = np.roll(feasible, -first)
-            length = np.roll(width, -first)[: np.argmin(run)].sum()
-            pieces.append((float(ends[first]), float(ends[first] + length)))
-        return max(pieces, key=lambda piece: piece[1] - piece[0], default=None)
+        first = int(np.argmax(feasible & ~np.roll(feasible, 1)))
+        run, widths = np.roll(feasible, -first), np.roll(width, -first)
+        length = widths[: np.argmin(run)].sum()
+        return (float(ends[first]), float(ends[first] + length)) if run[0] else None
 
     def boundary(self, arc_points: int) -> np.ndarray:
         """The boundary, counter-clockwise, with its corners; d = 2 only."""
@@ -132,13 +130,13 @@ class CappedPolyhedron(NamedTuple):
                 corners.append(np.linalg.solve(pair, self.offset[[i, j]])[None])
         arc = self.arc()
         if arc is not None:
-            corners.append(self._on_circle(np.linspace(*arc, arc_points)))
+            corners.append(self.on_circle(np.linspace(*arc, arc_points)))
         points = np.concatenate(corners)
         points = points[self.excess(points) <= _ROUNDING * self.radius]
         relative = points - self.interior()
         return points[np.argsort(np.arctan2(relative[:, 1], relative[:, 0]))]
 
-    def _on_circle(self, angle: np.ndarray) -> np.ndarray:
+    def on_circle(self, angle: np.ndarray) -> np.ndarray:
         """Points (..., 2) of the circle at angles [rad]."""
         return self.radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
@@ -152,30 +150,26 @@ def capped_polyhedron(
     """
     from scipy.optimize import linprog  # late: slow to import
 
-    length = np.linalg.norm(rows, axis=1)
-    rows, offset = rows[length > 0] / length[length > 0, None], offset[length > 0]
-    offset = offset / length[length > 0]
+    rows, offset = _unit_rows(rows, offset, 0.0)
     box = [(-radius, radius)] * rows.shape[1]
     flat = np.zeros(len(rows), bool)
-    for i, (row, low) in enumerate(zip(rows, offset)):
-        if may_be_flat:
-            highest = -linprog(-row, -rows, -offset, bounds=box).fun
-            flat[i] = highest - low <= _FLAT * radius
-    centre = np.zeros(rows.shape[1])
-    axes = np.eye(rows.shape[1])
-    if flat.any():
-        _, singular, basis = np.linalg.svd(rows[flat])
-        rank = int((singular > _INDEPENDENT).sum())
-        centre = np.linalg.lstsq(rows[flat], offset[flat], rcond=_INDEPENDENT)[0]
-        axes = basis[rank:].T
-        rows, offset = rows[~flat], offset[~flat] - rows[~flat] @ centre
-    within = rows @ axes
-    length = np.linalg.norm(within, axis=1)
-    independent = length > _INDEPENDENT
+    if may_be_flat:
+        highest = [-linprog(-row, -rows, -offset, bounds=box).fun for row in rows]
+        flat = np.array(highest) - offset <= _FLAT * radius
+    _, singular, basis = np.linalg.svd(rows[flat])
+    axes = basis[int((singular > _INDEPENDENT).sum()) :].T
+    centre = np.linalg.lstsq(rows[flat], offset[flat], rcond=_INDEPENDENT)[0]
     inner = float(np.sqrt(max(radius**2 - float(centre @ centre), 0.0)))
-    within = within[independent] / length[independent, None]
-    offset = offset[independent] / length[independent]
-    return CappedPolyhedron(within, offset, inner), centre, axes
+    offset = offset[~flat] - rows[~flat] @ centre
+    within = _unit_rows(rows[~flat] @ axes, offset, _INDEPENDENT)
+    return CappedPolyhedron(*within, inner), centre, axes
+
+
+def _unit_rows(rows: np.ndarray, offset: np.ndarray, least: float) -> tuple[np.ndarray, np.ndarray]:
+    """The rows longer than `least` and their offsets, scaled to unit length."""
+    length = np.linalg.norm(rows, axis=1)
+    kept = length > least
+    return rows[kept] / length[kept, None], offset[kept] / length[kept]
 
 
 def least_squares(matrix: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -237,12 +231,10 @@ def cone_facets(generators: np.ndarray) -> np.ndarray:
     if rank == 1:  # hulls begin with two dimensions
         return unit[:, :1] if np.ptp(unit) == 0 else np.zeros((0, 1))
     outward = ConvexHull(np.vstack([np.zeros(rank), unit.T])).equations
-    through_origin = outward[np.abs(outward[:, -1]) <= _INDEPENDENT, :-1]
-    facets: list[np.ndarray] = []
-    for normal in -through_origin:  # a facet that is no simplex is reported in parts
-        if not any(np.linalg.norm(normal - known) <= _INDEPENDENT for known in facets):
-            facets.append(normal)
-    return np.array(facets).reshape(-1, rank)
+    normals = -outward[np.abs(outward[:, -1]) <= _INDEPENDENT, :-1]
+    # a facet that is no simplex is reported in parts; one that stays twice does no harm
+    _, first = np.unique(np.round(normals / _INDEPENDENT), axis=0, return_index=True)
+    return normals[np.sort(first)]
 
 
 def _chord(points: np.ndarray, steps: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:

@@ -157,21 +157,15 @@ class FrictionBounds(NamedTuple):
     def __str__(self) -> str:
         """The four conditions, a line each."""
 
-        def word(holds: bool) -> str:
-            """A sufficient condition that fails says nothing."""
-            return "holds" if holds else "does not hold, which decides nothing"
-
-        first, third = self.g_mu_bound < 1, self.restitution_bound < 1
+        words = {True: "holds", False: "does not hold, which decides nothing"}
+        first, third = words[self.g_mu_bound < 1], words[self.restitution_bound < 1]
         ratio = f"|qn-| / |qt-| >= {self.least_ratio:.6g}" if self.condition_i else "no bound"
-        return "\n".join(
-            [
-                f"Prop. 6.6 (1)    {self.g_mu_bound:.6g} < 1, so that G^mu > 0: {word(first)}",
-                f"Prop. 6.6 (3)    {self.restitution_bound:.6g} < 1, so that Mbar > 0: "
-                f"{word(third)}",
-                f"Theorem 6.2 (i)  lambda_min(Mbar) = {self.m_bar_least:.6g} > lambda_max(K) = "
-                f"{self.k_largest:.6g}: {word(self.condition_i)}",
-                f"Theorem 6.2 (ii) energy surely decreases where: {ratio}",
-            ]
+        return (
+            f"Prop. 6.6 (1)    {self.g_mu_bound:.6g} < 1, so that G^mu > 0: {first}\n"
+            f"Prop. 6.6 (3)    {self.restitution_bound:.6g} < 1, so that Mbar > 0: {third}\n"
+            f"Theorem 6.2 (i)  lambda_min(Mbar) = {self.m_bar_least:.6g} > lambda_max(K) = "
+            f"{self.k_largest:.6g}: {words[self.condition_i]}\n"
+            f"Theorem 6.2 (ii) energy surely decreases where: {ratio}"
         )
 
 

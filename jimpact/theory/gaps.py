@@ -93,9 +93,8 @@ class GapSensitivity:
 
     def covariance(self, gap_covariance: Any) -> np.ndarray:
         """Linearized covariance (n, n) of velocities, `J Sigma J^T`, Sigma = `gap_covariance`."""
-        sigma = np.asarray(gap_covariance, float)
-        m = len(self.gaps)
-        check_shape("gap_covariance", sigma, (m, m), "a row and a column per contact")
+        sigma, shape = np.asarray(gap_covariance, float), (len(self.gaps),) * 2
+        check_shape("gap_covariance", sigma, shape, "a row and a column per contact")
         return self.jacobian @ sigma @ self.jacobian.T
 
     @property
@@ -109,12 +108,11 @@ class GapSensitivity:
 
     def __str__(self) -> str:
         """The linearized outcome and, if sampled, the spread."""
-        m = len(self.gaps)
         at = ", ".join(f"{gap:g}" for gap in self.gaps)
         lines = [f"Linearized at gaps ({at}) m, status {self.status}; d v+ / d gap [1/s]:"]
-        for i in range(len(self.velocity)):
-            row = "".join(f"{self.jacobian[i, j]:13.5g}" for j in range(m))
-            lines.append(f"v{i + 1}+ = {self.velocity[i]:10.6f} m/s: {row}")
+        for i, (v, row) in enumerate(zip(self.velocity, self.jacobian)):
+            numbers = "".join(f"{x:13.5g}" for x in row)
+            lines.append(f"v{i + 1}+ = {v:10.6f} m/s: {numbers}")
         return "\n".join(lines + ([] if self.sampled is None else self._comparison()))
 
     def _comparison(self) -> list[str]:

@@ -34,13 +34,14 @@ class HanGilmoreOutcome:
     endless: bool = False
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass
 class _Node:
     """Normalized gap and slip velocities (m + t,), impulses (m + t,) so far, and the rules."""
 
     state: np.ndarray
     p: np.ndarray
-    rules: tuple[str, ...]
+    rules: tuple[str, ...] = ()
+    endless: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,29 +73,25 @@ class _Problem:
         coupled: np.ndarray = blocks.max(axis=(0, 2)) > SINGULAR
         return coupled
 
-    def ends(self, node: _Node) -> bool:
-        """Whether no closed contact approaches."""
-        return bool(np.all(node.state[: self.contacts][self.closed] >= -ZERO))
+    def approach(self, node: _Node) -> float:
+        """The largest of a closed contact, 0 where none approaches."""
+        return float(np.max(-node.state[: self.contacts][self.closed], initial=0.0))
 
 
-class _VisitedStates:
-    """Velocities visited so far, sorted into cells by a generic weighted sum."""
+Cells = dict[int, list[np.ndarray]]
 
-    def __init__(self, first: np.ndarray):
-        """With one state."""
-        self._weights = np.sqrt(np.arange(2.0, len(first) + 2))
-        self._width = 2 * ZERO * float(self._weights.sum())  # equal ones are in adjacent cells
-        self._cells: dict[int, list[np.ndarray]] = {}
-        self.add(first)
 
-    def add(self, qn: np.ndarray) -> bool:
-        """Whether `qn` is new; then it is added."""
-        cell = int(np.floor(qn @ self._weights / self._width))
-        near = [old for k in (cell - 1, cell, cell + 1) for old in self._cells.get(k, [])]
-        if any(np.abs(old - qn).max() <= ZERO for old in near):
-            return False
-        self._cells.setdefault(cell, []).append(qn)
-        return True
+def _is_new(state: np.ndarray, visited: Cells) -> bool:
+    """Whether a state was not visited; it is now. Cells are those of a generic weighted sum."""
+    weights = np.sqrt(np.arange(2.0, len(state) + 2))
+    cell = int(
+        np.floor(state @ weights / (2 * ZERO * weights.sum()))
+    )  # that of equal ones, or next to it
+    near = [old for k in (cell - 1, cell, cell + 1) for old in visited.get(k, [])]
+    if any(np.abs(old - state).max() <= ZERO for old in near):
+        return False
+    visited.setdefault(cell, []).append(state)
+    return True
 
 
 def han_gilmore(
@@ -149,26 +146,25 @@ def han_gilmore(
     as_whole("max_depth", max_depth, 1)
     v, problem = np.asarray(velocity, float), _problem(scene, restitution, friction)
     m, state = problem.contacts, problem.rows.T @ v / problem.root
-    size = float(np.max(-state[:m][problem.closed], initial=0.0))
+    start = _Node(state, np.zeros_like(state))
+    size = problem.approach(start)
     if size == 0.0:
-        return [HanGilmoreOutcome(v, np.zeros(m), (), np.zeros(len(state) - m))]
+        return [HanGilmoreOutcome(v, start.p[:m], (), start.p[m:])]
+    start.state = state / size
     found: list[_Node] = []
-    endless: list[bool] = []
-    frontier = [_Node(state / size, np.zeros_like(state), ())]
-    visited = _VisitedStates(state / size)
+    frontier, visited = [start], Cells()
+    _is_new(start.state, visited)
     while frontier:
         following: list[_Node] = []
         for node in frontier:
             for child in _impacts(problem, node):
-                new, ended = visited.add(child.state), problem.ends(child)
-                if new and not ended:
-                    following.append(child)
-                elif new:
-                    found.append(child)
-                    endless.append(False)
-                if ended and np.any(child.state[:m][problem.closed] < -ROUNDING):
-                    for k, other in enumerate(found):
-                        endless[k] |= bool(np.abs(other.state - child.state).max() <= 2 * ZERO)
+                approach = problem.approach(child)
+                if _is_new(child.state, visited):
+                    (found if approach <= ZERO else following).append(child)
+                if ROUNDING < approach <= ZERO:
+                    for other in found:
+                        near = np.abs(other.state - child.state).max() <= 2 * ZERO
+                        other.endless |= bool(near)
         if following and len(following[0].rules) >= max_depth:
             raise RuntimeError(
                 f"A branch of the tree has more than `max_depth` = {max_depth} impacts "
@@ -176,10 +172,10 @@ def han_gilmore(
             )
         frontier = following
     outcomes = []
-    for node, without_end in zip(found, endless):
+    for node in found:
         p = node.p * size / problem.root
         after = v + problem.mobility @ p
-        outcomes.append(HanGilmoreOutcome(after, p[:m], node.rules, p[m:], without_end))
+        outcomes.append(HanGilmoreOutcome(after, p[:m], node.rules, p[m:], node.endless))
     return outcomes
 
 
@@ -255,7 +251,7 @@ def _impact(problem: _Problem, node: _Node, at: np.ndarray, slides: np.ndarray) 
             return None
         if np.any(slides * state[m + at] < -ZERO):
             return None
-    return _Node(state, node.p + p, ())
+    return _Node(state, node.p + p)
 
 
 def _active_sets(

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_numbers, check_shape, check_values
+from jimpact._checks import as_numbers, check_values
 from jimpact.compiling import full_precision
 from jimpact.contact import kinetic_norm, normalized_delassus, normalized_gap_velocity
 from jimpact.scene import Scene, kinetic_energy, velocity_change
@@ -68,7 +68,8 @@ def margin(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
     fixed = jax.lax.stop_gradient(q)
     largest = jnp.abs(fixed).max()
     fixed = fixed / jnp.where(largest > 0, largest, 1.0)
-    supports = _supports(m).astype(q.dtype)
+    # all nonempty sets of indices, as rows of zeros and ones
+    supports = ((np.arange(1, 2**m)[:, None] >> np.arange(m)) & 1).astype(q.dtype)
     inside = supports[:, :, None] * supports[:, None, :]
     outside = (m + 1.0) * (1 - supports)  # above every eigenvalue of Q_SS, which are at most m
     blocks = inside * fixed[None] + outside[:, :, None] * jnp.eye(m, dtype=q.dtype)[None]
@@ -128,11 +129,6 @@ def _size(matrix: jax.Array) -> int:
     return int(shape[0])
 
 
-def _supports(m: int) -> np.ndarray:
-    """All nonempty subsets of m indices as rows of zeros and ones."""
-    return (np.arange(1, 2**m)[:, None] >> np.arange(m)[None, :]) & 1
-
-
 _compiled_margin = jax.jit(margin)
 
 
@@ -178,7 +174,40 @@ class MatrixAudit(NamedTuple):
 
     def __str__(self) -> str:
         """The verdict and each proposition, a line each."""
-        return _in_words(self)
+        kinematic, kinetic, energetic = self.kinematic, self.kinetic, self.energetic
+        verdict = "admissible" if self.admissible else "NOT admissible"
+        lines = [f"restitution matrix: {verdict} for all pre-impact velocities qn- <= 0"]
+        for title, sign, what in (
+            ("kinematic  (6.2 i)  E >= 0", kinematic, "still approaches"),
+            ("kinetic    (6.2 ii) G^-1 (I + E) >= 0", kinetic, "would have to pull"),
+        ):
+            i, j = (k + 1 for k in sign.where)
+            text = f"yes, least entry {sign.worst:.4g}"
+            if not sign.holds:
+                text = f"NO, entry ({i}, {j}) is {sign.worst:.4g}: "
+                text += f"contact {i} {what} when only {j} closes"
+            lines.append(f"{title}: {text}")
+        text = {
+            "yes": f"yes, every impact loses energy (margin {energetic.margin:.4g})",
+            "no": f"NO, energy grows (margin {energetic.margin:.4g})",
+            "boundary": "boundary, energy never grows but is conserved",
+        }[energetic.answer]
+        if energetic.answer != "yes":
+            text += (
+                f" for qn- = {_row(self.worst_normal_velocity)}, v- = {_row(self.worst_velocity)}"
+            )
+        lines.append(f"energetic  (6.3)    G^-1 - E^T G^-1 E copositive: {text}")
+        if self.spectral is None:
+            text = "not applicable, E is not self-adjoint (G^-1 E not symmetric)"
+        else:
+            text = f"{'yes' if self.spectral else 'NO'}, rho = {self.spectral_radius:.4g}"
+        lines.append(f"spectral   (6.4)    rho(E) <= 1: {text}")
+        holds = "yes" if self.singular_values else "does not hold, which decides nothing"
+        lines.append(
+            f"sufficient (6.5)    sigma_max(E) = {self.singular_value:.4g} <= "
+            f"{self.singular_value_bound:.4g}: {holds}"
+        )
+        return "\n".join(lines)
 
 
 @full_precision
@@ -230,8 +259,13 @@ def audit_matrix(scene: Scene, matrix: Any, tolerance: float | None = None) -> M
     >>> result.admissible, result.energetic.answer, result.worst_velocity.round(2).tolist()
     (False, 'no', [0.47, 0.47, -0.94])
     """
-    g, norm, e, closed = _closed_problem(scene, matrix)
+    array = as_numbers(
+        "matrix", matrix, (scene.contacts,) * 2, "one row and one column per contact"
+    )
     check_values("tolerance", tolerance, low=0.0)
+    g, closed = _closed_delassus(scene)
+    _check_independent(scene, g)
+    e = np.asarray(array, float)[np.ix_(closed, closed)]
     if tolerance is None:
         tolerance = COPOSITIVITY_TOLERANCE.get(str(scene.mass.dtype), 1e-4)
     inverse = np.linalg.inv(g)
@@ -239,7 +273,7 @@ def audit_matrix(scene: Scene, matrix: Any, tolerance: float | None = None) -> M
     scale = max(np.abs(inverse).max(), np.abs(e.T @ inverse @ e).max())
     energetic = copositivity(q, tolerance, scale)
     impulse = np.zeros(len(closed))
-    impulse[closed] = inverse @ -energetic.witness / norm
+    impulse[closed] = inverse @ -energetic.witness / np.asarray(kinetic_norm(scene), float)[closed]
     # the v- without any motion along the contacts: v = M^-1 N p has qn = G pbar
     worst = velocity_change(scene, jnp.asarray(impulse, scene.mass.dtype)) + 0.0
     worst_normal = np.array(normalized_gap_velocity(scene, worst), float)
@@ -289,18 +323,16 @@ def carnot_energy_loss(scene: Scene, jump: Any, restitution: Any = 0.0) -> jax.A
     return (1 - e) / (1 + e) * kinetic_energy(scene, change)
 
 
-def _closed_problem(
-    scene: Scene, matrix: Any
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """G, norms and E of the closed contacts, and which those are."""
-    m = scene.contacts
-    array = as_numbers("matrix", matrix)
-    check_shape("matrix", array, (m, m), "one row and one column per contact")
+def _closed_delassus(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """G of the closed contacts, and which those are (m,)."""
     closed = np.asarray(scene.closed)
     if not closed.any():
         raise ValueError("Argument `scene` must have a closed contact, but all gaps are open.")
-    pick = np.ix_(closed, closed)
-    g = np.asarray(as_matrix(normalized_delassus(scene)), float)[pick]
+    return np.asarray(as_matrix(normalized_delassus(scene)), float)[np.ix_(closed, closed)], closed
+
+
+def _check_independent(scene: Scene, g: np.ndarray) -> None:
+    """Raise a ValueError where the contacts of G are redundant."""
     eigenvalues = np.linalg.eigvalsh(g)
     floor = _SINGULAR * np.finfo(scene.mass.dtype).eps * len(g) * eigenvalues[-1]
     if eigenvalues[0] <= floor:
@@ -309,7 +341,6 @@ def _closed_problem(
             f"have rank {int((eigenvalues > floor).sum())}: G is singular, and a matrix law "
             "cannot be consistent for every velocity."
         )
-    return g, np.asarray(kinetic_norm(scene), float)[closed], np.asarray(array, float)[pick], closed
 
 
 def _sign(a: np.ndarray, tolerance: float, closed: np.ndarray) -> Sign:
@@ -320,43 +351,6 @@ def _sign(a: np.ndarray, tolerance: float, closed: np.ndarray) -> Sign:
     velocity[contact[at[1]]] = -1.0
     worst = float(a[at])
     return Sign(worst >= -tolerance, worst, (int(contact[at[0]]), int(contact[at[1]])), velocity)
-
-
-def _in_words(audit: MatrixAudit) -> str:
-    """The audit as text."""
-    kinematic, kinetic, energetic = audit.kinematic, audit.kinetic, audit.energetic
-    verdict = "admissible" if audit.admissible else "NOT admissible"
-    lines = [f"restitution matrix: {verdict} for all pre-impact velocities qn- <= 0"]
-    for title, sign, what in (
-        ("kinematic  (6.2 i)  E >= 0", kinematic, "still approaches"),
-        ("kinetic    (6.2 ii) G^-1 (I + E) >= 0", kinetic, "would have to pull"),
-    ):
-        i, j = (k + 1 for k in sign.where)
-        text = f"yes, least entry {sign.worst:.4g}"
-        if not sign.holds:
-            text = (
-                f"NO, entry ({i}, {j}) is {sign.worst:.4g}: contact {i} {what} when only {j} closes"
-            )
-        lines.append(f"{title}: {text}")
-    text = {
-        "yes": f"yes, every impact loses energy (margin {energetic.margin:.4g})",
-        "no": f"NO, energy grows (margin {energetic.margin:.4g})",
-        "boundary": "boundary, energy never grows but is conserved",
-    }[energetic.answer]
-    if energetic.answer != "yes":
-        text += f" for qn- = {_row(audit.worst_normal_velocity)}, v- = {_row(audit.worst_velocity)}"
-    lines.append(f"energetic  (6.3)    G^-1 - E^T G^-1 E copositive: {text}")
-    if audit.spectral is None:
-        text = "not applicable, E is not self-adjoint (G^-1 E not symmetric)"
-    else:
-        text = f"{'yes' if audit.spectral else 'NO'}, rho = {audit.spectral_radius:.4g}"
-    lines.append(f"spectral   (6.4)    rho(E) <= 1: {text}")
-    holds = "yes" if audit.singular_values else "does not hold, which decides nothing"
-    lines.append(
-        f"sufficient (6.5)    sigma_max(E) = {audit.singular_value:.4g} <= "
-        f"{audit.singular_value_bound:.4g}: {holds}"
-    )
-    return "\n".join(lines)
 
 
 def _row(vector: np.ndarray) -> str:
@@ -415,11 +409,8 @@ def audit_coefficients(scene: Scene, restitution: Any) -> CoefficientAudit:
     sufficient: 1 <= 0.3333: does not, which decides nothing
     """
     e = as_numbers("restitution", restitution, low=0.0, high=1.0, contacts=scene.contacts)
-    closed = np.flatnonzero(np.asarray(scene.closed))
-    if not closed.size:
-        raise ValueError("Argument `scene` must have a closed contact, but all gaps are open.")
-    each = np.broadcast_to(np.asarray(e, float), (scene.contacts,))[closed]
-    g = np.asarray(as_matrix(normalized_delassus(scene)), float)[np.ix_(closed, closed)]
+    g, closed = _closed_delassus(scene)
+    each = np.broadcast_to(np.asarray(e, float), closed.shape)[closed]
     d = (1 - each) / (1 + each)
     whole = d[:, None] * g
     low, high = float(d.min()), float(d.max())

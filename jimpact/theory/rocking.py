@@ -176,7 +176,7 @@ class RockingDispersion(eqx.Module):
         theta, outcomes = np.degrees(self.kinetic_angle), self.outcomes()
         lines = [
             f"rocking block, kinetic angle {theta.min():.1f} to {theta.max():.1f} degrees "
-            f"({len(theta)} shapes), {len(self.restitution)} e",
+            f"({len(theta)} shapes), {len(self.restitution)} e"
         ]
         for j, mu in enumerate(np.asarray(self.friction)):
             counts = np.bincount(outcomes[:, j].ravel(), minlength=len(OUTCOMES))
@@ -247,9 +247,9 @@ def _impacts(a: jax.Array, mu: jax.Array, e: jax.Array, law: LZB) -> tuple[jax.A
         """One block of aspect a."""
         scene = Block(jnp.ones_like(a), a, jnp.ones_like(a), corners="base").scene()
         before = jnp.stack([a / 2, jnp.full_like(a, -0.5), jnp.full_like(a, -1.0)])
-        fields = (mu, e)
-        now = eqx.tree_at(lambda x: (x.friction, x.restitution), law, fields)
-        out = impact(now, scene, before)
+        out = impact(
+            eqx.tree_at(lambda x: (x.friction, x.restitution), law, (mu, e)), scene, before
+        )
         after, energy = out.velocity, (before**2 * scene.mass).sum() / 2
         slip = after[0] + a / 2 * after[2]
         remaining = 1 + out.energy_change / energy
@@ -259,11 +259,6 @@ def _impacts(a: jax.Array, mu: jax.Array, e: jax.Array, law: LZB) -> tuple[jax.A
     bad = jnp.asarray(_FAILS)[status]
     parts = [jnp.where(bad, jnp.nan, x) for x in (turns, slip, remaining)]
     return jnp.where(bad[:, None], jnp.nan, gamma), *parts, status
-
-
-def _law(stiffness: Any, exponent: Any, rtol: float | None) -> LZB:
-    """LZB; friction and restitution are set case by case."""
-    return LZB(1.0, stiffness, exponent, friction=0.0, rtol=rtol)
 
 
 def rocking_dispersion(
@@ -309,10 +304,11 @@ def rocking_dispersion(
     check_values("aspect", a, low=0.0, open_low=True)
     check_values("friction", mu, low=0.0)
     check_values("restitution", e, low=0.0, high=1.0)
-    each_a, each_mu, each_e = (x.reshape(-1) for x in jnp.meshgrid(a, mu, e, indexing="ij"))
-    results = _impacts(each_a, each_mu, each_e, _law(stiffness, exponent, rtol))
-    shape = (len(a), len(mu), len(e))
-    parts = [x.reshape(shape + x.shape[1:]) for x in results]
+    law = LZB(1.0, stiffness, exponent, friction=0.0, rtol=rtol)
+    cases = jnp.meshgrid(a, mu, e, indexing="ij")
+    each_a, each_mu, each_e = (x.ravel() for x in cases)
+    results = _impacts(each_a, each_mu, each_e, law)
+    parts = [x.reshape(cases[0].shape + x.shape[1:]) for x in results]
     return RockingDispersion(a, mu, e, *parts)
 
 
@@ -347,8 +343,8 @@ def search_critical_angle(
     mu, e = as_axis("friction", friction), as_axis("restitution", restitution)
     check_values("friction", mu, low=0.0)
     check_values("restitution", e, low=0.0, high=1.0, open_low=True)
-    law = _law(stiffness, exponent, None)
-    mus, es = (x.reshape(-1) for x in jnp.meshgrid(mu, e, indexing="ij"))
+    law = LZB(1.0, stiffness, exponent, friction=0.0)
+    mus, es = (x.ravel() for x in jnp.meshgrid(mu, e, indexing="ij"))
     low, high = jnp.full_like(mus, 0.5), jnp.full_like(mus, 2.0)
     for _ in range(_ZOOMS):
         a = jnp.linspace(low, high, _POINTS, axis=1)
@@ -422,12 +418,8 @@ def rocking_domain(aspect: Any, sliding: bool = True) -> RockingDomain:
     >>> domain.half_rocking, ji.theory.rocking_domain(2.0, sliding=False).rocking
     (None, (0.7, 1.0))
     """
-    a = as_numbers("aspect", aspect, (), "one block", low=0.0, open_low=True)
-    slenderness = float(a)
-    if sliding:
-        g = (slenderness**2 - 2) / (slenderness**2 + 4)
-    else:
-        g = float(housner_restitution(slenderness))
+    a = float(as_numbers("aspect", aspect, (), "one block", low=0.0, open_low=True))
+    g = (a**2 - 2) / (a**2 + 4) if sliding else float(housner_restitution(a))
     wide = [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]
     slender = [[0.0, g], [(1 - g) / (1 + g), 2 * g / (1 + g)], [0.0, 1.0]]
-    return RockingDomain(slenderness, sliding, g, np.array(wide if g <= 0 else slender))
+    return RockingDomain(a, sliding, g, np.array(wide if g <= 0 else slender))

@@ -122,6 +122,9 @@ def test_given_samples_are_used_row_by_row():
     np.testing.assert_array_equal(np.asarray(result.replay(299)[1].gaps), gaps[299])
     with pytest.raises(ValueError, match="`samples` must be at most 300, the rows of `gaps`"):
         monte_carlo(LAW, BALLS, BEFORE, gaps, samples=301)
+    rows = np.array([[1.0, 0.0, -1.0], [0.5, 0.0, -1.0]])  # of velocities: they alone are random
+    result = monte_carlo(LAW, BALLS, rows, chunk=CHUNK)
+    np.testing.assert_array_equal(result.first["velocity_before"], rows)
 
 
 def test_random_parameters_are_independent():

@@ -23,7 +23,7 @@ from jimpact._checks import as_whole, check_kind, in_common_dtype
 from jimpact.compiling import precise_jit
 from jimpact.impacts import impact
 from jimpact.law import Law, within_domains
-from jimpact.montecarlo.distributions import Distribution, Rows, as_source
+from jimpact.montecarlo.distributions import Distribution, GivenRows, as_source
 from jimpact.montecarlo.statistics import BAD_GAP, BAD_LAW, BAD_VELOCITY, Chunk, Task, reduced
 from jimpact.montecarlo.store import fingerprint
 from jimpact.scene import Scene, with_gaps
@@ -35,8 +35,8 @@ SAMPLES = 100_000  # default number of samples; ten times more: quantiles three 
 class Sources(eqx.Module):
     """Law, velocity and gaps of the samples: sources, or what was drawn from them for a chunk.
 
-    A source is a distribution, a function of a key, `Rows`, or a constant (array, `Law`, None). Of
-    a chunk, what is random has a leading axis (C,).
+    A source is a distribution, a function of a key, `GivenRows`, or a constant (array, `Law`,
+    None). Of a chunk, what is random has a leading axis (C,).
     """
 
     law: Any
@@ -46,8 +46,10 @@ class Sources(eqx.Module):
     @property
     def random(self) -> dict[str, bool]:
         """Which of the sources differ from sample to sample."""
-        constant = type(None), jax.Array, Law
-        return {name: not isinstance(x, constant) for name, x in vars(self).items()}
+        return {
+            name: not (x is None or isinstance(x, Law) or getattr(x, "ndim", 0) == 1)
+            for name, x in vars(self).items()
+        }
 
 
 @precise_jit
@@ -93,11 +95,16 @@ def impacts(
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
-    """Everything that determines the chunks; `plan(task)` computes one."""
+class Run:
+    """Everything that determines the samples; `run(task)` computes a chunk of them.
+
+    Given samples travel with the tasks: what computes chunks elsewhere needs no `rows`.
+    """
 
     sources: Sources
+    rows: dict[str, np.ndarray]
     scene: Scene
+    samples: int
     key: np.ndarray  # of the run: its raw data
     key_kind: str
     size: int  # samples a chunk
@@ -112,19 +119,46 @@ class Plan:
         with self._flags():
             drawn, scene = self._drawn(task, device)
             velocity, status = impacts(drawn, scene, random, self.size)
-        empty = np.zeros((self.size, 0))
-        samples = {"velocity": np.asarray(velocity), "status": np.asarray(status)}
-        for name, source in (("velocity_before", "velocity"), ("gaps", "gaps")):
-            samples[name] = np.asarray(getattr(drawn, source) if random[source] else empty)
-        return reduced(task, samples, self.bins, self.keep_samples)
+        constant = np.zeros((self.size, 0))
+        samples: dict[str, Any] = {
+            "velocity": velocity,
+            "status": status,
+            "velocity_before": drawn.velocity if random["velocity"] else constant,
+            "gaps": drawn.gaps if random["gaps"] else constant,
+        }
+        on_host = {name: np.asarray(x) for name, x in samples.items()}
+        return reduced(task, on_host, self.bins, self.keep_samples)
 
-    def sample(self, task: Task, lane: int) -> Sources:
-        """Law, velocity and gaps of one sample, the same bits as in the run."""
+    @property
+    def chunks(self) -> int:
+        """Number of chunks, the last one perhaps not used whole."""
+        return -(-self.samples // self.size)
+
+    def count(self, number: int) -> int:
+        """How many samples of a chunk are used."""
+        return min(self.size, self.samples - number * self.size)
+
+    def task(self, number: int, ends: np.ndarray | None = None) -> Task:
+        """The task of a chunk."""
+        size = self.size
+        rows = {}
+        for name, values in self.rows.items():
+            own = values[number * size : (number + 1) * size]
+            rows[name] = np.pad(own, ((0, size - len(own)), (0, 0)), mode="edge")
+        return Task(number, self.count(number), ends, rows)
+
+    def sample(self, index: int) -> tuple[Law, Scene, jax.Array]:
+        """Law, scene and velocity of sample `index`, the same bits as in the run."""
+        number, lane = divmod(index, self.size)
         with self._flags():
-            drawn, _ = self._drawn(task, None)
-        varying = [getattr(drawn, name) for name, random in self.sources.random.items() if random]
-        arrays = [x for x in jax.tree.leaves(varying) if eqx.is_array(x)]
-        return jax.tree.map(lambda x: x[lane] if any(x is y for y in arrays) else x, drawn)
+            drawn, _ = self._drawn(self.task(number), None)
+        law, velocity, gaps = (
+            jax.tree.map(lambda x: x[lane] if eqx.is_array(x) else x, getattr(drawn, name))
+            if random
+            else getattr(drawn, name)
+            for name, random in self.sources.random.items()
+        )
+        return law, self.scene if gaps is None else with_gaps(self.scene, gaps), velocity
 
     @contextlib.contextmanager
     def _flags(self) -> Iterator[None]:
@@ -143,49 +177,18 @@ class Plan:
         )
         return draw(sources, scene, key, lanes, rows), scene
 
-
-@dataclass(frozen=True, eq=False)
-class Run:
-    """A plan, how many samples, and the rows of given samples, which travel with the tasks."""
-
-    plan: Plan
-    samples: int
-    rows: dict[str, np.ndarray]
-
-    @property
-    def chunks(self) -> int:
-        """Number of chunks, the last one perhaps not used whole."""
-        return -(-self.samples // self.plan.size)
-
-    def task(self, number: int, ends: np.ndarray | None = None) -> Task:
-        """The task of a chunk."""
-        size = self.plan.size
-        rows = {}
-        for name, values in self.rows.items():
-            own = values[number * size : (number + 1) * size]
-            rows[name] = np.pad(own, ((0, size - len(own)), (0, 0)), mode="edge")
-        return Task(number, min(size, self.samples - number * size), ends, rows)
-
-    def sample(self, index: int) -> tuple[Law, Scene, jax.Array]:
-        """Law, scene and velocity of sample `index`, the same bits as in the run."""
-        number, lane = divmod(index, self.plan.size)
-        drawn, scene = self.plan.sample(self.task(number), lane), self.plan.scene
-        place = scene if drawn.gaps is None else with_gaps(scene, drawn.gaps)
-        return drawn.law, place, drawn.velocity
-
     @property
     def identity(self) -> dict[str, str]:
         """A hash of each thing that determines the chunks; the number of samples does not."""
-        plan = self.plan
         parts = {
-            "law": plan.sources.law,
-            "scene": plan.scene,
-            "velocity": (plan.sources.velocity, self.rows.get("velocity")),
-            "gaps": (plan.sources.gaps, self.rows.get("gaps")),
-            "key": (plan.key, plan.key_kind, plan.threefry_partitionable),
-            "chunk": plan.size,
-            "bins": plan.bins,
-            "precision": plan.x64,
+            "law": self.sources.law,
+            "scene": self.scene,
+            "velocity": (self.sources.velocity, self.rows.get("velocity")),
+            "gaps": (self.sources.gaps, self.rows.get("gaps")),
+            "key": (self.key, self.key_kind, self.threefry_partitionable),
+            "chunk": self.size,
+            "bins": self.bins,
+            "precision": self.x64,
         }
         versions = {"version of jimpact": jimpact.__version__, "version of jax": jax.__version__}
         return {name: fingerprint(value) for name, value in parts.items()} | versions
@@ -193,17 +196,12 @@ class Run:
     @property
     def description(self) -> str:
         """The run in one line."""
-        sources, scene = self.plan.sources, self.plan.scene
-        law = sources.law
-        name = type(law).__name__ if isinstance(law, Law) else _named(law)
-        text = f"{name}, {scene.size} coordinates, {scene.contacts} contacts"
+        sources, scene = self.sources, self.scene
+        law = type(sources.law).__name__ if isinstance(sources.law, Law) else _named(sources.law)
+        text = f"{law}, {scene.size} coordinates, {scene.contacts} contacts"
         for what in ("gaps", "velocity"):
             if sources.random[what]:
-                rows = self.rows.get(what)
-                drawn = (
-                    _named(getattr(sources, what)) if rows is None else f"{len(rows)} given rows"
-                )
-                text += f"; {what}: {drawn}"
+                text += f"; {what}: {_named(getattr(sources, what))}"
         if not sources.random["velocity"]:
             entries = [f"{x:g}" for x in np.asarray(sources.velocity)]
             more = [f"... {len(entries)} entries"] if len(entries) > _WRITTEN else []
@@ -224,9 +222,9 @@ def planned_run(
     """The run of these arguments; raises where one of them is bad."""
     check_kind("scene", scene, Scene)
     sources = _checked_sources(sources, scene)
+    rows = {name: np.asarray(x) for name, x in vars(sources).items() if getattr(x, "ndim", 1) == 2}
     chunk, bins = as_whole("chunk", chunk, 1), as_whole("bins", bins, 1)
-    rows = {name: np.asarray(x.values) for name, x in vars(sources).items() if isinstance(x, Rows)}
-    fewest = min((len(values) for values in rows.values()), default=SAMPLES)
+    fewest = min(map(len, rows.values()), default=SAMPLES)
     samples = as_whole("samples", fewest if samples is None else samples, 1)
     for name, values in rows.items():
         if len(values) < samples:
@@ -235,14 +233,11 @@ def planned_run(
                 f"value {samples}."
             )
     data, kind = _key(key)
-    plan = Plan(
-        # the arrays of given samples travel with the tasks, not with the plan
-        sources=eqx.tree_at(
-            lambda x: [getattr(x, name).values for name in rows],
-            sources,
-            replace_fn=lambda x: x[:0],
-        ),
+    return Run(
+        sources=Sources(**vars(sources) | {name: GivenRows(len(x)) for name, x in rows.items()}),
+        rows=rows,
         scene=scene,
+        samples=samples,
         key=data,
         key_kind=kind,
         size=chunk,
@@ -251,7 +246,6 @@ def planned_run(
         x64=jax.config.jax_enable_x64,  # type: ignore[attr-defined]
         threefry_partitionable=jax.config.jax_threefry_partitionable,  # type: ignore[attr-defined]
     )
-    return Run(plan, samples, rows)
 
 
 def _checked_sources(sources: Sources, scene: Scene) -> Sources:
