@@ -262,7 +262,7 @@ class _Lines(Deviances):
         """The profiles of these parameters.
 
         Where deviances pass the limit is found by regula falsi in their roots, all ends side by
-        side.
+        side. Each value is searched from both sides, as minima may change places between them.
         """
         grids = [self.grid(i) for i in which]
         lines = [
@@ -274,12 +274,14 @@ class _Lines(Deviances):
             for n, line in enumerate(lines):
                 for inside, outside, p, q in self._crossings(line):
                     share = np.clip(p / (p - q), 0.02, 0.98) if turn % 3 < 2 else 0.5
-                    trials.append((n, inside + share * (outside - inside), line[inside].y))
+                    value = float(inside + share * (outside - inside))
+                    trials += [(n, value, line[side].y) for side in (inside, outside)]
             if not trials:
                 break
             ends = self.minimize([((which[n],), (value,), y) for n, value, y in trials])
             for (n, value, _), squares, y in zip(trials, ends.squares.tolist(), ends.y):
-                lines[n][float(value)] = Lowest(squares, y)
+                end = Lowest(squares, y)
+                lines[n][value] = min(lines[n].get(value, end), end, key=lambda e: e.squares)
         return tuple(self.profile(i, line, level) for i, line in zip(which, lines))
 
     def _crossings(self, line: dict[float, Lowest]) -> Iterator[tuple[float, float, float, float]]:
