@@ -11,7 +11,7 @@ from jimpact.events import stepper
 
 @pytest.mark.release
 def test_stages_written_out_are_the_scanned_ones(monkeypatch):
-    """Values and a derivative; the programs differ, so that sums round differently."""
+    """Values and a derivative."""
 
     def outcomes():
         """Of a fresh function, which JAX has no compiled program of."""
@@ -25,9 +25,15 @@ def test_stages_written_out_are_the_scanned_ones(monkeypatch):
 
     scanned = outcomes()
     jax.clear_caches()
-    monkeypatch.setattr(stepper, "_scanned", stepper._written_out)
+    calls = []
+
+    def written_out(*args):
+        calls.append(args)
+        return stepper._written_out(*args)
+
+    monkeypatch.setattr(stepper, "_scanned", written_out)
     written = outcomes()
     jax.clear_caches()
+    assert calls
     for one, other in zip(scanned, written):
         np.testing.assert_allclose(one, other, atol=1e-10)
-    assert (scanned[0] != written[0]).any()  # another program indeed
