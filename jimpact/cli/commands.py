@@ -330,7 +330,7 @@ def compare(command: options.CompareCommand, steps: Steps) -> CommandResult:
         "T+/T-: kinetic energy after over before. Time: a compiled call, with its checks.",
     ]
     data = {"velocity": before, "laws": result, "fits": fits, "left_out": left_out}
-    picture = ji.plot.comparison(result, measured, study.title)
+    picture = ji.plot.comparison(result, measured, study.title, study.velocities)
     return CommandResult(_titled(study, before), data, picture, result.table, "\n".join(lines))
 
 
@@ -442,7 +442,7 @@ def advise(command: options.AdviseCommand, steps: Steps) -> CommandResult:
         progress=steps.patience,
         **_advise_parameters(study),
     )
-    picture = ji.plot.advice(result, study.title)
+    picture = ji.plot.advice(result, study.title, study.velocities)
     return CommandResult(_titled(study, before), result, picture, result.table)
 
 

@@ -62,6 +62,7 @@ class Study:
         parameters: the law's values as the file states them.
         options: of `fit`, by name.
         monte_carlo: arguments of `monte_carlo`, empty without `[monte_carlo]`.
+        velocities: names of the velocities of a body with their units; empty of a chain.
     """
 
     title: str
@@ -74,6 +75,7 @@ class Study:
     options: dict[str, Any] = field(default_factory=dict)
     priors: dict[str, Any] = field(default_factory=dict)
     monte_carlo: dict[str, Any] = field(default_factory=dict)
+    velocities: tuple[str, ...] = ()
 
     def run(self, **options: Any) -> Fit:
         """`fit` with the study's options, or with those that are passed and not None."""
@@ -192,6 +194,7 @@ def _impact_study(tables: Mapping[str, Any], place: Path, law_name: str | None) 
         options=fitted.options,
         priors=fitted.priors,
         monte_carlo=_sampling(tables["monte_carlo"], law, scene) if "monte_carlo" in tables else {},
+        velocities=() if body is None else tuple(body.velocity_names),
     )
 
 

@@ -15,7 +15,7 @@ from jimpact.impacts import Impact, impact
 from jimpact.law import Law
 from jimpact.methods.points import in_turns, left_out_if_it_raises, left_out_notes, seconds
 from jimpact.registry import registered_laws
-from jimpact.scene import Scene, as_velocity
+from jimpact.scene import Scene, as_velocity, dense_mass
 from jimpact.status import STATUS
 from jimpact.theory.dispersion import dispersion_index, energy_ratio
 
@@ -77,12 +77,20 @@ class Comparison(Tabular):
 
     @property
     def distances(self) -> dict[str, float]:
-        """Root mean square difference [m/s] of each law's v+ from the measured one, if any."""
+        """Root mean square difference [m/s] of each law's v+ from the measured one, if any.
+
+        Velocities of bodies, some of them in rad/s, count by the root of their inertia over that of
+        the largest one: as m/s with as much energy.
+        """
         if self.measured is None:
             return {}
+        weight = np.ones(self.scene.size)
+        if self.scene.walls is None:
+            inertia = np.diag(dense_mass(self.scene))
+            weight = np.sqrt(inertia / inertia.max())
         after = {name: entry.outcome.velocity for name, entry in self.entries.items()}
         return {
-            name: float(np.sqrt(np.nanmean((np.asarray(v) - self.measured) ** 2)))
+            name: float(np.sqrt(np.nanmean((weight * (np.asarray(v) - self.measured)) ** 2)))
             for name, v in after.items()
         }
 
