@@ -1,6 +1,6 @@
 """Runs all benchmarks of speed and writes `results/`: `python tests/benchmarks/all.py`.
 
-About five minutes on two quiet cores. `--quick` only shows that everything runs.
+About ten minutes on two quiet cores. `--quick` only shows that everything runs.
 """
 
 import datetime
@@ -16,8 +16,8 @@ from harness import arguments
 from kernels import compiled
 from rich.console import Console
 
-SCRIPTS = ("three_balls", "derivatives", "economy", "long_chains", "motions")
-PACKAGES = ("jimpact", "jax", "jaxlib", "equinox", "diffrax", "numpy", "numba")
+SCRIPTS = ("three_balls", "peers", "derivatives", "economy", "long_chains", "motions")
+PACKAGES = ("jimpact", "jax", "jaxlib", "equinox", "diffrax", "numpy", "scipy", "numba", "mujoco")
 
 
 def processor():
