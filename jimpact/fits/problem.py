@@ -257,14 +257,7 @@ class FitProblem:
         coarse = getattr(self.law, "rtol", None) == COARSE_RTOL
         if data.sigma_pre is not None or self.mixing is not None or coarse:
             return None
-        observe: Any = self.observe
-        count, n = data.pre.shape
-        scenes = jax.tree.map(lambda x: np.repeat(x[:1], count, axis=0), observe.scenes)
-        before = np.repeat(observe.pre[:1], count, axis=0)
-        before[:, :n] = np.asarray(data.pre)
-        observe = replace(observe, scenes=scenes, pre=before)
-        weights = _in(self.low.dtype, _weighed_shots(data, self.scene))
-        return replace(self, observe=observe, experiments=data, **weights)
+        return self.of_other(data, self.scene)
 
     def of_other(self, data: Experiments, scene: Scene | None) -> "FitProblem":
         """The same of other shots; errors of v- count as if there were none.
