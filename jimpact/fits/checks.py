@@ -110,7 +110,7 @@ def unusable(problem: FitProblem, solution: Solution) -> np.ndarray:
     """Shots (K,) whose impacts fail, or whose derivatives are not finite or absurdly large."""
     if not isinstance(problem.observe, Shots):
         return np.zeros(1, bool)
-    slope = np.abs(problem.of_data(solution.jacobian))
+    slope = np.abs(problem.of_data(solution.minima[0].jacobian))
     allowed = ABSURD * float(problem.unit) * np.asarray(problem.weight, float)[..., None]
     fails = [STATUS[code].name in UNUSABLE for code in solution.status]
     used = ~np.isnan(problem.measured).all(axis=1)

@@ -177,12 +177,9 @@ class Experiments(eqx.Module):
 
     def energy_ratio(self, scene: Scene | None = None) -> np.ndarray:
         """`T+ / T-` of every shot (K,) in a scene; NaN for shots with missing values."""
-        ratios = []
-        masses = self.each(scene, dense_mass)
-        for mass, pre, post in zip(masses, np.asarray(self.pre), np.asarray(self.post)):
-            before = pre @ mass @ pre
-            ratios.append(post @ mass @ post / before if before > 0 else np.nan)
-        return np.array(ratios)
+        masses, both = np.array(self.each(scene, dense_mass)), (self.pre, self.post)
+        before, after = (np.einsum("ki,kij,kj->k", v, masses, v) for v in map(np.asarray, both))
+        return after / np.where(before > 0, before, np.nan)
 
     def momentum_corrected(self, scene: Scene | None = None) -> "Experiments":
         """The same shots, moved as little as possible so that they conserve momentum.

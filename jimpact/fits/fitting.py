@@ -178,7 +178,7 @@ def _with_profiles(result: Fit[AnyLaw], profiles: tuple[Profile, ...]) -> Fit[An
 
 def _check_derivatives(problem: FitProblem, solution: Solution) -> None:
     """Raise a ValueError where derivatives are not finite, whichever shots are left out."""
-    lost = np.flatnonzero(~np.isfinite(solution.jacobian).all(axis=1))
+    lost = np.flatnonzero(~np.isfinite(solution.minima[0].jacobian).all(axis=1))
     if len(lost):
         at = ", ".join(f"{name} = {x:g}" for name, x in zip(problem.names, solution.value))
         which = listed([str(i + 1) for i in lost])
@@ -218,9 +218,6 @@ def as_fit(
     judged = Judged(replace(problem, scene=problem.to_scene(found.value)), found, robust)
     errors, findings = judged.errors, fit_warnings(judged)
     residual = np.asarray(problem.measured, float) - found.predicted
-    numbers = errors._asdict()
-    undetermined = numbers.pop("undetermined")
-    slope = problem.of_data(found.jacobian)
     starts, limit = [], found.minima[0].sum_of_squares + HARDLY_WORSE * errors.noise**2
     for end in found.minima:
         matters = not end.sum_of_squares > limit  # also where the noise is not known
@@ -236,8 +233,7 @@ def as_fit(
         predicted=found.predicted,
         residual=residual,
         rms=rms(problem, residual),
-        **numbers,
-        identifiability=(*problem.notes, *undetermined),
+        **vars(errors),
         starts=tuple(starts),
         status=found.status,
         converged=found.converged,
@@ -246,7 +242,7 @@ def as_fit(
         warnings=tuple(each.line for each in findings),
         reservations=tuple(each.reservation for each in findings if each.reservation),
         problem=problem,
-        jacobian=problem.errors_of(slope / problem.steps_at(found.value)),
+        jacobian=problem.derivatives(found.minima[0]),
     )
 
 

@@ -360,10 +360,10 @@ def priors_of(
         _check_name("priors", name, (*parameters.names, *fields))
     pairs = [chosen.get(name, chosen.get(field)) for name, field in zip(parameters.names, fields)]
     each = enumerate(zip(parameters.names, pairs, *limits))
-    return tuple(Prior(i, *_mean_and_std(*row)) for i, row in each if row[1] is not None)
+    return tuple(Prior(i, *mean_and_std(*row)) for i, row in each if row[1] is not None)
 
 
-def _mean_and_std(name: str, pair: Any, low: float, high: float) -> tuple[float, float]:
+def mean_and_std(name: str, pair: Any, low: float, high: float) -> tuple[float, float]:
     """The two numbers of a prior: (mean, std), or of a `ji.Normal`."""
     ends = (pair.mean, pair.std) if hasattr(pair, "std") and hasattr(pair, "mean") else pair
     try:

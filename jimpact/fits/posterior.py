@@ -12,6 +12,7 @@ import numpy as np
 from jimpact._checks import as_whole, check_choice, needed
 from jimpact.compiling import known_options
 from jimpact.fits.fitting import Fit
+from jimpact.fits.parameters import mean_and_std
 from jimpact.fits.problem import FitProblem
 from jimpact.fits.uncertainty import check_squares
 from jimpact.montecarlo.distributions import Normal, Uniform
@@ -214,12 +215,7 @@ def _prior(name: str, chosen: Any, low: float, high: float, log: bool, kinds: An
     if isinstance(chosen, Normal):
         ends = {"low": low, "high": high}
         ends = {key: end for key, end in ends.items() if np.isfinite(end)}
-        mean, std = float(chosen.mean), float(chosen.std)
-        if not low <= mean <= high:
-            raise ValueError(
-                f"Argument `priors` must have its mean in [{low:g}, {high:g}] for `{name}`, but "
-                f"has {chosen!r}."
-            )
+        mean, std = mean_and_std(name, chosen, low, high)
         return kinds.TruncatedNormal(mean, std, **ends) if ends else kinds.Normal(mean, std)
     if not isinstance(chosen, kinds.Distribution) or chosen.shape() != ():
         raise ValueError(

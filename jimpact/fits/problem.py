@@ -392,13 +392,11 @@ class FitProblem:
         of your own (docs/gradient_descent.md). Not differentiable.
         """
         x = jax.lax.stop_gradient(jnp.asarray(x, self.low.dtype))
-        rest = len(self.low) - len(x)
-        x = jnp.pad(x, (0, rest))
-        y = scaled(x, self.scale, self.log, jnp)
+        y = scaled(jnp.pad(x, (0, len(self.low) - len(x))), self.scale, self.log, jnp)
         inside = jnp.clip(y, self.low, self.high)
         if self.matrix is not None:
             inside = self.matrix.nearest(y, jnp.eye(len(y), dtype=y.dtype), jnp.zeros_like(y))
-        return self._values(inside)[: len(x) - rest]
+        return self._values(inside)[: len(x)]
 
     def log_density(self, x: Any) -> jax.Array:
         """Logarithm () of the probability density of the data at x (P,), normally distributed.
@@ -496,16 +494,14 @@ class FitProblem:
 
     def point(self, x: np.ndarray) -> np.ndarray:
         """y (..., Q) of x (..., P), on the host."""
-        p = x.shape[-1]
-        y, log = np.zeros((*x.shape[:-1], len(self.low))), np.asarray(self.log)[:p]
-        y[..., :p] = scaled(x, np.asarray(self.scale, float)[:p], log)
-        return y
+        every = np.zeros((*x.shape[:-1], len(self.low)))
+        every[..., : x.shape[-1]] = x
+        return np.asarray(scaled(every, np.asarray(self.scale, float), np.asarray(self.log)))
 
     def values_at(self, y: np.ndarray) -> np.ndarray:
         """x (..., P) of y (..., Q), on the host."""
-        p = len(self.names)
-        scale = np.asarray(self.scale, float)[:p]
-        return unscaled(np.asarray(y, float)[..., :p], scale, np.asarray(self.log)[:p])
+        x = unscaled(np.asarray(y, float), np.asarray(self.scale, float), np.asarray(self.log))
+        return np.asarray(x)[..., : len(self.names)]
 
     def steps_at(self, x: np.ndarray) -> np.ndarray:
         """(P,) dx/dy: the natural size of a change of each parameter at x."""
@@ -533,6 +529,15 @@ class FitProblem:
         """Those of rows (R, ...), as of a residual, that are of what was measured, in its shape."""
         count = self.measured.size
         return rows[:count].reshape((*self.measured.shape, *rows.shape[1:]))
+
+    def derivatives(self, minimum: Any) -> np.ndarray:
+        """Of what was measured in the parameters (K, n, P); NaN where it was not measured.
+
+        Args:
+            minimum: with its `jacobian` and `value`.
+        """
+        slope = self.of_data(minimum.jacobian) / self.steps_at(minimum.value)
+        return self.errors_of(slope)
 
     def independent(self, errors: np.ndarray) -> np.ndarray:
         """Errors of what was measured, in units of sigma and as independent ones.

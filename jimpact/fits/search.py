@@ -134,11 +134,6 @@ class Solution(NamedTuple):
         """The parameters (P,) of the best."""
         return self.minima[0].value
 
-    @property
-    def jacobian(self) -> np.ndarray:
-        """(R, P), of the scaled parameters at the best."""
-        return self.minima[0].jacobian
-
 
 def solution(
     problem: "FitProblem", ends: Ends, counts: np.ndarray | None = None, lost: int = 0
@@ -186,7 +181,7 @@ def find_minima(problem: "FitProblem", starts: int | None, seed: int, solver: So
     rng, turns = np.random.default_rng(seed), 1 if starts else TURNS
     if starts == 1:
         points = start_points(problem, 1, rng)
-        return solution(problem, minimize(stacked([problem]), points, solver, what="starts"))
+        return solution(problem, minimize([problem], points, solver, what="starts"))
     ends, idle = _rough_ends(problem, starts, rng, solver), 0
     for turn in range(1, turns):
         least = np.nanmin(ends.squares)
@@ -198,7 +193,7 @@ def find_minima(problem: "FitProblem", starts: int | None, seed: int, solver: So
         if idle * IDLE_PARAMETERS >= len(problem.names):
             break
     best = _groups(problem, ends)[0][:1]
-    fine = minimize(stacked([problem]), ends.y[best], solver, what="minima")
+    fine = minimize([problem], ends.y[best], solver, what="minima")
     fine = fine._replace(steps=fine.steps + ends.steps[best])
     for leaf, value in zip(jax.tree.leaves(ends), jax.tree.leaves(fine)):
         leaf[best] = value
@@ -226,8 +221,7 @@ def _rough_ends(
 
     def rough(points: np.ndarray) -> Ends:
         """To where minima can be told apart."""
-        many = stacked([problem], len(points))
-        return minimize(many, points, solver, COARSE, noise, "starts")
+        return minimize([problem], points, solver, COARSE, noise, "starts")
 
     ends = rough((_first_points if scanned else start_points)(problem, far, rng))
     idle = 0  # rounds without a gain, one after the other
@@ -379,7 +373,7 @@ def settled(
     """
     each, start = len(points) // len(problems), points
     for _ in range(SETTLING):
-        ends = minimize(stacked(problems, each), start, solver, stop)
+        ends = minimize(problems, start, solver, stop)
         if ends.slopes is None:
             return problems, ends
         best = np.nanargmin(ends.squares.reshape(-1, each), axis=1)
@@ -389,7 +383,7 @@ def settled(
         start = ends.y
         if not moved.any():  # residuals and Jacobians with the weights of the final law
             last = solver._replace(max_steps=1)
-            return problems, minimize(stacked(problems, each), start, last)
+            return problems, minimize(problems, start, last)
     return problems, ends._replace(converged=ends.converged & ~moved)
 
 
@@ -428,7 +422,7 @@ def robust_minimum(
         share, slope = LOSSES[loss](error / scale)
         factor, before = np.sqrt(share), problem.point(found.value)
         weighed = problem.weighed(factor)
-        found = solution(weighed, minimize(stacked([weighed]), before[None], solver))
+        found = solution(weighed, minimize([weighed], before[None], solver))
         if np.abs(problem.point(found.value) - before).max() <= SETTLED:
             break
     else:

@@ -292,7 +292,7 @@ class Ends(NamedTuple):
 
 
 def minimize(
-    problems: Any,
+    problems: "Sequence[FitProblem]",
     points: np.ndarray,
     solver: Solver,
     stop: float = 0.0,
@@ -300,34 +300,35 @@ def minimize(
     what: str = "fits",
     fixed: np.ndarray | None = None,
 ) -> Ends:
-    """Minima of S problems (`stacked`) from y (S, Q).
+    """Minima of problems from y (S, Q), equally many of each, one after the other.
 
-    As many as `problems.lanes(S)` are solved side by side; those that are done make room for
+    As many as `lanes(S)` are solved side by side; those that are done make room for
     others. `stop`: see `FINE`, which it is at least. `noise`: all are starts of one problem, whose
     residuals have this noise at least, and every few passes the worse half of them is given up
     (successive halving). Progress counts `what`. `fixed` (S, Q): which entries of y stay as they
     are. A matrix that must be admissible is sought without that, and then the best admissible one.
     """
-    points = points.astype(problems.low.dtype)
-    dtype, matrix = str(points.dtype), problems.matrix
+    many = stacked(problems, len(points) // len(problems))
+    points = points.astype(many.low.dtype)
+    dtype, matrix = str(points.dtype), many.matrix
     if fixed is not None:
-        low, high = (np.where(fixed, points, end) for end in (problems.low, problems.high))
-        problems, matrix = replace(problems, low=low, high=high), None
-    problems = replace(problems, matrix=None)
+        low, high = (np.where(fixed, points, end) for end in (many.low, many.high))
+        many, matrix = replace(many, low=low, high=high), None
+    many = replace(many, matrix=None)
     rule = (max(FINE[dtype], stop), noise, what)
-    states, converged = _descended(problems, points, solver, *rule)
+    states, converged = _descended(many, points, solver, *rule)
     y, steps, stuck = np.asarray(states.y), states.steps, states.stuck
     once, moved = solver._replace(max_steps=1), np.full(len(y), matrix is not None)
     for _ in range(SETTLING):
         if not moved.any():
             break
         inside = np.empty_like(y)
-        every = np.arange(len(y)), problems.lanes(len(y))
+        every = np.arange(len(y)), many.lanes(len(y))
         for rows, nearest in in_lanes(best_inside, *every, matrix, states):
             inside[rows] = nearest
-        states, _ = _descended(problems, inside, once, *rule)
+        states, _ = _descended(many, inside, once, *rule)
         moved, y = np.abs(inside - y).max(axis=1) > SETTLED, inside
-    size = np.asarray(problems.size, float)
+    size = np.asarray(many.size, float)
     return Ends(
         y=np.asarray(states.y, float),
         squares=2 * np.asarray(states.cost, float) * size**2,
@@ -347,7 +348,7 @@ def outcome_at(problem: "FitProblem", x: Any) -> Ends:
     """Residual, derivatives and predictions at x (P,), by the program that searches."""
     point = problem.point(np.asarray(x))[None]
     once, every = Solver(max_steps=1), np.ones(point.shape, bool)
-    return minimize(stacked([problem]), point, once, fixed=every)
+    return minimize([problem], point, once, fixed=every)
 
 
 def in_lanes(

@@ -8,6 +8,7 @@ from typing import Any, Generic, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.linalg import qr
 from scipy.special import ndtri, stdtrit
 
 from jimpact._checks import check_choice, check_kind, check_values
@@ -37,8 +38,9 @@ PRIOR_ALONE = 0.95
 # ---------------------------------------------------------------------------- linearized errors
 
 
-class Uncertainty(NamedTuple):
-    """Errors of P parameters; see `Fit` for the meaning of inf and NaN."""
+@dataclass(frozen=True, eq=False)
+class Uncertainty:
+    """Errors of P parameters; see `Fit`."""
 
     rank: int
     singular_values: np.ndarray
@@ -47,7 +49,7 @@ class Uncertainty(NamedTuple):
     covariance: np.ndarray
     correlation: np.ndarray
     standard_error: np.ndarray
-    undetermined: tuple[str, ...]
+    identifiability: tuple[str, ...]
 
 
 def uncertainty(
@@ -84,20 +86,15 @@ def uncertainty(
     with np.errstate(divide="ignore", invalid="ignore"):
         correlation = covariance / np.outer(error, error)
     np.fill_diagonal(correlation, 1.0)
-    words = tuple(_in_words(problem, row, scale) for row in _reduced(null))
+    words = (*problem.notes, *(_in_words(problem, row, scale) for row in _reduced(null)))
     return Uncertainty(rank, singular, freedom, noise, covariance, correlation, error, words)
 
 
 def _reduced(null: np.ndarray) -> np.ndarray:
     """The same subspace in reduced row echelon form: each direction with few parameters."""
-    rows = null.copy()
-    for i in range(len(rows)):
-        row, column = divmod(int(np.argmax(np.abs(rows[i:]))), rows.shape[1])
-        rows[[i, i + row]] = rows[[i + row, i]]
-        rows[i] /= rows[i, column]
-        others = np.arange(len(rows)) != i
-        rows[others] -= np.outer(rows[others, column], rows[i])
-    return rows
+    _, rows, pivots = qr(null, mode="economic", pivoting=True)
+    rows[:, pivots] = np.linalg.solve(rows[:, : len(rows)], rows)
+    return np.asarray(rows)
 
 
 def _in_words(problem: FitProblem, direction: np.ndarray, scale: np.ndarray) -> str:
@@ -210,7 +207,7 @@ class Predicted(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Fit(Tabular, Generic[AnyLaw]):
+class Fit(Uncertainty, Tabular, Generic[AnyLaw]):
     """The result of `fit`. `print(fit)` gives its report.
 
     P free parameters, K shots of n velocities.
@@ -255,19 +252,11 @@ class Fit(Tabular, Generic[AnyLaw]):
     method: str
     names: tuple[str, ...]
     value: np.ndarray
-    standard_error: np.ndarray
-    covariance: np.ndarray
-    correlation: np.ndarray
     bounds: tuple[np.ndarray, np.ndarray]
     at_bound: np.ndarray
     predicted: np.ndarray
     residual: np.ndarray
     rms: float
-    noise: float
-    degrees_of_freedom: int
-    rank: int
-    singular_values: np.ndarray
-    identifiability: tuple[str, ...]
     starts: tuple[FitMinimum, ...]
     status: np.ndarray
     converged: bool
@@ -417,8 +406,7 @@ class Fit(Tabular, Generic[AnyLaw]):
         self._check_scene(largest, len(units))
         problem = self.problem.of_other(data, own)
         there = solution(problem, outcome_at(problem, self.value))
-        slope = problem.of_data(there.jacobian)
-        error = self.errors_of(problem.errors_of(slope / problem.steps_at(self.value)))
+        error = self.errors_of(problem.derivatives(there.minima[0]))
         value, noise = there.predicted, np.broadcast_to(self._noise_of(sigma), data.pre.shape)
         half = quantile * np.hypot(error, noise)
         return Predicted(value, error, np.asarray(there.status), noise, value - half, value + half)
