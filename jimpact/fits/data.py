@@ -1,7 +1,7 @@
 """Measured shots: velocities before and after impacts, read from CSV files."""
 
-import operator
 from collections.abc import Callable, Sequence
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,6 @@ from jimpact.scene import WALLS, Scene, chain, dense_mass, stackable, with_gaps
 ROUNDING = 1e-9
 _PRINTED = 4  # shots that `print` shows
 _VALUES = ("pre", "post", "sigma", "sigma_pre", "resolution")
-_RESOLUTION = operator.attrgetter("resolution")
 
 
 class Experiments(eqx.Module):
@@ -208,13 +207,12 @@ class Experiments(eqx.Module):
         """A copy with other fields."""
         fields = self._of_each_shot() | {"units": self.units} | changed
         resolution = fields.pop("resolution")
+        copy = Experiments(**fields)
+        if resolution is None:
+            return copy
         # what it adds to sigma is there already
-        return eqx.tree_at(
-            _RESOLUTION,
-            Experiments(**fields),
-            None if resolution is None else np.asarray(resolution),
-            is_leaf=lambda x: x is None,
-        )
+        steps = np.asarray(resolution)
+        return eqx.tree_at(lambda x: x.resolution, copy, steps, is_leaf=lambda x: x is None)
 
     def _of_each_shot(self) -> dict[str, Any]:
         """What each shot has, by the name of its argument; None: no shot has it."""
@@ -362,10 +360,8 @@ def kept_by_corrections(data: Experiments, scene: Scene | None) -> np.ndarray:
 
 def _filled(rows: list[np.ndarray]) -> np.ndarray:
     """Rows of one length; shots whose contacts can change more momenta have NaN at the end."""
-    filled = np.full((len(rows), max(map(len, rows))), np.nan)
-    for row, values in zip(filled, rows):
-        row[: len(values)] = values
-    return filled
+    columns = list(zip_longest(*rows, fillvalue=np.nan))
+    return np.array(columns, float).reshape(-1, len(rows)).T
 
 
 def conserved_momenta(scene: Scene) -> np.ndarray:

@@ -181,7 +181,9 @@ class FitProblem:
             ties: as in `fit`.
         """
         problem = of_shots(law, scene, experiments, free, bounds, priors, ties)
-        return problem.passing_errors_at(problem.start)
+        if problem.mixing is None:
+            return problem
+        return problem.with_errors_before(outcome_at(problem, problem.start).slopes[0])
 
     @classmethod
     def from_observable(
@@ -314,12 +316,6 @@ class FitProblem:
         weights = self._weights(self.weight * old / sigma, np.linalg.inv(factor))
         return replace(self, **weights, sigma=np.where(here, sigma, np.nan))
 
-    def passing_errors_at(self, x: Any) -> "FitProblem":
-        """With errors of v-, if there are any, passed on as the law of x (P,) does."""
-        if self.mixing is None:
-            return self
-        return self.with_errors_before(outcome_at(self, x).slopes[0])
-
     def program(self) -> "FitProblem":
         """As compiled functions take it: without what differs between fits of one program.
 
@@ -442,7 +438,10 @@ class FitProblem:
 
         def outcome(both: jax.Array) -> tuple[tuple[jax.Array, jax.Array], Any]:
             """Residual and prediction of y and a change of v-, and all not differentiated."""
-            moved = self._shifted(both[count:]) if passed else self
+            moved = self
+            if passed:
+                pre = self.observe.pre.at[:, :passed].add(both[count:])  # type: ignore[attr-defined]
+                moved = eqx.tree_at(lambda problem: problem.observe.pre, self, pre)
             residual, prediction = moved._scaled_residual(both[:count])
             out = residual, prediction.value
             return out, (*out, prediction.status)
@@ -485,12 +484,6 @@ class FitProblem:
             many = LANES_OF_MANY if jax.default_backend() == "cpu" else LANES_ON_ACCELERATOR
             return LANES if count <= LANES_OF_MANY else many
         return LANES if count > 1 else 1
-
-    def _shifted(self, shift: jax.Array) -> "FitProblem":
-        """With this change (n,) of the velocities before all shots."""
-        observe: Any = self.observe
-        pre = observe.pre.at[:, : shift.shape[0]].add(shift)
-        return replace(self, observe=eqx.tree_at(lambda o: o.pre, observe, pre))
 
     def point(self, x: np.ndarray) -> np.ndarray:
         """y (..., Q) of x (..., P), on the host."""

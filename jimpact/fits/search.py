@@ -1,5 +1,6 @@
 """The lowest minimum of a fit, and others: where searches start, and which of their ends differ."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -178,20 +179,20 @@ def find_minima(problem: "FitProblem", starts: int | None, seed: int, solver: So
     best follow as long as they lower the sum of squares, and all is done again with other and
     twice as many points if sigma contradicts what was found, as long as that helps.
     """
-    rng, turns = np.random.default_rng(seed), 1 if starts else TURNS
+    rng = np.random.default_rng(seed)
     if starts == 1:
         points = start_points(problem, 1, rng)
         return solution(problem, minimize([problem], points, solver, what="starts"))
-    ends, idle = _rough_ends(problem, starts, rng, solver), 0
-    for turn in range(1, turns):
-        least = np.nanmin(ends.squares)
-        freedom = problem.values - len(problem.names)
+
+    def again(ends: Ends, turn: int) -> Ends | None:
+        """From twice as many points as before, where sigma contradicts what was found."""
+        least, freedom = np.nanmin(ends.squares), problem.values - len(problem.names)
         if problem.sigma is None or freedom < 1 or chdtrc(freedom, least) > REJECTED:
-            break
-        more = _rough_ends(problem, None, rng, solver, STARTS * 2**turn)
-        ends, idle = _both(ends, more), 0 if _gains(more, least) else idle + 1
-        if idle * IDLE_PARAMETERS >= len(problem.names):
-            break
+            return None
+        return _rough_ends(problem, None, rng, solver, STARTS * 2 ** (turn + 1))
+
+    ends = _rough_ends(problem, starts, rng, solver)
+    ends = _extended(ends, 0 if starts else TURNS - 1, len(problem.names), again)
     best = _groups(problem, ends)[0][:1]
     fine = minimize([problem], ends.y[best], solver, what="minima")
     fine = fine._replace(steps=fine.steps + ends.steps[best])
@@ -223,30 +224,36 @@ def _rough_ends(
         """To where minima can be told apart."""
         return minimize([problem], points, solver, COARSE, noise, "starts")
 
-    ends = rough((_first_points if scanned else start_points)(problem, far, rng))
-    idle = 0  # rounds without a gain, one after the other
-    for _ in range((1 if starts else ROUNDS) if count > far else 0):
+    def around(ends: Ends, _: int) -> Ends | None:
+        """From points around the best; None: the data see none of the parameters."""
         points = _near(problem, ends, SCANNED if scanned else count - far, noise, rng)
         if scanned:
             points = _lowest(problem, points, count - far)
-        if not len(points):  # the data see none of the parameters
+        return rough(points) if len(points) else None
+
+    ends = rough((_first_points if scanned else start_points)(problem, far, rng))
+    rounds = 1 if starts else ROUNDS
+    return _extended(ends, rounds if count > far else 0, len(log), around)
+
+
+def _extended(
+    ends: Ends, rounds: int, parameters: int, search: Callable[[Ends, int], Ends | None]
+) -> Ends:
+    """Ends with those of further rounds, as long as these lower the least sum of squares.
+
+    By more than the noise of a value.
+    """
+    idle = 0  # rounds without a gain, one after the other
+    for k in range(rounds):
+        more = search(ends, k)
+        if more is None:
             break
-        least, more = np.nanmin(ends.squares), rough(points)
-        ends = _both(ends, more)
-        idle = 0 if _gains(more, least) else idle + 1
-        if idle * IDLE_PARAMETERS >= len(log):
+        least = np.nanmin(ends.squares) * (1 - 1 / more.jacobian.shape[1])
+        idle = 0 if np.nanmin(more.squares) < least else idle + 1
+        ends = jax.tree.map(lambda a, b: np.concatenate([a, b]), ends, more)
+        if idle * IDLE_PARAMETERS >= parameters:
             break
     return ends
-
-
-def _both(first: Ends, second: Ends) -> Ends:
-    """All ends of two searches."""
-    return jax.tree.map(lambda a, b: np.concatenate([a, b]), first, second)
-
-
-def _gains(more: Ends, least: float) -> bool:
-    """Whether ends are lower than the least sum of squares by more than the noise of a value."""
-    return bool(np.nanmin(more.squares) < least * (1 - 1 / more.jacobian.shape[1]))
 
 
 def _box(problem: "FitProblem") -> np.ndarray:
