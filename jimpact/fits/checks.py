@@ -57,7 +57,7 @@ class Judged:
     def __init__(self, problem: FitProblem, solution: Solution, loss_noise: float | None):
         """`loss_noise`: noise times the root of the degrees of freedom, of a robust loss."""
         self.problem, self.solution, self.robust = problem, solution, loss_noise is not None
-        minimum, here = solution.minima[0], ~np.isnan(problem.measured).ravel()
+        minimum, here = solution.starts[0], ~np.isnan(problem.measured).ravel()
         of_value = np.nonzero(~np.isnan(np.atleast_1d(problem.measured)))[0]
         self.shot = np.append(of_value, np.full(len(problem.priors), NO_SHOT))
         self.shots = np.unique(of_value)
@@ -110,7 +110,7 @@ def unusable(problem: FitProblem, solution: Solution) -> np.ndarray:
     """Shots (K,) whose impacts fail, or whose derivatives are not finite or absurdly large."""
     if not isinstance(problem.observe, Shots):
         return np.zeros(1, bool)
-    slope = np.abs(problem.of_data(solution.minima[0].jacobian))
+    slope = np.abs(problem.of_data(solution.starts[0].jacobian))
     allowed = ABSURD * float(problem.unit) * np.asarray(problem.weight, float)[..., None]
     fails = [STATUS[code].name in UNUSABLE for code in solution.status]
     used = ~np.isnan(problem.measured).all(axis=1)
@@ -409,7 +409,7 @@ def _at_bounds(judged: Judged) -> Iterator[Finding]:
 def _choices(judged: Judged) -> Iterator[Finding]:
     """Fewer parameters determined than fitted, or several minima that fit as well as the best."""
     rank, count = judged.errors.rank, len(judged.problem.names)
-    minima, noise = judged.solution.minima, np.nan_to_num(judged.errors.noise)
+    minima, noise = judged.solution.starts, np.nan_to_num(judged.errors.noise)
     more = max(EQUALLY_GOOD * noise**2, judged.problem.exact_squares)
     several = sum(end.sum_of_squares <= minima[0].sum_of_squares + more for end in minima)
     if rank < count:
@@ -429,7 +429,7 @@ def _unknown_errors(judged: Judged) -> Iterator[Finding]:
         yield Finding(
             "No degree of freedom is left to estimate the noise: errors are unknown without sigma."
         )
-    elif judged.solution.minima[0].sum_of_squares <= judged.problem.exact_squares:
+    elif judged.solution.starts[0].sum_of_squares <= judged.problem.exact_squares:
         yield Finding(
             "The data are reproduced to the last digit and do not show their noise: errors are "
             "unknown without `sigma` or `resolution`."

@@ -464,9 +464,7 @@ def read_experiments(
     [-0.0605, 0.1049, 0.9978]
     """
     values, units, shots = read_shots(path)
-    named: dict[str, Any] = {
-        k: values.get(k) for k in ("pre", "post", "sigma", "sigma_pre", "resolution")
-    }
+    named: dict[str, Any] = {name: values.get(name) for name in _VALUES}
     scenes = _scenes_of(path, values, scene, near)
     return Experiments(**named, scenes=scenes, shots=shots, units=units)
 

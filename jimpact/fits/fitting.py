@@ -6,13 +6,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import jax
 import numpy as np
 
 from jimpact._checks import as_whole, check_choice, check_kind
 from jimpact.files.records import listed
 from jimpact.fits.checks import Judged, fit_warnings, unusable
 from jimpact.fits.data import Experiments
-from jimpact.fits.observables import filled_count
 from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw
 from jimpact.fits.problem import FitProblem, of_shots
 from jimpact.fits.profiles import LEVEL, PROFILE_STARTS, needs_profiles, profiles_of
@@ -146,11 +146,11 @@ def fit(
             found = find_minima(problem, starts, seed, solver)
         _check_derivatives(problem, found)
         if found.slopes is not None:
-            points = problem.point(np.array([minimum.value for minimum in found.minima]))
+            points = problem.point(np.array([minimum.value for minimum in found.starts]))
             problem = problem.with_errors_before(found.slopes)
             (problem,), ends = settled([problem], points, solver)
-            counts = np.array([minimum.count for minimum in found.minima])
-            found = solution(problem, ends, counts, found.lost)
+            counts = np.array([minimum.count for minimum in found.starts])
+            found = solution(problem, ends, counts, found.lost_starts)
         robust = None
         if search.loss != "squares":
             problem, found, robust = robust_minimum(problem, found, search.loss, solver)
@@ -178,7 +178,7 @@ def _with_profiles(result: Fit[AnyLaw], profiles: tuple[Profile, ...]) -> Fit[An
 
 def _check_derivatives(problem: FitProblem, solution: Solution) -> None:
     """Raise a ValueError where derivatives are not finite, whichever shots are left out."""
-    lost = np.flatnonzero(~np.isfinite(solution.minima[0].jacobian).all(axis=1))
+    lost = np.flatnonzero(~np.isfinite(solution.starts[0].jacobian).all(axis=1))
     if len(lost):
         at = ", ".join(f"{name} = {x:g}" for name, x in zip(problem.names, solution.value))
         which = listed([str(i + 1) for i in lost])
@@ -218,8 +218,8 @@ def as_fit(
     judged = Judged(replace(problem, scene=problem.to_scene(found.value)), found, robust)
     errors, findings = judged.errors, fit_warnings(judged)
     residual = np.asarray(problem.measured, float) - found.predicted
-    starts, limit = [], found.minima[0].sum_of_squares + HARDLY_WORSE * errors.noise**2
-    for end in found.minima:
+    starts, limit = [], found.starts[0].sum_of_squares + HARDLY_WORSE * errors.noise**2
+    for end in found.starts:
         matters = not end.sum_of_squares > limit  # also where the noise is not known
         error = uncertainty(problem, end, errors.noise).standard_error if matters else None
         starts.append(FitMinimum(end.sum_of_squares, end.value, end.count, error))
@@ -227,22 +227,15 @@ def as_fit(
         law=problem.to_law(found.value),
         method=method if isinstance(method, str) else "optax",
         names=problem.names,
-        value=found.value,
         bounds=(problem.domains[:, 0], problem.domains[:, 1]),
-        at_bound=found.at_bound,
-        predicted=found.predicted,
         residual=residual,
         rms=rms(problem, residual),
         **vars(errors),
-        starts=tuple(starts),
-        status=found.status,
-        converged=found.converged,
-        steps=found.steps,
-        lost_starts=found.lost,
+        **vars(replace(found, starts=tuple(starts))),
         warnings=tuple(each.line for each in findings),
         reservations=tuple(each.reservation for each in findings if each.reservation),
         problem=problem,
-        jacobian=problem.derivatives(found.minima[0]),
+        jacobian=problem.derivatives(found.starts[0]),
     )
 
 
@@ -304,7 +297,7 @@ def fit_many(
     problems = [first, *others]
     each: dict[int, Ends] = {}  # where its starts ended
     with progress_bar(progress) as show:
-        for members in _alike(many):
+        for members in _alike(problems):
             first, solver = problems[members[0]], Solver(max_steps=max_steps, show=show)
             points = start_points(first, starts, np.random.default_rng(seed))
             points = np.tile(points, (len(members), 1))
@@ -330,13 +323,12 @@ def fit_many(
     return Fits(problems[0].names, value, squares, converged, made)
 
 
-def _alike(many: Sequence[Experiments]) -> list[list[int]]:
-    """Data sets that share one program: as many shots, filled up, all with or without errors."""
+def _alike(problems: Sequence[FitProblem]) -> list[list[int]]:
+    """Problems that share one program: their arrays have the same shapes."""
     groups: dict[Any, list[int]] = {}
-    for k, data in enumerate(many):
-        kind = (filled_count(len(data.shots)), data.pre.shape[1], data.sigma is None)
-        shapes = None if data.scenes is None else data.largest_scene(None).contacts
-        groups.setdefault((*kind, data.sigma_pre is None, shapes), []).append(k)
+    for k, problem in enumerate(problems):
+        leaves, structure = jax.tree.flatten(problem.program())
+        groups.setdefault((structure, *map(np.shape, leaves)), []).append(k)
     return list(groups.values())
 
 

@@ -230,13 +230,13 @@ def profiles_of(
     with progress_bar(progress) as show:
         lines = _Lines(fit, fit.quantile(level) ** 2, show)
         if points and fit.start_count == 1:
-            lines.add_starts(find_minima(fit.problem, points, fit.seed, Solver(show=show)).minima)
+            lines.add_starts(find_minima(fit.problem, points, fit.seed, Solver(show=show)).starts)
         for _ in range(ROUNDS):
             profiles = lines.profiles(which, level)
             if lines.lowest is lines.best:
                 break
             end = lines.minimize([((), (), lines.lowest.y)])
-            lines.add_starts(solution(fit.problem, end).minima)
+            lines.add_starts(solution(fit.problem, end).starts)
     return profiles
 
 

@@ -5,7 +5,6 @@ import json
 import platform
 from collections.abc import Iterable, Sequence
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
 from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,14 +33,11 @@ OF_A_CONTACT = ("restitution", "friction", "tangential_restitution")  # each may
 FEW_DEGREES = 8
 UNSEEN = "start value; not determined by the data"  # note on a value in brackets
 FORMAT = 1  # of the file; it changes where older files could not be read any more
-_PACKAGES = ("jax", "jaxlib", "equinox", "numpy", "scipy")
+_PACKAGES = ("jimpact", "jax", "jaxlib", "equinox", "numpy", "scipy")
 _FIT = "jimpact.fits.uncertainty:Fit"  # which imports this module
-_KINDS: dict[str, Any] = {  # of values in the file that are not arrays, mappings or classes
-    "static": StaticNumber,
-    "statics": StaticNumbers,
-    "number": float,
-    "tuple": tuple,
-    "list": list,
+# of values in the file that are not arrays, mappings or classes with fields
+_KINDS: dict[str, Any] = {
+    kind.__name__: kind for kind in (StaticNumber, StaticNumbers, float, tuple, list)
 }
 
 
@@ -452,25 +448,17 @@ def load_fit(path: str | Path) -> "Fit":
 
 def versions() -> dict[str, str]:
     """Versions of jimpact, of what it computes with, and of Python."""
-    found = {"jimpact": jimpact.__version__}
-    for name in _PACKAGES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:  # installed in a way that leaves no record
-            continue
+    found = {name: import_module(name).__version__ for name in _PACKAGES}
     return found | {"Python": f"{platform.python_version()}, {platform.system()}"}
 
 
 def _encoded(value: Any) -> Any:
     """What a JSON file can hold, from which `_decoded` makes the value again, bit by bit."""
-    if isinstance(value, StaticNumber):
-        return {"static": float(value)}
-    if isinstance(value, StaticNumbers):
-        return {"statics": list(value)}
     if value is None or isinstance(value, bool | str | int):
         return value
     if isinstance(value, float):
-        return value if np.isfinite(value) else {"number": str(value)}
+        plain = type(value) is float and np.isfinite(value)
+        return value if plain else {type(value).__name__: repr(float(value))}
     if isinstance(value, jax.Array | np.ndarray | np.generic):
         array = np.asarray(value)
         entries = [_encoded(x) for x in array.ravel().tolist()]

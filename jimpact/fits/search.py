@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -117,23 +117,24 @@ class FitMinimum:
     residual: np.ndarray = None  # type: ignore[assignment]
 
 
-class Solution(NamedTuple):
-    """All distinct minima, best first, and what the law of the best predicts."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Solution:
+    """All distinct minima, and what the law of the best predicts; see `Fit`."""
 
-    minima: list[FitMinimum]
-    predicted: np.ndarray  # shaped like what was measured
+    starts: tuple[FitMinimum, ...]
+    predicted: np.ndarray
     status: np.ndarray
-    slopes: np.ndarray | None  # `dv+/dv-` of the shots, where errors of v- are passed on
+    slopes: np.ndarray | None = None
     converged: bool
-    stuck: bool  # no step lowers the sum of squares, although derivatives promise it
+    stuck: bool = False
     at_bound: np.ndarray
     steps: int
-    lost: int  # starts that were given up, or did not converge
+    lost_starts: int
 
     @property
     def value(self) -> np.ndarray:
         """The parameters (P,) of the best."""
-        return self.minima[0].value
+        return self.starts[0].value
 
 
 def solution(
@@ -145,8 +146,9 @@ def solution(
     # without what filled up, and parameters that have no prior
     first_prior = ends.residual.shape[1] - len(problem.low)
     own = [*range(measured.size), *(first_prior + prior.parameter for prior in problem.priors)]
-    groups, y, minima = _groups(problem, ends), ends.y[:, :count], []
+    groups, minima = _groups(problem, ends), []
     best = groups[0][0]
+    end = ends.rows(best)
     for group in groups:
         # starts that did not converge have no minimum to report, unless they are the best there is
         kept = [i for i in group if ends.converged[i] or i == best]
@@ -156,17 +158,16 @@ def solution(
             starts = int(counts[kept].sum())
             minima.append(FitMinimum(squares, value, starts, None, slope, residual))
     rows = slice(len(measured)) if measured.ndim else ...
-    low, high = (np.asarray(end)[:count] for end in (problem.low, problem.high))
     return Solution(
-        minima=minima,
-        predicted=ends.predicted[best][rows],
-        status=ends.status[best][rows],
-        slopes=None if ends.slopes is None else ends.slopes[best],
-        converged=bool(ends.converged[best]),
-        stuck=bool(ends.stuck[best]),
-        at_bound=(y[best] <= low) | (y[best] >= high),
+        starts=tuple(minima),
+        predicted=end.predicted[rows],
+        status=end.status[rows],
+        slopes=end.slopes,
+        converged=bool(end.converged),
+        stuck=bool(end.stuck),
+        at_bound=((end.y <= problem.low) | (end.y >= problem.high))[:count],
         steps=int(np.max(ends.steps)),
-        lost=lost + int(counts.sum()) - sum(minimum.count for minimum in minima),
+        lost_starts=lost + int(counts.sum()) - sum(minimum.count for minimum in minima),
     )
 
 
@@ -339,7 +340,7 @@ def _groups(problem: "FitProblem", ends: Ends) -> list[list[int]]:
     the user's own.
     """
     squares, y, least = ends.squares, ends.y[:, : len(problem.names)], np.nanmin(ends.squares)
-    unit, exact = SAME_COST / ends.jacobian.shape[1], ends.exact[0]
+    unit, exact = SAME_COST / ends.jacobian.shape[1], problem.exact_squares
     equal = squares <= least * (1 + unit) + exact
     order = np.lexsort((np.arange(len(y)), ~ends.converged, np.where(equal, least, squares)))
     groups: list[list[int]] = []
@@ -433,9 +434,9 @@ def robust_minimum(
         if np.abs(problem.point(found.value) - before).max() <= SETTLED:
             break
     else:
-        found = found._replace(converged=False)
+        found = replace(found, converged=False)
     psi = (share * error / scale)[here]
     noise = scale * np.sqrt(np.sum(psi**2)) / max(slope[here].mean(), LEAST_SLOPE)
     # weighted as in the problem, without the factors of the loss
-    minima = solution(problem, outcome_at(problem, found.value)).minima
-    return problem, found._replace(minima=minima), float(noise)
+    starts = solution(problem, outcome_at(problem, found.value)).starts
+    return problem, replace(found, starts=starts), float(noise)

@@ -284,7 +284,6 @@ class Ends(NamedTuple):
     converged: np.ndarray  # (S,) whether so close to a minimum that it stands
     stuck: np.ndarray  # (S,) no step lowers the sum of squares, although derivatives promise it
     steps: np.ndarray
-    exact: np.ndarray  # (S,) sums of squares up to which data count as reproduced
 
     def rows(self, which: Any) -> "Ends":
         """Some of them."""
@@ -340,7 +339,6 @@ def minimize(
         converged=converged & ~moved,
         stuck=np.asarray(stuck),
         steps=np.asarray(steps),
-        exact=EXACT[dtype] * size**2,
     )
 
 
@@ -388,13 +386,8 @@ def _descended(
     descends = solver.method != "levenberg-marquardt"
     if not descends:
         limit = np.asarray(limit)  # one program serves all limits
-    rule: Any = (solver.method, limit, np.asarray(stop, dtype))
-    states = begin(problems, points, solver)
-
-    def advance(problems: Any, states: SolverState) -> SolverState:
-        """Some of them."""
-        return advance_all(problems, states, *rule)
-
+    rule: Any = {"method": solver.method, "max_steps": limit, "stop": np.asarray(stop, dtype)}
+    advance, states = partial(advance_all, **rule), begin(problems, points, solver)
     converged = np.zeros(count, bool)
     active, lanes = np.arange(count), problems.lanes(count)
     while len(active):

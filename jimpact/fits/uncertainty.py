@@ -17,7 +17,7 @@ from jimpact.fits.data import Experiments
 from jimpact.fits.parameters import AnyLaw, LawInScene, tied_names, tied_value
 from jimpact.fits.problem import FitProblem
 from jimpact.fits.report import as_record, pieces_in_words, report, save_fit, verdict
-from jimpact.fits.search import FitMinimum, solution
+from jimpact.fits.search import FitMinimum, Solution, solution
 from jimpact.fits.solve import RANK_TOLERANCE, outcome_at
 from jimpact.law import parameters_of
 from jimpact.scene import Scene
@@ -206,8 +206,8 @@ class Predicted(NamedTuple):
     high: np.ndarray
 
 
-@dataclass(frozen=True, eq=False)
-class Fit(Uncertainty, Tabular, Generic[AnyLaw]):
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Fit(Solution, Uncertainty, Tabular, Generic[AnyLaw]):
     """The result of `fit`. `print(fit)` gives its report.
 
     P free parameters, K shots of n velocities.
@@ -238,6 +238,8 @@ class Fit(Uncertainty, Tabular, Generic[AnyLaw]):
         converged: whether the best start did.
         steps: iterations of the best start.
         lost_starts: how many were given up far above the best, or did not converge.
+        stuck: whether no step lowers the sum of squares, although derivatives promise it.
+        slopes: `dv+/dv-` (K, n, n) of the shots, where errors of v- are passed on, else None.
         warnings: what is wrong with data or fit, in words.
         problem: what was solved.
         jacobian: derivatives of what was measured in the parameters (K, n, P), NaN where no
@@ -251,17 +253,9 @@ class Fit(Uncertainty, Tabular, Generic[AnyLaw]):
     law: AnyLaw
     method: str
     names: tuple[str, ...]
-    value: np.ndarray
     bounds: tuple[np.ndarray, np.ndarray]
-    at_bound: np.ndarray
-    predicted: np.ndarray
     residual: np.ndarray
     rms: float
-    starts: tuple[FitMinimum, ...]
-    status: np.ndarray
-    converged: bool
-    steps: int
-    lost_starts: int
     warnings: tuple[str, ...]
     problem: FitProblem
     jacobian: np.ndarray
@@ -406,7 +400,7 @@ class Fit(Uncertainty, Tabular, Generic[AnyLaw]):
         self._check_scene(largest, len(units))
         problem = self.problem.of_other(data, own)
         there = solution(problem, outcome_at(problem, self.value))
-        error = self.errors_of(problem.derivatives(there.minima[0]))
+        error = self.errors_of(problem.derivatives(there.starts[0]))
         value, noise = there.predicted, np.broadcast_to(self._noise_of(sigma), data.pre.shape)
         half = quantile * np.hypot(error, noise)
         return Predicted(value, error, np.asarray(there.status), noise, value - half, value + half)
