@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
+from scipy.sparse import block_diag
 from scipy.special import chdtrc, fdtrc
 
 from jimpact.files.records import listed
@@ -61,7 +62,7 @@ class Judged:
         of_value = np.nonzero(~np.isnan(np.atleast_1d(problem.measured)))[0]
         self.shot = np.append(of_value, np.full(len(problem.priors), NO_SHOT))
         self.shots = np.unique(of_value)
-        used = np.append(here, np.ones(len(problem.priors), bool))
+        self.used = used = np.append(here, np.ones(len(problem.priors), bool))
         # where the law fails, what a search takes for the residual is no error
         errors = problem.independent(problem.measured - solution.predicted)
         self.residual = np.append(errors, -minimum.residual[errors.size :])[used]
@@ -86,13 +87,17 @@ class Judged:
         squares, freedom, data = self.squares, self.freedom, self.problem.experiments
         tests = [(squares, freedom)]
         if data is not None and not data.lost_freedom:
-            for k, basis in enumerate(_conserved(self.problem)):
-                if basis.shape[1]:
-                    squares -= float(np.sum((basis.T @ self.residual[self.shot == k]) ** 2))
-                    freedom -= basis.shape[1]
-            tests.append((max(squares, 0.0), freedom))
+            momentum = self.momentum
+            squares -= float(np.sum((momentum.T @ self.residual) ** 2))
+            tests.append((max(squares, 0.0), freedom - momentum.shape[1]))
         rejected = [s / f for s, f in tests if f > 0 and chdtrc(f, s) < LEVEL]
         return float(np.sqrt(max(rejected, default=1.0)))
+
+    @property
+    def momentum(self) -> Any:
+        """(R, C) of shots: the directions in which residuals are momentum, a sparse matrix."""
+        of_priors = np.zeros((len(self.problem.priors), 0))
+        return block_diag([*_conserved(self.problem), of_priors], format="csr")[self.used]
 
     @property
     def inexact(self) -> bool:
@@ -296,13 +301,10 @@ def _pattern(judged: Judged) -> Iterator[Finding]:
     body = np.broadcast_to(np.arange(pre.shape[1]), problem.measured.shape)
     body = body[~np.isnan(problem.measured)]
     more = np.hstack([basis[judged.shot] * (body == i)[:, None] for i in range(pre.shape[1])])
-    residual, known = judged.residual.copy(), _range(problem, judged.jacobian)
-    for k, momentum in enumerate(_conserved(problem)):  # no law explains that part
-        if momentum.shape[1]:
-            rows = judged.shot == k
-            more[rows] -= momentum @ (momentum.T @ more[rows])
-            residual[rows] -= momentum @ (momentum.T @ residual[rows])
-            rest -= 0 if problem.experiments.lost_freedom else momentum.shape[1]
+    momentum, known = judged.momentum, _range(problem, judged.jacobian)
+    # no law explains that part
+    more, residual = (x - momentum @ (momentum.T @ x) for x in (more, judged.residual))
+    rest -= 0 if problem.experiments.lost_freedom else momentum.shape[1]
     extra = _range(problem, more - known @ (known.T @ more), float(np.linalg.norm(more)))
     count = extra.shape[1]
     rest -= count

@@ -234,7 +234,8 @@ class FitProblem:
         # a stiffness that the user names is one that the function sees
         own = isinstance(observe, eqx.Module)
         observable = observe if own else Observed(observe, free is not DEFAULT_FREE)
-        values = _weighed(post, sigma, 1.0 if sigma is None else sigma, np.nanmax(np.abs(post)))
+        weight = np.where(np.isnan(post), 0.0, 1 / (1.0 if sigma is None else sigma))
+        values = _weighed(post, sigma, weight, np.nanmax(np.abs(post)))
         problem = _build(law, observable, values, (free, bounds, priors, ties))
         shape = eqx.filter_eval_shape(observable, law).value.shape
         if shape != post.shape:
@@ -247,17 +248,15 @@ class FitProblem:
     def with_shots(self, data: Experiments) -> "FitProblem | None":
         """The same of other shots, where only these differ, which is many times quicker; else None.
 
-        They differ in more where they have scenes, other units or errors of v-, or where the law is
+        They differ in more where they have scenes or errors of v-, or where the law is
         computed as coarsely as the noise of the shots allows.
 
         Args:
             data: shots of as many bodies.
         """
-        own, first = data.scenes is not None or self.scene is None, self.experiments
-        if own or first is None or data.units != first.units:
-            return None
+        own = data.scenes is not None or self.scene is None
         coarse = getattr(self.law, "rtol", None) == COARSE_RTOL
-        if data.sigma_pre is not None or self.mixing is not None or coarse:
+        if own or coarse or data.sigma_pre is not None or self.mixing is not None:
             return None
         return self.of_other(data, self.scene)
 
@@ -269,8 +268,8 @@ class FitProblem:
             scene: of all; None: they have their own.
         """
         observe, _, weights = _measured_shots(data, scene)
-        arrays = {"observe": observe, "mixing": None} | weights
-        return replace(self, **_in(self.low.dtype, arrays), experiments=data, scene=scene)
+        arrays = _in(self.low.dtype, {"observe": observe} | weights)
+        return replace(self, **arrays, experiments=data, scene=scene)
 
     def weighed(self, factor: np.ndarray) -> "FitProblem":
         """With factors on the independent errors.
@@ -282,13 +281,8 @@ class FitProblem:
         if mixing is not None:  # which comes before the factors
             weight, mixing = self.weight * used, np.where(used, factor, 1.0)[..., None] * mixing
         measured = np.where(used, self.measured, np.nan)
-        return replace(self, **self._weights(weight, mixing), measured=measured)
-
-    def _weights(self, weight: np.ndarray, mixing: Any) -> dict[str, Any]:
-        """The fields that follow from weights and mixing."""
-        size = float(self.unit) * np.linalg.norm(weight)
-        arrays = {"weight": weight, "size": np.asarray(size), "mixing": mixing}
-        return _in(self.low.dtype, arrays)
+        arrays = _weighed(measured, self.sigma, weight, self.unit, mixing)
+        return replace(self, **_in(self.low.dtype, arrays))
 
     def with_errors_before(self, slopes: np.ndarray | None) -> "FitProblem":
         """With the errors of v-, if there are any, passed on to v+ by slopes.
@@ -313,8 +307,9 @@ class FitProblem:
         factor = np.linalg.cholesky(covariance / (sigma[:, :, None] * sigma[:, None, :]))
         # factors that a weight already has (shots left out) stay
         old = np.where(here, np.asarray(self.sigma, float), 1.0)
-        weights = self._weights(self.weight * old / sigma, np.linalg.inv(factor))
-        return replace(self, **weights, sigma=np.where(here, sigma, np.nan))
+        weight, sigma = self.weight * old / sigma, np.where(here, sigma, np.nan)
+        arrays = _weighed(self.measured, sigma, weight, self.unit, np.linalg.inv(factor))
+        return replace(self, **_in(self.low.dtype, arrays))
 
     def program(self) -> "FitProblem":
         """As compiled functions take it: without what differs between fits of one program.
@@ -642,20 +637,21 @@ def _build(
     )
 
 
-def _weighed(measured: np.ndarray, sigma: Any, errors: Any, unit: float) -> dict[str, Any]:
-    """What was measured, its weights, and the sizes that follow; `errors`: to weigh by."""
-    here, unit = ~np.isnan(measured), float(unit) or 1.0
-    weight = np.where(here, 1 / np.where(here, errors, 1.0), 0.0)
-    size = np.asarray(unit * np.linalg.norm(weight))
-    arrays = {"measured": measured, "weight": weight, "unit": np.asarray(unit), "size": size}
-    return arrays | {"sigma": sigma}
+def _weighed(
+    measured: np.ndarray, sigma: Any, weight: np.ndarray, unit: Any, mixing: Any = None
+) -> dict[str, Any]:
+    """What was measured, its weights, and the sizes that follow."""
+    unit = np.asarray(float(unit) or 1.0)
+    arrays = {"measured": measured, "weight": weight, "unit": unit, "mixing": mixing}
+    return arrays | {"size": np.asarray(unit * np.linalg.norm(weight)), "sigma": sigma}
 
 
 def _weighed_shots(data: Experiments, scene: Scene | None) -> dict[str, Any]:
     """The same of shots."""
     post, sigma = np.asarray(data.post), None if data.sigma is None else np.asarray(data.sigma)
     unit = max(np.abs(np.asarray(data.pre)).max(), np.nanmax(np.abs(post)))
-    return _weighed(post, sigma, data.natural_errors(scene) if sigma is None else sigma, unit)
+    errors = data.natural_errors(scene) if sigma is None else sigma
+    return _weighed(post, sigma, np.where(np.isnan(post), 0.0, 1 / errors), unit)
 
 
 def _of_parameters(
