@@ -7,8 +7,7 @@ first P count, so that a compiled program does not depend on which entries are f
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import equinox as eqx
@@ -64,17 +63,14 @@ FEW = 64
 LANES, LANES_OF_MANY, LANES_ON_ACCELERATOR = 2, 64, 1024
 
 
-_ARRAYS = (
-    *("law", "observe", "owner", "fixed", "scale", "log", "low", "high", "matrix", "measured"),
-    *("weight", "unit", "size", "prior_mean", "prior_weight", "mixing"),
-)
-_STATIC = ("fields", "ties")
+_STATIC = {"static": True}  # fields that are no arrays for JAX
+# ... of which a compiled function knows none
 _ON_HOST: dict[str, Any] = dict.fromkeys(
     ("parameters", "domains", "sigma", "priors", "notes", "experiments", "scene", "left_out")
 )
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=_ARRAYS, meta_fields=(*_STATIC, *_ON_HOST))
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class FitProblem:
     """The least-squares problem behind a fit, in the parameters x (P,) themselves.
@@ -144,16 +140,16 @@ class FitProblem:
     size: Any
     prior_mean: Any
     prior_weight: Any
-    fields: tuple[str, ...]
-    ties: Ties
-    parameters: Parameters
-    domains: np.ndarray
-    sigma: np.ndarray | None
-    priors: tuple[Prior, ...]
-    notes: tuple[str, ...]
-    experiments: Experiments | None = None
-    scene: Scene | None = None
-    left_out: tuple[str, ...] = ()
+    fields: tuple[str, ...] = field(metadata=_STATIC)
+    ties: Ties = field(metadata=_STATIC)
+    parameters: Parameters = field(metadata=_STATIC)
+    domains: np.ndarray = field(metadata=_STATIC)
+    sigma: np.ndarray | None = field(metadata=_STATIC)
+    priors: tuple[Prior, ...] = field(metadata=_STATIC)
+    notes: tuple[str, ...] = field(metadata=_STATIC)
+    experiments: Experiments | None = field(default=None, metadata=_STATIC)
+    scene: Scene | None = field(default=None, metadata=_STATIC)
+    left_out: tuple[str, ...] = field(default=(), metadata=_STATIC)
     mixing: Any = None
 
     # ------------------------------------------------------------------ how problems are made
@@ -661,9 +657,9 @@ def _of_parameters(
     fixed, count = entries(law, parameters.fields), len(parameters.names)
     owner, starts = np.full(len(fixed), -1), fixed[parameters.first]
     natural = np.where(parameters.log, 1.0, np.maximum(np.abs(starts), 1.0))
-    for i, (group, field) in enumerate(zip(parameters.groups, parameters.of_fields)):
+    for i, (group, name) in enumerate(zip(parameters.groups, parameters.of_fields)):
         owner[list(group)] = i
-        natural[i] = energy if field == "initial_energy" else natural[i]
+        natural[i] = energy if name == "initial_energy" else natural[i]
     mean, weight = np.zeros((2, count))
     for prior in priors:
         i = prior.parameter
