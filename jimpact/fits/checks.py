@@ -259,9 +259,7 @@ def _not_finite(judged: Judged) -> Iterator[Finding]:
 
 def _beyond_sigma(judged: Judged) -> Iterator[Finding]:
     """Residuals larger than sigma allows."""
-    if not judged.inexact or judged.problem.sigma is None:
-        return
-    if judged.stretch > 1:
+    if judged.inexact and judged.stretch > 1:
         how = "are those of the loss" if judged.robust else "are stretched by that"
         yield Finding(
             f"Lack of fit: the residuals are {judged.stretch:.2g} times what sigma allows (chi^2 = "

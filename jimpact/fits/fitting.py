@@ -13,6 +13,7 @@ from jimpact._checks import as_whole, check_choice, check_kind
 from jimpact.files.records import listed
 from jimpact.fits.checks import Judged, fit_warnings, unusable
 from jimpact.fits.data import Experiments
+from jimpact.fits.observables import COARSE_RTOL
 from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw
 from jimpact.fits.problem import FitProblem, of_shots
 from jimpact.fits.profiles import LEVEL, PROFILE_STARTS, needs_profiles, profiles_of
@@ -168,11 +169,8 @@ def _with_profiles(result: Fit[AnyLaw], profiles: tuple[Profile, ...]) -> Fit[An
         values = ", ".join(f"{name} {x:.4g}" for name, x in zip(result.names, better))
         line = f"A profile found a lower minimum than the fit ({values}): allow more `starts`."
         short = "a profile found a lower minimum"
-        result = replace(
-            result,
-            warnings=(*result.warnings, line),
-            reservations=(*result.reservations, short),
-        )
+        result = replace(result, warnings=(*result.warnings, line))
+        result = replace(result, reservations=(*result.reservations, short))
     return replace(result, profiles=profiles)
 
 
@@ -293,8 +291,13 @@ def fit_many(
     for k, data in enumerate(many):
         check_kind(f"many[{k}]", data, Experiments)
     first = of_shots(law, scene, many[0], *choice)
-    others = (first.with_shots(data) or of_shots(law, scene, data, *choice) for data in many[1:])
-    problems = [first, *others]
+    same = scene is not None and first.mixing is None
+    same &= getattr(first.law, "rtol", None) != COARSE_RTOL  # where the noise allows it
+    problems = [first]
+    for data in many[1:]:
+        only_shots = same and data.scenes is None and data.sigma_pre is None
+        other = first.of_other(data, scene) if only_shots else of_shots(law, scene, data, *choice)
+        problems.append(other)
     each: dict[int, Ends] = {}  # where its starts ended
     with progress_bar(progress) as show:
         for members in _alike(problems):

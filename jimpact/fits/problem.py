@@ -20,7 +20,6 @@ from jimpact.compiling import full_precision
 from jimpact.fits.data import Experiments, kept_by_corrections
 from jimpact.fits.matrices import AdmissibleMatrices, matrix_region
 from jimpact.fits.observables import (
-    COARSE_RTOL,
     Observed,
     Prediction,
     Shots,
@@ -241,23 +240,10 @@ class FitProblem:
             )
         return problem
 
-    def with_shots(self, data: Experiments) -> "FitProblem | None":
-        """The same of other shots, where only these differ, which is many times quicker; else None.
-
-        They differ in more where they have scenes or errors of v-, or where the law is
-        computed as coarsely as the noise of the shots allows.
-
-        Args:
-            data: shots of as many bodies.
-        """
-        own = data.scenes is not None or self.scene is None
-        coarse = getattr(self.law, "rtol", None) == COARSE_RTOL
-        if own or coarse or data.sigma_pre is not None or self.mixing is not None:
-            return None
-        return self.of_other(data, self.scene)
-
     def of_other(self, data: Experiments, scene: Scene | None) -> "FitProblem":
-        """The same of other shots; errors of v- count as if there were none.
+        """The same of other shots, which is many times quicker than to make it from them.
+
+        Errors of v- count as if there were none; the law and its tolerance stay.
 
         Args:
             data: shots of as many bodies.

@@ -265,7 +265,7 @@ def _box(problem: "FitProblem") -> np.ndarray:
     reach = np.where(log, np.log(START_FACTOR), START_SCALES)
     low = np.where(log | np.isinf(low), np.maximum(low, own - reach), low)
     high = np.where(log | np.isinf(high), np.minimum(high, own + reach), high)
-    elastic = np.array([field == "restitution" for field in problem.parameters.of_fields])
+    elastic = np.array(problem.parameters.of_fields) == "restitution"
     low = np.where(elastic & (high > START_RESTITUTION), np.maximum(low, START_RESTITUTION), low)
     return np.stack([low, high])
 

@@ -86,7 +86,8 @@ def uncertainty(
     with np.errstate(divide="ignore", invalid="ignore"):
         correlation = covariance / np.outer(error, error)
     np.fill_diagonal(correlation, 1.0)
-    words = (*problem.notes, *(_in_words(problem, row, scale) for row in _reduced(null)))
+    unseen = _reduced(null) if len(null) else null
+    words = (*problem.notes, *(_in_words(problem, row, scale) for row in unseen))
     return Uncertainty(rank, singular, freedom, noise, covariance, correlation, error, words)
 
 
