@@ -483,8 +483,7 @@ class FitProblem:
     def values(self) -> int:
         """How many independent values were measured or are priors."""
         here, data = ~np.isnan(self.measured), self.experiments
-        used = here.any(axis=1) if data is not None else ()
-        lost = sum(np.array(data.lost)[used]) if data is not None else 0
+        lost = 0 if data is None else np.array(data.lost)[here.any(axis=1)].sum()
         return int(here.sum() - lost) + len(self.priors)
 
     @property
@@ -492,8 +491,7 @@ class FitProblem:
         """Of the shots, or of the rows of what was measured."""
         if self.experiments is not None:
             return self.experiments.shots
-        rows = self.measured.shape[0] if self.measured.ndim else 1
-        return tuple(str(k + 1) for k in range(rows))
+        return tuple(str(k + 1) for k in range(len(np.atleast_1d(self.measured))))
 
     def of_data(self, rows: np.ndarray) -> np.ndarray:
         """Those of rows (R, ...), as of a residual, that are of what was measured, in its shape."""

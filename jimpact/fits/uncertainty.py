@@ -412,11 +412,9 @@ class Fit(Solution, Uncertainty, Tabular, Generic[AnyLaw]):
         values = [x.value for x in parameters_of(self.law).values() if x.domain.per_contact]
         counts = {np.shape(value)[0] for value in values if np.ndim(value) == 1}
         if scene.size != size or counts - {scene.contacts}:
-            contacts = (
-                f" and {min(counts)} contacts, one for each value of the law" if counts else ""
-            )
+            also = f" and {min(counts)} contacts, one for each value of the law" if counts else ""
             raise ValueError(
-                f"Argument `scene` must have {size} velocities as the fit{contacts}, but has "
+                f"Argument `scene` must have {size} velocities as the fit{also}, but has "
                 f"{scene.size} and {scene.contacts}."
             )
 
