@@ -337,8 +337,7 @@ def _bound_pair(field: str, pair: Any, law: Law) -> Limits:
     return low, high
 
 
-@dataclasses.dataclass(frozen=True)
-class Prior:
+class Prior(NamedTuple):
     """What is known of a parameter (by its number) besides the data: normally distributed."""
 
     parameter: int
@@ -600,7 +599,7 @@ def limits_with_scene(
                 f"Argument `priors` must have (mean, standard deviation) for `{name}`, a part of "
                 "the scene that is fitted with the law."
             )
-        mean, std = known[i].mean, known[i].std
+        _, mean, std = known[i]
         low[i], high[i] = max(low[i], mean - REACH * std), min(high[i], mean + REACH * std)
         if not low[i] <= start[i] <= high[i]:
             raise ValueError(

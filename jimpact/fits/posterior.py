@@ -183,7 +183,7 @@ def _inside(start: np.ndarray, domains: np.ndarray) -> np.ndarray:
 def _priors(problem: FitProblem, chosen_priors: dict[str, Any], kinds: Any) -> dict[str, Any]:
     """A distribution of numpyro a parameter: chosen, or of the fit, or flat."""
     parameters, priors = problem.parameters, {}
-    own = {each.parameter: Normal(each.mean, each.std) for each in problem.priors}
+    own = {i: Normal(mean, std) for i, mean, std in problem.priors}
     for i, (name, field) in enumerate(zip(problem.names, parameters.of_fields)):
         chosen = chosen_priors.get(name, chosen_priors.get(field, own.get(i)))
         low, high = problem.domains[i].tolist()

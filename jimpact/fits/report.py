@@ -15,7 +15,7 @@ import numpy as np
 
 import jimpact
 from jimpact.files.records import as_data, with_error
-from jimpact.fits.parameters import value_of
+from jimpact.fits.parameters import Prior, value_of
 from jimpact.law import StaticNumber, StaticNumbers
 from jimpact.status import STATUS
 
@@ -38,7 +38,7 @@ _FIT = "jimpact.fits.uncertainty:Fit"  # which imports this module
 # of values in the file that are not arrays, mappings or classes with fields
 _KINDS: dict[str, Any] = {
     kind.__name__: kind for kind in (StaticNumber, StaticNumbers, float, tuple, list)
-}
+} | {"Prior": Prior._make}
 
 
 def joined_words(parts: Sequence[str]) -> str:
