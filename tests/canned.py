@@ -10,7 +10,7 @@ from jimpact.laws.histories import History
 from jimpact.motion.record import KIND_CODE, Motion, no_events, with_row
 
 
-def canned(shots, **change):
+def canned(shots, value=(0.6, 2.0), **change):
     """A fit of two parameters to a pair of balls, as if found."""
     rng = np.random.default_rng(0)
     pre = np.stack([rng.uniform(1, 2, shots), np.zeros(shots)], axis=1)
@@ -22,7 +22,6 @@ def canned(shots, **change):
         "law": ji.LZB([0.6], [2.0]),
         "method": "levenberg-marquardt",
         "names": ("restitution[1]", "stiffness[1]"),
-        "value": np.array([0.6, 2.0]),
         "standard_error": np.array([0.01, np.inf]),
         "covariance": np.array([[1e-4, np.nan], [np.nan, np.inf]]),
         "correlation": np.eye(2),
@@ -38,7 +37,7 @@ def canned(shots, **change):
         "identifiability": (
             "The data cannot see stiffness[1]: no measured velocity depends on it.",
         ),
-        "starts": (start(0.6, 3), start(0.4, 5)),
+        "starts": (start(value, 3), start((0.4, 2.0), 5)),
         "status": np.zeros(shots, int),
         "converged": True,
         "steps": 17,
@@ -57,7 +56,7 @@ def canned(shots, **change):
 
 def start(value, count):
     fields = {name: None for name in FitMinimum.__annotations__}
-    known = {"value": np.array([value, 2.0]), "sum_of_squares": 1e-4, "count": count}
+    known = {"value": np.array(value), "sum_of_squares": 1e-4, "count": count}
     return FitMinimum(**(fields | {k: v for k, v in known.items() if k in fields}))
 
 

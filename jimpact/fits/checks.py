@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
+from scipy.sparse import block_diag
 from scipy.special import chdtrc, fdtrc
 
 from jimpact.files.records import listed
@@ -57,11 +58,11 @@ class Judged:
     def __init__(self, problem: FitProblem, solution: Solution, loss_noise: float | None):
         """`loss_noise`: noise times the root of the degrees of freedom, of a robust loss."""
         self.problem, self.solution, self.robust = problem, solution, loss_noise is not None
-        minimum, here = solution.minima[0], ~np.isnan(problem.measured).ravel()
+        minimum, here = solution.starts[0], ~np.isnan(problem.measured).ravel()
         of_value = np.nonzero(~np.isnan(np.atleast_1d(problem.measured)))[0]
         self.shot = np.append(of_value, np.full(len(problem.priors), NO_SHOT))
         self.shots = np.unique(of_value)
-        used = np.append(here, np.ones(len(problem.priors), bool))
+        self.used = used = np.append(here, np.ones(len(problem.priors), bool))
         # where the law fails, what a search takes for the residual is no error
         errors = problem.independent(problem.measured - solution.predicted)
         self.residual = np.append(errors, -minimum.residual[errors.size :])[used]
@@ -86,13 +87,17 @@ class Judged:
         squares, freedom, data = self.squares, self.freedom, self.problem.experiments
         tests = [(squares, freedom)]
         if data is not None and not data.lost_freedom:
-            for k, basis in enumerate(_conserved(self.problem)):
-                if basis.shape[1]:
-                    squares -= float(np.sum((basis.T @ self.residual[self.shot == k]) ** 2))
-                    freedom -= basis.shape[1]
-            tests.append((max(squares, 0.0), freedom))
+            momentum = self.momentum
+            squares -= float(np.sum((momentum.T @ self.residual) ** 2))
+            tests.append((max(squares, 0.0), freedom - momentum.shape[1]))
         rejected = [s / f for s, f in tests if f > 0 and chdtrc(f, s) < LEVEL]
         return float(np.sqrt(max(rejected, default=1.0)))
+
+    @property
+    def momentum(self) -> Any:
+        """(R, C) of shots: the directions in which residuals are momentum, a sparse matrix."""
+        of_priors = np.zeros((len(self.problem.priors), 0))
+        return block_diag([*_conserved(self.problem), of_priors], format="csr")[self.used]
 
     @property
     def inexact(self) -> bool:
@@ -110,7 +115,7 @@ def unusable(problem: FitProblem, solution: Solution) -> np.ndarray:
     """Shots (K,) whose impacts fail, or whose derivatives are not finite or absurdly large."""
     if not isinstance(problem.observe, Shots):
         return np.zeros(1, bool)
-    slope = np.abs(problem.of_data(solution.jacobian))
+    slope = np.abs(problem.of_data(solution.starts[0].jacobian))
     allowed = ABSURD * float(problem.unit) * np.asarray(problem.weight, float)[..., None]
     fails = [STATUS[code].name in UNUSABLE for code in solution.status]
     used = ~np.isnan(problem.measured).all(axis=1)
@@ -254,9 +259,7 @@ def _not_finite(judged: Judged) -> Iterator[Finding]:
 
 def _beyond_sigma(judged: Judged) -> Iterator[Finding]:
     """Residuals larger than sigma allows."""
-    if not judged.inexact or judged.problem.sigma is None:
-        return
-    if judged.stretch > 1:
+    if judged.inexact and judged.stretch > 1:
         how = "are those of the loss" if judged.robust else "are stretched by that"
         yield Finding(
             f"Lack of fit: the residuals are {judged.stretch:.2g} times what sigma allows (chi^2 = "
@@ -296,13 +299,10 @@ def _pattern(judged: Judged) -> Iterator[Finding]:
     body = np.broadcast_to(np.arange(pre.shape[1]), problem.measured.shape)
     body = body[~np.isnan(problem.measured)]
     more = np.hstack([basis[judged.shot] * (body == i)[:, None] for i in range(pre.shape[1])])
-    residual, known = judged.residual.copy(), _range(problem, judged.jacobian)
-    for k, momentum in enumerate(_conserved(problem)):  # no law explains that part
-        if momentum.shape[1]:
-            rows = judged.shot == k
-            more[rows] -= momentum @ (momentum.T @ more[rows])
-            residual[rows] -= momentum @ (momentum.T @ residual[rows])
-            rest -= 0 if problem.experiments.lost_freedom else momentum.shape[1]
+    momentum, known = judged.momentum, _range(problem, judged.jacobian)
+    # no law explains that part
+    more, residual = (x - momentum @ (momentum.T @ x) for x in (more, judged.residual))
+    rest -= 0 if problem.experiments.lost_freedom else momentum.shape[1]
     extra = _range(problem, more - known @ (known.T @ more), float(np.linalg.norm(more)))
     count = extra.shape[1]
     rest -= count
@@ -409,7 +409,7 @@ def _at_bounds(judged: Judged) -> Iterator[Finding]:
 def _choices(judged: Judged) -> Iterator[Finding]:
     """Fewer parameters determined than fitted, or several minima that fit as well as the best."""
     rank, count = judged.errors.rank, len(judged.problem.names)
-    minima, noise = judged.solution.minima, np.nan_to_num(judged.errors.noise)
+    minima, noise = judged.solution.starts, np.nan_to_num(judged.errors.noise)
     more = max(EQUALLY_GOOD * noise**2, judged.problem.exact_squares)
     several = sum(end.sum_of_squares <= minima[0].sum_of_squares + more for end in minima)
     if rank < count:
@@ -429,7 +429,7 @@ def _unknown_errors(judged: Judged) -> Iterator[Finding]:
         yield Finding(
             "No degree of freedom is left to estimate the noise: errors are unknown without sigma."
         )
-    elif judged.solution.minima[0].sum_of_squares <= judged.problem.exact_squares:
+    elif judged.solution.starts[0].sum_of_squares <= judged.problem.exact_squares:
         yield Finding(
             "The data are reproduced to the last digit and do not show their noise: errors are "
             "unknown without `sigma` or `resolution`."

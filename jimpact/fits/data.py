@@ -1,7 +1,7 @@
 """Measured shots: velocities before and after impacts, read from CSV files."""
 
-import operator
 from collections.abc import Callable, Sequence
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,6 @@ from jimpact.scene import WALLS, Scene, chain, dense_mass, stackable, with_gaps
 ROUNDING = 1e-9
 _PRINTED = 4  # shots that `print` shows
 _VALUES = ("pre", "post", "sigma", "sigma_pre", "resolution")
-_RESOLUTION = operator.attrgetter("resolution")
 
 
 class Experiments(eqx.Module):
@@ -177,12 +176,9 @@ class Experiments(eqx.Module):
 
     def energy_ratio(self, scene: Scene | None = None) -> np.ndarray:
         """`T+ / T-` of every shot (K,) in a scene; NaN for shots with missing values."""
-        ratios = []
-        masses = self.each(scene, dense_mass)
-        for mass, pre, post in zip(masses, np.asarray(self.pre), np.asarray(self.post)):
-            before = pre @ mass @ pre
-            ratios.append(post @ mass @ post / before if before > 0 else np.nan)
-        return np.array(ratios)
+        masses, both = np.array(self.each(scene, dense_mass)), (self.pre, self.post)
+        before, after = (np.einsum("ki,kij,kj->k", v, masses, v) for v in map(np.asarray, both))
+        return after / np.where(before > 0, before, np.nan)
 
     def momentum_corrected(self, scene: Scene | None = None) -> "Experiments":
         """The same shots, moved as little as possible so that they conserve momentum.
@@ -211,13 +207,12 @@ class Experiments(eqx.Module):
         """A copy with other fields."""
         fields = self._of_each_shot() | {"units": self.units} | changed
         resolution = fields.pop("resolution")
+        copy = Experiments(**fields)
+        if resolution is None:
+            return copy
         # what it adds to sigma is there already
-        return eqx.tree_at(
-            _RESOLUTION,
-            Experiments(**fields),
-            None if resolution is None else np.asarray(resolution),
-            is_leaf=lambda x: x is None,
-        )
+        steps = np.asarray(resolution)
+        return eqx.tree_at(lambda x: x.resolution, copy, steps, is_leaf=lambda x: x is None)
 
     def _of_each_shot(self) -> dict[str, Any]:
         """What each shot has, by the name of its argument; None: no shot has it."""
@@ -365,10 +360,8 @@ def kept_by_corrections(data: Experiments, scene: Scene | None) -> np.ndarray:
 
 def _filled(rows: list[np.ndarray]) -> np.ndarray:
     """Rows of one length; shots whose contacts can change more momenta have NaN at the end."""
-    filled = np.full((len(rows), max(map(len, rows))), np.nan)
-    for row, values in zip(filled, rows):
-        row[: len(values)] = values
-    return filled
+    columns = list(zip_longest(*rows, fillvalue=np.nan))
+    return np.array(columns, float).reshape(-1, len(rows)).T
 
 
 def conserved_momenta(scene: Scene) -> np.ndarray:
@@ -471,9 +464,7 @@ def read_experiments(
     [-0.0605, 0.1049, 0.9978]
     """
     values, units, shots = read_shots(path)
-    named: dict[str, Any] = {
-        k: values.get(k) for k in ("pre", "post", "sigma", "sigma_pre", "resolution")
-    }
+    named: dict[str, Any] = {name: values.get(name) for name in _VALUES}
     scenes = _scenes_of(path, values, scene, near)
     return Experiments(**named, scenes=scenes, shots=shots, units=units)
 

@@ -120,23 +120,20 @@ class DataBalances:
         values = ratios.values()
         return f"{len(ratios)} of {self.total} shots, {min(values):.4f} to {max(values):.4f}"
 
-    def beyond(
-        self, defects: list[_Defect], level: float, gains: bool = False
-    ) -> list[tuple[int, float]]:
+    def beyond(self, defects: list[_Defect], level: float, gains: bool = False) -> dict[int, float]:
         """Shots whose balance fails by more than their noise, with ratios; gains: upwards only."""
         _, excess, scale, before, _, error = np.array(defects).reshape(-1, 6).T
-        size, ratios = excess if gains else np.abs(excess), [(d.k, d.ratio) for d in defects]
-        if self.experiments.sigma is not None:
-            sigmas = max(DEFECT_SIGMAS, float(ndtri(1 - 0.5 * level / max(len(defects), 1))))
-            return [row for row, far in zip(ratios, size > sigmas * error) if far]
-        flagged = [row for row, far in zip(ratios, size > DEFECT_TOLERANCE * scale) if far]
-        if len(defects) < 2 or not flagged or np.mean(size > GROSS * scale) >= 0.5:
+        size, known = excess if gains else np.abs(excess), self.experiments.sigma is not None
+        sigmas = max(DEFECT_SIGMAS, float(ndtri(1 - 0.5 * level / max(len(defects), 1))))
+        beyond = size > (sigmas * error if known else DEFECT_TOLERANCE * scale)
+        flagged = {d.k: d.ratio for d, far in zip(defects, beyond) if far}
+        if known or len(defects) < 2 or not flagged or np.mean(size > GROSS * scale) >= 0.5:
             return flagged
         some = error > 0
-        weight, chances = 1 / error[some], []
-        for shape in (np.sign(weight), weight * before[some]):
-            chances.append(_chance(weight * excess[some], shape, gains))
-        return flagged if min(chances) < level / len(chances) else []
+        weight = 1 / error[some]
+        shapes = np.sign(weight), weight * before[some]
+        chance = min(_chance(weight * excess[some], shape, gains) for shape in shapes)
+        return flagged if chance < level / len(shapes) else {}
 
 
 def _units(data: DataBalances) -> Iterator[Finding]:
@@ -164,7 +161,7 @@ def _units(data: DataBalances) -> Iterator[Finding]:
 def _momentum(data: DataBalances) -> Iterator[Finding]:
     """Shots that break a momentum beyond their noise, and the rms that this alone leaves."""
     level = DEFECT_LEVEL / max(len(data.momenta), 1)
-    ratios = {k: r for each in data.momenta.values() for k, r in data.beyond(each, level)}
+    ratios = {k: r for each in data.momenta.values() for k, r in data.beyond(each, level).items()}
     if not ratios:
         return
     floor, experiments = "", data.experiments
@@ -181,7 +178,7 @@ def _momentum(data: DataBalances) -> Iterator[Finding]:
 
 def _energy(data: DataBalances) -> Iterator[Finding]:
     """Shots that gain energy beyond their noise."""
-    if ratios := dict(data.beyond(data.energies, DEFECT_LEVEL, gains=True)):
+    if ratios := data.beyond(data.energies, DEFECT_LEVEL, gains=True):
         yield Finding(
             f"The data gain energy (1 = conserved): {data.listed(ratios)}.",
             f"kinetic energy grows in {share(len(ratios), data.total)}",

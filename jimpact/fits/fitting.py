@@ -6,13 +6,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import jax
 import numpy as np
 
 from jimpact._checks import as_whole, check_choice, check_kind
 from jimpact.files.records import listed
 from jimpact.fits.checks import Judged, fit_warnings, unusable
 from jimpact.fits.data import Experiments
-from jimpact.fits.observables import filled_count
+from jimpact.fits.observables import COARSE_RTOL
 from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw
 from jimpact.fits.problem import FitProblem, of_shots
 from jimpact.fits.profiles import LEVEL, PROFILE_STARTS, needs_profiles, profiles_of
@@ -146,11 +147,11 @@ def fit(
             found = find_minima(problem, starts, seed, solver)
         _check_derivatives(problem, found)
         if found.slopes is not None:
-            points = problem.point(np.array([minimum.value for minimum in found.minima]))
+            points = problem.point(np.array([minimum.value for minimum in found.starts]))
             problem = problem.with_errors_before(found.slopes)
             (problem,), ends = settled([problem], points, solver)
-            counts = np.array([minimum.count for minimum in found.minima])
-            found = solution(problem, ends, counts, found.lost)
+            counts = np.array([minimum.count for minimum in found.starts])
+            found = solution(problem, ends, counts, found.lost_starts)
         robust = None
         if search.loss != "squares":
             problem, found, robust = robust_minimum(problem, found, search.loss, solver)
@@ -168,17 +169,14 @@ def _with_profiles(result: Fit[AnyLaw], profiles: tuple[Profile, ...]) -> Fit[An
         values = ", ".join(f"{name} {x:.4g}" for name, x in zip(result.names, better))
         line = f"A profile found a lower minimum than the fit ({values}): allow more `starts`."
         short = "a profile found a lower minimum"
-        result = replace(
-            result,
-            warnings=(*result.warnings, line),
-            reservations=(*result.reservations, short),
-        )
+        result = replace(result, warnings=(*result.warnings, line))
+        result = replace(result, reservations=(*result.reservations, short))
     return replace(result, profiles=profiles)
 
 
 def _check_derivatives(problem: FitProblem, solution: Solution) -> None:
     """Raise a ValueError where derivatives are not finite, whichever shots are left out."""
-    lost = np.flatnonzero(~np.isfinite(solution.jacobian).all(axis=1))
+    lost = np.flatnonzero(~np.isfinite(solution.starts[0].jacobian).all(axis=1))
     if len(lost):
         at = ", ".join(f"{name} = {x:g}" for name, x in zip(problem.names, solution.value))
         which = listed([str(i + 1) for i in lost])
@@ -218,11 +216,8 @@ def as_fit(
     judged = Judged(replace(problem, scene=problem.to_scene(found.value)), found, robust)
     errors, findings = judged.errors, fit_warnings(judged)
     residual = np.asarray(problem.measured, float) - found.predicted
-    numbers = errors._asdict()
-    undetermined = numbers.pop("undetermined")
-    slope = problem.of_data(found.jacobian)
-    starts, limit = [], found.minima[0].sum_of_squares + HARDLY_WORSE * errors.noise**2
-    for end in found.minima:
+    starts, limit = [], found.starts[0].sum_of_squares + HARDLY_WORSE * errors.noise**2
+    for end in found.starts:
         matters = not end.sum_of_squares > limit  # also where the noise is not known
         error = uncertainty(problem, end, errors.noise).standard_error if matters else None
         starts.append(FitMinimum(end.sum_of_squares, end.value, end.count, error))
@@ -230,23 +225,15 @@ def as_fit(
         law=problem.to_law(found.value),
         method=method if isinstance(method, str) else "optax",
         names=problem.names,
-        value=found.value,
         bounds=(problem.domains[:, 0], problem.domains[:, 1]),
-        at_bound=found.at_bound,
-        predicted=found.predicted,
         residual=residual,
         rms=rms(problem, residual),
-        **numbers,
-        identifiability=(*problem.notes, *undetermined),
-        starts=tuple(starts),
-        status=found.status,
-        converged=found.converged,
-        steps=found.steps,
-        lost_starts=found.lost,
+        **vars(errors),
+        **vars(replace(found, starts=tuple(starts))),
         warnings=tuple(each.line for each in findings),
         reservations=tuple(each.reservation for each in findings if each.reservation),
         problem=problem,
-        jacobian=problem.errors_of(slope / problem.steps_at(found.value)),
+        jacobian=problem.derivatives(found.starts[0]),
     )
 
 
@@ -304,11 +291,16 @@ def fit_many(
     for k, data in enumerate(many):
         check_kind(f"many[{k}]", data, Experiments)
     first = of_shots(law, scene, many[0], *choice)
-    others = (first.with_shots(data) or of_shots(law, scene, data, *choice) for data in many[1:])
-    problems = [first, *others]
+    same = scene is not None and first.mixing is None
+    same &= getattr(first.law, "rtol", None) != COARSE_RTOL  # where the noise allows it
+    problems = [first]
+    for data in many[1:]:
+        only_shots = same and data.scenes is None and data.sigma_pre is None
+        other = first.of_other(data, scene) if only_shots else of_shots(law, scene, data, *choice)
+        problems.append(other)
     each: dict[int, Ends] = {}  # where its starts ended
     with progress_bar(progress) as show:
-        for members in _alike(many):
+        for members in _alike(problems):
             first, solver = problems[members[0]], Solver(max_steps=max_steps, show=show)
             points = start_points(first, starts, np.random.default_rng(seed))
             points = np.tile(points, (len(members), 1))
@@ -334,13 +326,12 @@ def fit_many(
     return Fits(problems[0].names, value, squares, converged, made)
 
 
-def _alike(many: Sequence[Experiments]) -> list[list[int]]:
-    """Data sets that share one program: as many shots, filled up, all with or without errors."""
+def _alike(problems: Sequence[FitProblem]) -> list[list[int]]:
+    """Problems that share one program: their arrays have the same shapes."""
     groups: dict[Any, list[int]] = {}
-    for k, data in enumerate(many):
-        kind = (filled_count(len(data.shots)), data.pre.shape[1], data.sigma is None)
-        shapes = None if data.scenes is None else data.largest_scene(None).contacts
-        groups.setdefault((*kind, data.sigma_pre is None, shapes), []).append(k)
+    for k, problem in enumerate(problems):
+        leaves, structure = jax.tree.flatten(problem.program())
+        groups.setdefault((structure, *map(np.shape, leaves)), []).append(k)
     return list(groups.values())
 
 

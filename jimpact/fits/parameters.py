@@ -119,15 +119,10 @@ class Parameters:
     group are fixed. (All entries are listed so that a compiled fit does not depend on the groups.)
     """
 
-    labels: dict[str, np.ndarray]  # of each field: 0 is fixed, equal numbers share a value
+    fields: tuple[str, ...]
     names: tuple[str, ...]
     groups: tuple[tuple[int, ...], ...]
     log: np.ndarray  # (P,) whether a parameter is fitted in its logarithm
-
-    @property
-    def fields(self) -> tuple[str, ...]:
-        """Names of the fields."""
-        return tuple(self.labels)
 
     @property
     def first(self) -> list[int]:
@@ -177,7 +172,7 @@ def free_parameters(
         raise ValueError("Argument `free` must name a parameter to fit, but leaves none free.")
     log = np.array([domain_of(law, entry_of(name)[0]).log for name in names])
     note = f"{fixed} is fixed at its start: with equal exponents only stiffness ratios matter."
-    return Parameters(labels, tuple(names), tuple(groups), log), [note] if fixed else []
+    return Parameters(tuple(labels), tuple(names), tuple(groups), log), [note] if fixed else []
 
 
 def _labels(law: Law, free: Any) -> dict[str, np.ndarray]:
@@ -359,10 +354,10 @@ def priors_of(
         _check_name("priors", name, (*parameters.names, *fields))
     pairs = [chosen.get(name, chosen.get(field)) for name, field in zip(parameters.names, fields)]
     each = enumerate(zip(parameters.names, pairs, *limits))
-    return tuple(Prior(i, *_mean_and_std(*row)) for i, row in each if row[1] is not None)
+    return tuple(Prior(i, *mean_and_std(*row)) for i, row in each if row[1] is not None)
 
 
-def _mean_and_std(name: str, pair: Any, low: float, high: float) -> tuple[float, float]:
+def mean_and_std(name: str, pair: Any, low: float, high: float) -> tuple[float, float]:
     """The two numbers of a prior: (mean, std), or of a `ji.Normal`."""
     ends = (pair.mean, pair.std) if hasattr(pair, "std") and hasattr(pair, "mean") else pair
     try:

@@ -12,6 +12,7 @@ import numpy as np
 from jimpact._checks import as_whole, check_choice, needed
 from jimpact.compiling import known_options
 from jimpact.fits.fitting import Fit
+from jimpact.fits.parameters import mean_and_std
 from jimpact.fits.problem import FitProblem
 from jimpact.fits.uncertainty import check_squares
 from jimpact.montecarlo.distributions import Normal, Uniform
@@ -185,9 +186,8 @@ def _priors(problem: FitProblem, chosen_priors: dict[str, Any], kinds: Any) -> d
     own = {i: Normal(mean, std) for i, mean, std in problem.priors}
     for i, (name, field) in enumerate(zip(problem.names, parameters.of_fields)):
         chosen = chosen_priors.get(name, chosen_priors.get(field, own.get(i)))
-        log = bool(parameters.log[i])
-        low, high = (float(end) for end in problem.domains[i])
-        priors[name] = _prior(name, chosen, low, high, log, kinds)
+        low, high = problem.domains[i].tolist()
+        priors[name] = _prior(name, chosen, low, high, bool(parameters.log[i]), kinds)
     for name in chosen_priors:
         check_choice("priors", name, dict.fromkeys((*problem.names, *parameters.of_fields)))
     return priors
@@ -198,11 +198,10 @@ def _prior(name: str, chosen: Any, low: float, high: float, log: bool, kinds: An
     if chosen is None:
         if np.isfinite([low, high]).all():
             return kinds.LogUniform(low, high) if log else kinds.Uniform(low, high)
-        real, c = (low, high), kinds.constraints
-        if np.isinf(real).all():
-            return kinds.ImproperUniform(c.real, (), ())
-        end = c.greater_than(low) if np.isfinite(low) else c.less_than(high)
-        return kinds.ImproperUniform(end, (), ())
+        c = kinds.constraints
+        below = c.less_than(high) if np.isfinite(high) else c.real
+        domain = c.greater_than(low) if np.isfinite(low) else below
+        return kinds.ImproperUniform(domain, (), ())
     if isinstance(chosen, Uniform):
         a, b = float(chosen.low), float(chosen.high)
         if not low <= a < b <= high:
@@ -212,32 +211,22 @@ def _prior(name: str, chosen: Any, low: float, high: float, log: bool, kinds: An
             )
         return kinds.Uniform(a, b)
     if isinstance(chosen, Normal):
-        ends = {"low": low, "high": high}
-        ends = {key: end for key, end in ends.items() if np.isfinite(end)}
-        mean, std = float(chosen.mean), float(chosen.std)
-        if not low <= mean <= high:
-            raise ValueError(
-                f"Argument `priors` must have its mean in [{low:g}, {high:g}] for `{name}`, but "
-                f"has {chosen!r}."
-            )
-        return kinds.TruncatedNormal(mean, std, **ends) if ends else kinds.Normal(mean, std)
+        mean_std = mean_and_std(name, chosen, low, high)
+        ends = (end if np.isfinite(end) else None for end in (low, high))
+        return kinds.TruncatedNormal(*mean_std, **dict(zip(("low", "high"), ends)))
     if not isinstance(chosen, kinds.Distribution) or chosen.shape() != ():
         raise ValueError(
             f"Argument `priors` must map `{name}` to a ji.Uniform, a ji.Normal or a numpyro "
             f"distribution of one number, but has {chosen!r}."
         )
-    _check_support(name, chosen, low, high)
-    return chosen
-
-
-def _check_support(name: str, prior: Any, low: float, high: float) -> None:
-    """What a numpyro distribution can yield must lie in the domain: seen on a sample."""
-    drawn = np.asarray(prior.sample(jax.random.PRNGKey(0), (1000,)))
+    # what it can yield must lie in the domain: seen on a sample
+    drawn = np.asarray(chosen.sample(jax.random.PRNGKey(0), (1000,)))
     if (drawn < low).any() or (drawn > high).any():
         raise ValueError(
             f"Argument `priors` must lie in [{low:g}, {high:g}] for `{name}`, but draws reach "
             f"from {drawn.min():.3g} to {drawn.max():.3g}."
         )
+    return chosen
 
 
 def _warn(draws: Any, arviz: Any) -> None:

@@ -7,8 +7,7 @@ first P count, so that a compiled program does not depend on which entries are f
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import equinox as eqx
@@ -21,7 +20,6 @@ from jimpact.compiling import full_precision
 from jimpact.fits.data import Experiments, kept_by_corrections
 from jimpact.fits.matrices import AdmissibleMatrices, matrix_region
 from jimpact.fits.observables import (
-    COARSE_RTOL,
     Observed,
     Prediction,
     Shots,
@@ -64,17 +62,14 @@ FEW = 64
 LANES, LANES_OF_MANY, LANES_ON_ACCELERATOR = 2, 64, 1024
 
 
-_ARRAYS = (
-    *("law", "observe", "owner", "fixed", "scale", "log", "low", "high", "matrix", "measured"),
-    *("weight", "unit", "size", "prior_mean", "prior_weight", "mixing"),
-)
-_STATIC = ("fields", "ties")
+_STATIC = {"static": True}  # fields that are no arrays for JAX
+# ... of which a compiled function knows none
 _ON_HOST: dict[str, Any] = dict.fromkeys(
     ("parameters", "domains", "sigma", "priors", "notes", "experiments", "scene", "left_out")
 )
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=_ARRAYS, meta_fields=(*_STATIC, *_ON_HOST))
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class FitProblem:
     """The least-squares problem behind a fit, in the parameters x (P,) themselves.
@@ -144,16 +139,16 @@ class FitProblem:
     size: Any
     prior_mean: Any
     prior_weight: Any
-    fields: tuple[str, ...]
-    ties: Ties
-    parameters: Parameters
-    domains: np.ndarray
-    sigma: np.ndarray | None
-    priors: tuple[Prior, ...]
-    notes: tuple[str, ...]
-    experiments: Experiments | None = None
-    scene: Scene | None = None
-    left_out: tuple[str, ...] = ()
+    fields: tuple[str, ...] = field(metadata=_STATIC)
+    ties: Ties = field(metadata=_STATIC)
+    parameters: Parameters = field(metadata=_STATIC)
+    domains: np.ndarray = field(metadata=_STATIC)
+    sigma: np.ndarray | None = field(metadata=_STATIC)
+    priors: tuple[Prior, ...] = field(metadata=_STATIC)
+    notes: tuple[str, ...] = field(metadata=_STATIC)
+    experiments: Experiments | None = field(default=None, metadata=_STATIC)
+    scene: Scene | None = field(default=None, metadata=_STATIC)
+    left_out: tuple[str, ...] = field(default=(), metadata=_STATIC)
     mixing: Any = None
 
     # ------------------------------------------------------------------ how problems are made
@@ -181,7 +176,9 @@ class FitProblem:
             ties: as in `fit`.
         """
         problem = of_shots(law, scene, experiments, free, bounds, priors, ties)
-        return problem.passing_errors_at(problem.start)
+        if problem.mixing is None:
+            return problem
+        return problem.with_errors_before(outcome_at(problem, problem.start).slopes[0])
 
     @classmethod
     def from_observable(
@@ -232,7 +229,8 @@ class FitProblem:
         # a stiffness that the user names is one that the function sees
         own = isinstance(observe, eqx.Module)
         observable = observe if own else Observed(observe, free is not DEFAULT_FREE)
-        values = _weighed(post, sigma, 1.0 if sigma is None else sigma, np.nanmax(np.abs(post)))
+        weight = np.where(np.isnan(post), 0.0, 1 / (1.0 if sigma is None else sigma))
+        values = _weighed(post, sigma, weight, np.nanmax(np.abs(post)))
         problem = _build(law, observable, values, (free, bounds, priors, ties))
         shape = eqx.filter_eval_shape(observable, law).value.shape
         if shape != post.shape:
@@ -242,40 +240,18 @@ class FitProblem:
             )
         return problem
 
-    def with_shots(self, data: Experiments) -> "FitProblem | None":
-        """The same of other shots, where only these differ, which is many times quicker; else None.
-
-        They differ in more where they have scenes, other units or errors of v-, or where the law is
-        computed as coarsely as the noise of the shots allows.
-
-        Args:
-            data: shots of as many bodies.
-        """
-        own, first = data.scenes is not None or self.scene is None, self.experiments
-        if own or first is None or data.units != first.units:
-            return None
-        coarse = getattr(self.law, "rtol", None) == COARSE_RTOL
-        if data.sigma_pre is not None or self.mixing is not None or coarse:
-            return None
-        observe: Any = self.observe
-        count, n = data.pre.shape
-        scenes = jax.tree.map(lambda x: np.repeat(x[:1], count, axis=0), observe.scenes)
-        before = np.repeat(observe.pre[:1], count, axis=0)
-        before[:, :n] = np.asarray(data.pre)
-        observe = replace(observe, scenes=scenes, pre=before)
-        weights = _in(self.low.dtype, _weighed_shots(data, self.scene))
-        return replace(self, observe=observe, experiments=data, **weights)
-
     def of_other(self, data: Experiments, scene: Scene | None) -> "FitProblem":
-        """The same of other shots; errors of v- count as if there were none.
+        """The same of other shots, which is many times quicker than to make it from them.
+
+        Errors of v- count as if there were none; the law and its tolerance stay.
 
         Args:
             data: shots of as many bodies.
             scene: of all; None: they have their own.
         """
         observe, _, weights = _measured_shots(data, scene)
-        arrays = {"observe": observe, "mixing": None} | weights
-        return replace(self, **_in(self.low.dtype, arrays), experiments=data, scene=scene)
+        arrays = _in(self.low.dtype, {"observe": observe} | weights)
+        return replace(self, **arrays, experiments=data, scene=scene)
 
     def weighed(self, factor: np.ndarray) -> "FitProblem":
         """With factors on the independent errors.
@@ -287,13 +263,8 @@ class FitProblem:
         if mixing is not None:  # which comes before the factors
             weight, mixing = self.weight * used, np.where(used, factor, 1.0)[..., None] * mixing
         measured = np.where(used, self.measured, np.nan)
-        return replace(self, **self._weights(weight, mixing), measured=measured)
-
-    def _weights(self, weight: np.ndarray, mixing: Any) -> dict[str, Any]:
-        """The fields that follow from weights and mixing."""
-        size = float(self.unit) * np.linalg.norm(weight)
-        arrays = {"weight": weight, "size": np.asarray(size), "mixing": mixing}
-        return _in(self.low.dtype, arrays)
+        arrays = _weighed(measured, self.sigma, weight, self.unit, mixing)
+        return replace(self, **_in(self.low.dtype, arrays))
 
     def with_errors_before(self, slopes: np.ndarray | None) -> "FitProblem":
         """With the errors of v-, if there are any, passed on to v+ by slopes.
@@ -318,14 +289,9 @@ class FitProblem:
         factor = np.linalg.cholesky(covariance / (sigma[:, :, None] * sigma[:, None, :]))
         # factors that a weight already has (shots left out) stay
         old = np.where(here, np.asarray(self.sigma, float), 1.0)
-        weights = self._weights(self.weight * old / sigma, np.linalg.inv(factor))
-        return replace(self, **weights, sigma=np.where(here, sigma, np.nan))
-
-    def passing_errors_at(self, x: Any) -> "FitProblem":
-        """With errors of v-, if there are any, passed on as the law of x (P,) does."""
-        if self.mixing is None:
-            return self
-        return self.with_errors_before(outcome_at(self, x).slopes[0])
+        weight, sigma = self.weight * old / sigma, np.where(here, sigma, np.nan)
+        arrays = _weighed(self.measured, sigma, weight, self.unit, np.linalg.inv(factor))
+        return replace(self, **_in(self.low.dtype, arrays))
 
     def program(self) -> "FitProblem":
         """As compiled functions take it: without what differs between fits of one program.
@@ -399,13 +365,11 @@ class FitProblem:
         of your own (docs/gradient_descent.md). Not differentiable.
         """
         x = jax.lax.stop_gradient(jnp.asarray(x, self.low.dtype))
-        rest = len(self.low) - len(x)
-        x = jnp.pad(x, (0, rest))
-        y = scaled(x, self.scale, self.log, jnp)
+        y = scaled(jnp.pad(x, (0, len(self.low) - len(x))), self.scale, self.log, jnp)
         inside = jnp.clip(y, self.low, self.high)
         if self.matrix is not None:
             inside = self.matrix.nearest(y, jnp.eye(len(y), dtype=y.dtype), jnp.zeros_like(y))
-        return self._values(inside)[: len(x) - rest]
+        return self._values(inside)[: len(x)]
 
     def log_density(self, x: Any) -> jax.Array:
         """Logarithm () of the probability density of the data at x (P,), normally distributed.
@@ -451,7 +415,10 @@ class FitProblem:
 
         def outcome(both: jax.Array) -> tuple[tuple[jax.Array, jax.Array], Any]:
             """Residual and prediction of y and a change of v-, and all not differentiated."""
-            moved = self._shifted(both[count:]) if passed else self
+            moved = self
+            if passed:
+                pre = self.observe.pre.at[:, :passed].add(both[count:])  # type: ignore[attr-defined]
+                moved = eqx.tree_at(lambda problem: problem.observe.pre, self, pre)
             residual, prediction = moved._scaled_residual(both[:count])
             out = residual, prediction.value
             return out, (*out, prediction.status)
@@ -495,24 +462,16 @@ class FitProblem:
             return LANES if count <= LANES_OF_MANY else many
         return LANES if count > 1 else 1
 
-    def _shifted(self, shift: jax.Array) -> "FitProblem":
-        """With this change (n,) of the velocities before all shots."""
-        observe: Any = self.observe
-        pre = observe.pre.at[:, : shift.shape[0]].add(shift)
-        return replace(self, observe=eqx.tree_at(lambda o: o.pre, observe, pre))
-
     def point(self, x: np.ndarray) -> np.ndarray:
         """y (..., Q) of x (..., P), on the host."""
-        p = x.shape[-1]
-        y, log = np.zeros((*x.shape[:-1], len(self.low))), np.asarray(self.log)[:p]
-        y[..., :p] = scaled(x, np.asarray(self.scale, float)[:p], log)
-        return y
+        every = np.zeros((*x.shape[:-1], len(self.low)))
+        every[..., : x.shape[-1]] = x
+        return np.asarray(scaled(every, np.asarray(self.scale, float), np.asarray(self.log)))
 
     def values_at(self, y: np.ndarray) -> np.ndarray:
         """x (..., P) of y (..., Q), on the host."""
-        p = len(self.names)
-        scale = np.asarray(self.scale, float)[:p]
-        return unscaled(np.asarray(y, float)[..., :p], scale, np.asarray(self.log)[:p])
+        x = unscaled(np.asarray(y, float), np.asarray(self.scale, float), np.asarray(self.log))
+        return np.asarray(x)[..., : len(self.names)]
 
     def steps_at(self, x: np.ndarray) -> np.ndarray:
         """(P,) dx/dy: the natural size of a change of each parameter at x."""
@@ -524,8 +483,7 @@ class FitProblem:
     def values(self) -> int:
         """How many independent values were measured or are priors."""
         here, data = ~np.isnan(self.measured), self.experiments
-        used = here.any(axis=1) if data is not None else ()
-        lost = sum(np.array(data.lost)[used]) if data is not None else 0
+        lost = 0 if data is None else np.array(data.lost)[here.any(axis=1)].sum()
         return int(here.sum() - lost) + len(self.priors)
 
     @property
@@ -533,13 +491,21 @@ class FitProblem:
         """Of the shots, or of the rows of what was measured."""
         if self.experiments is not None:
             return self.experiments.shots
-        rows = self.measured.shape[0] if self.measured.ndim else 1
-        return tuple(str(k + 1) for k in range(rows))
+        return tuple(str(k + 1) for k in range(len(np.atleast_1d(self.measured))))
 
     def of_data(self, rows: np.ndarray) -> np.ndarray:
         """Those of rows (R, ...), as of a residual, that are of what was measured, in its shape."""
         count = self.measured.size
         return rows[:count].reshape((*self.measured.shape, *rows.shape[1:]))
+
+    def derivatives(self, minimum: Any) -> np.ndarray:
+        """Of what was measured in the parameters (K, n, P); NaN where it was not measured.
+
+        Args:
+            minimum: with its `jacobian` and `value`.
+        """
+        slope = self.of_data(minimum.jacobian) / self.steps_at(minimum.value)
+        return self.errors_of(slope)
 
     def independent(self, errors: np.ndarray) -> np.ndarray:
         """Errors of what was measured, in units of sigma and as independent ones.
@@ -651,20 +617,21 @@ def _build(
     )
 
 
-def _weighed(measured: np.ndarray, sigma: Any, errors: Any, unit: float) -> dict[str, Any]:
-    """What was measured, its weights, and the sizes that follow; `errors`: to weigh by."""
-    here, unit = ~np.isnan(measured), float(unit) or 1.0
-    weight = np.where(here, 1 / np.where(here, errors, 1.0), 0.0)
-    size = np.asarray(unit * np.linalg.norm(weight))
-    arrays = {"measured": measured, "weight": weight, "unit": np.asarray(unit), "size": size}
-    return arrays | {"sigma": sigma}
+def _weighed(
+    measured: np.ndarray, sigma: Any, weight: np.ndarray, unit: Any, mixing: Any = None
+) -> dict[str, Any]:
+    """What was measured, its weights, and the sizes that follow."""
+    unit = np.asarray(float(unit) or 1.0)
+    arrays = {"measured": measured, "weight": weight, "unit": unit, "mixing": mixing}
+    return arrays | {"size": np.asarray(unit * np.linalg.norm(weight)), "sigma": sigma}
 
 
 def _weighed_shots(data: Experiments, scene: Scene | None) -> dict[str, Any]:
     """The same of shots."""
     post, sigma = np.asarray(data.post), None if data.sigma is None else np.asarray(data.sigma)
     unit = max(np.abs(np.asarray(data.pre)).max(), np.nanmax(np.abs(post)))
-    return _weighed(post, sigma, data.natural_errors(scene) if sigma is None else sigma, unit)
+    errors = data.natural_errors(scene) if sigma is None else sigma
+    return _weighed(post, sigma, np.where(np.isnan(post), 0.0, 1 / errors), unit)
 
 
 def _of_parameters(
@@ -674,9 +641,9 @@ def _of_parameters(
     fixed, count = entries(law, parameters.fields), len(parameters.names)
     owner, starts = np.full(len(fixed), -1), fixed[parameters.first]
     natural = np.where(parameters.log, 1.0, np.maximum(np.abs(starts), 1.0))
-    for i, (group, field) in enumerate(zip(parameters.groups, parameters.of_fields)):
+    for i, (group, name) in enumerate(zip(parameters.groups, parameters.of_fields)):
         owner[list(group)] = i
-        natural[i] = energy if field == "initial_energy" else natural[i]
+        natural[i] = energy if name == "initial_energy" else natural[i]
     mean, weight = np.zeros((2, count))
     for prior in priors:
         i = prior.parameter

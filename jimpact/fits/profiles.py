@@ -16,7 +16,7 @@ import numpy as np
 from jimpact._checks import as_whole, check_choice, check_kind
 from jimpact.fits.parameters import scaled, unscaled
 from jimpact.fits.search import SAME_VALUE, START_SCALES, FitMinimum, find_minima, solution
-from jimpact.fits.solve import RANK_TOLERANCE, Ends, Solver, minimize, stacked
+from jimpact.fits.solve import RANK_TOLERANCE, Ends, Solver, minimize
 from jimpact.fits.uncertainty import Fit, Profile, check_level
 from jimpact.progress import Show, progress_bar
 
@@ -107,8 +107,7 @@ class Deviances:
         for k, (which, values, _) in enumerate(trials):
             points[k, which], fixed[k, which] = values, True
         solver = Solver(max_steps=PASSES, show=self.show, damping=NEAR)
-        many = stacked([self.problem], len(points))
-        ends = minimize(many, points, solver, _STOP, what="fixed values", fixed=fixed)
+        ends = minimize([self.problem], points, solver, _STOP, what="fixed values", fixed=fixed)
         least = int(np.argmin(ends.squares))
         if self._is_below(ends.squares[least], self.lowest.squares):
             self.lowest = Lowest(float(ends.squares[least]), ends.y[least])
@@ -231,13 +230,13 @@ def profiles_of(
     with progress_bar(progress) as show:
         lines = _Lines(fit, fit.quantile(level) ** 2, show)
         if points and fit.start_count == 1:
-            lines.add_starts(find_minima(fit.problem, points, fit.seed, Solver(show=show)).minima)
+            lines.add_starts(find_minima(fit.problem, points, fit.seed, Solver(show=show)).starts)
         for _ in range(ROUNDS):
             profiles = lines.profiles(which, level)
             if lines.lowest is lines.best:
                 break
             end = lines.minimize([((), (), lines.lowest.y)])
-            lines.add_starts(solution(fit.problem, end).minima)
+            lines.add_starts(solution(fit.problem, end).starts)
     return profiles
 
 

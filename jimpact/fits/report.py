@@ -5,7 +5,6 @@ import json
 import platform
 from collections.abc import Iterable, Sequence
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
 from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,8 +15,7 @@ import numpy as np
 
 import jimpact
 from jimpact.files.records import as_data, with_error
-from jimpact.fits.parameters import value_of
-from jimpact.fits.problem import FitProblem
+from jimpact.fits.parameters import Prior, value_of
 from jimpact.law import StaticNumber, StaticNumbers
 from jimpact.status import STATUS
 
@@ -35,15 +33,12 @@ OF_A_CONTACT = ("restitution", "friction", "tangential_restitution")  # each may
 FEW_DEGREES = 8
 UNSEEN = "start value; not determined by the data"  # note on a value in brackets
 FORMAT = 1  # of the file; it changes where older files could not be read any more
-_PACKAGES = ("jax", "jaxlib", "equinox", "numpy", "scipy")
-_REBUILT = "problem"  # the field of a fit that is made again from its parts
-_KINDS: dict[str, Any] = {  # of values in the file that are not arrays, mappings or classes
-    "static": StaticNumber,
-    "statics": StaticNumbers,
-    "number": float,
-    "tuple": tuple,
-    "list": list,
-}
+_PACKAGES = ("jimpact", "jax", "jaxlib", "equinox", "numpy", "scipy")
+_FIT = "jimpact.fits.uncertainty:Fit"  # which imports this module
+# of values in the file that are not arrays, mappings or classes with fields
+_KINDS: dict[str, Any] = {
+    kind.__name__: kind for kind in (StaticNumber, StaticNumbers, float, tuple, list)
+} | {"Prior": Prior._make}
 
 
 def joined_words(parts: Sequence[str]) -> str:
@@ -397,28 +392,11 @@ def as_record(fit: "Fit") -> dict[str, Any]:
 
 def save_fit(fit: "Fit", path: str | Path) -> Path:
     """`Fit.save`."""
-    problem = fit.problem
     if fit.experiments is None:
         raise ValueError("Argument `fit` must be to shots to be saved: functions cannot be.")
-    if problem.ties:
+    if fit.problem.ties:
         raise ValueError("Argument `fit` must have no ties to be saved: functions cannot be.")
-    names = [field.name for field in dataclasses.fields(fit) if field.name != _REBUILT]
-    record = {
-        "format": FORMAT,
-        "versions": versions(),
-        "problem": {
-            "law": _encoded(problem.law),
-            "scene": _encoded(problem.scene),
-            "experiments": _encoded(fit.experiments),
-            "free": {name: label.tolist() for name, label in problem.parameters.labels.items()},
-            "bounds": _encoded(dict(zip(problem.names, problem.domains.tolist()))),
-            "priors": {problem.names[i]: [mean, std] for i, mean, std in problem.priors},
-            "used": (~np.isnan(problem.measured).all(axis=1)).tolist(),
-            "notes": list(problem.notes),
-            "left_out": list(problem.left_out),
-        },
-        "result": {name: _encoded(getattr(fit, name)) for name in names},
-    }
+    record = {"format": FORMAT, "versions": versions(), "result": _encoded(fit)["fields"]}
     path = Path(path)
     path.write_text(json.dumps(record, allow_nan=False, indent=1) + "\n", encoding="utf-8")
     return path
@@ -446,8 +424,6 @@ def load_fit(path: str | Path) -> "Fit":
     >>> ji.load_fit(path).verdict == fit.verdict
     True
     """
-    from jimpact.fits.uncertainty import Fit  # which imports this module
-
     path = Path(path)
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
@@ -462,9 +438,7 @@ def load_fit(path: str | Path) -> "Fit":
             f"{record['format']} (written by jimpact {writer}; this is {jimpact.__version__})."
         )
     try:
-        result = {name: _decoded(value) for name, value in record["result"].items()}
-        result[_REBUILT] = _problem(record["problem"], result["value"])
-        return Fit(**result)
+        return _instance(_FIT, record["result"])
     except (KeyError, AttributeError, ImportError, TypeError) as error:
         raise ValueError(
             f"{path}: the fit, saved by jimpact {writer}, cannot be read: {error!r}. A law of your "
@@ -474,38 +448,17 @@ def load_fit(path: str | Path) -> "Fit":
 
 def versions() -> dict[str, str]:
     """Versions of jimpact, of what it computes with, and of Python."""
-    found = {"jimpact": jimpact.__version__}
-    for name in _PACKAGES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:  # installed in a way that leaves no record
-            continue
+    found = {name: import_module(name).__version__ for name in _PACKAGES}
     return found | {"Python": f"{platform.python_version()}, {platform.system()}"}
-
-
-def _problem(parts: dict[str, Any], value: np.ndarray) -> FitProblem:
-    """The problem that was solved."""
-    law, scene, data = (_decoded(parts[name]) for name in ("law", "scene", "experiments"))
-    bounds = {name: tuple(pair) for name, pair in _decoded(parts["bounds"]).items()}
-    problem = FitProblem.from_shots(law, scene, data, parts["free"], bounds, parts["priors"])
-    used = np.broadcast_to(np.array(parts["used"])[:, None], problem.measured.shape)
-    if parts["left_out"]:
-        problem = problem.weighed(used.astype(float))
-    problem = problem.passing_errors_at(value)
-    notes, left_out = tuple(parts["notes"]), tuple(parts["left_out"])
-    return dataclasses.replace(problem, notes=notes, left_out=left_out)
 
 
 def _encoded(value: Any) -> Any:
     """What a JSON file can hold, from which `_decoded` makes the value again, bit by bit."""
-    if isinstance(value, StaticNumber):
-        return {"static": float(value)}
-    if isinstance(value, StaticNumbers):
-        return {"statics": list(value)}
     if value is None or isinstance(value, bool | str | int):
         return value
     if isinstance(value, float):
-        return value if np.isfinite(value) else {"number": str(value)}
+        plain = type(value) is float and np.isfinite(value)
+        return value if plain else {type(value).__name__: repr(float(value))}
     if isinstance(value, jax.Array | np.ndarray | np.generic):
         array = np.asarray(value)
         entries = [_encoded(x) for x in array.ravel().tolist()]

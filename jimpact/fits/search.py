@@ -1,7 +1,8 @@
 """The lowest minimum of a fit, and others: where searches start, and which of their ends differ."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -116,28 +117,24 @@ class FitMinimum:
     residual: np.ndarray = None  # type: ignore[assignment]
 
 
-class Solution(NamedTuple):
-    """All distinct minima, best first, and what the law of the best predicts."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Solution:
+    """All distinct minima, and what the law of the best predicts; see `Fit`."""
 
-    minima: list[FitMinimum]
-    predicted: np.ndarray  # shaped like what was measured
+    starts: tuple[FitMinimum, ...]
+    predicted: np.ndarray
     status: np.ndarray
-    slopes: np.ndarray | None  # `dv+/dv-` of the shots, where errors of v- are passed on
+    slopes: np.ndarray | None = None
     converged: bool
-    stuck: bool  # no step lowers the sum of squares, although derivatives promise it
+    stuck: bool = False
     at_bound: np.ndarray
     steps: int
-    lost: int  # starts that were given up, or did not converge
+    lost_starts: int
 
     @property
     def value(self) -> np.ndarray:
         """The parameters (P,) of the best."""
-        return self.minima[0].value
-
-    @property
-    def jacobian(self) -> np.ndarray:
-        """(R, P), of the scaled parameters at the best."""
-        return self.minima[0].jacobian
+        return self.starts[0].value
 
 
 def solution(
@@ -149,8 +146,9 @@ def solution(
     # without what filled up, and parameters that have no prior
     first_prior = ends.residual.shape[1] - len(problem.low)
     own = [*range(measured.size), *(first_prior + prior.parameter for prior in problem.priors)]
-    groups, y, minima = _groups(problem, ends), ends.y[:, :count], []
+    groups, minima = _groups(problem, ends), []
     best = groups[0][0]
+    end = ends.rows(best)
     for group in groups:
         # starts that did not converge have no minimum to report, unless they are the best there is
         kept = [i for i in group if ends.converged[i] or i == best]
@@ -160,17 +158,16 @@ def solution(
             starts = int(counts[kept].sum())
             minima.append(FitMinimum(squares, value, starts, None, slope, residual))
     rows = slice(len(measured)) if measured.ndim else ...
-    low, high = (np.asarray(end)[:count] for end in (problem.low, problem.high))
     return Solution(
-        minima=minima,
-        predicted=ends.predicted[best][rows],
-        status=ends.status[best][rows],
-        slopes=None if ends.slopes is None else ends.slopes[best],
-        converged=bool(ends.converged[best]),
-        stuck=bool(ends.stuck[best]),
-        at_bound=(y[best] <= low) | (y[best] >= high),
+        starts=tuple(minima),
+        predicted=end.predicted[rows],
+        status=end.status[rows],
+        slopes=end.slopes,
+        converged=bool(end.converged),
+        stuck=bool(end.stuck),
+        at_bound=((end.y <= problem.low) | (end.y >= problem.high))[:count],
         steps=int(np.max(ends.steps)),
-        lost=lost + int(counts.sum()) - sum(minimum.count for minimum in minima),
+        lost_starts=lost + int(counts.sum()) - sum(minimum.count for minimum in minima),
     )
 
 
@@ -183,22 +180,22 @@ def find_minima(problem: "FitProblem", starts: int | None, seed: int, solver: So
     best follow as long as they lower the sum of squares, and all is done again with other and
     twice as many points if sigma contradicts what was found, as long as that helps.
     """
-    rng, turns = np.random.default_rng(seed), 1 if starts else TURNS
+    rng = np.random.default_rng(seed)
     if starts == 1:
         points = start_points(problem, 1, rng)
-        return solution(problem, minimize(stacked([problem]), points, solver, what="starts"))
-    ends, idle = _rough_ends(problem, starts, rng, solver), 0
-    for turn in range(1, turns):
-        least = np.nanmin(ends.squares)
-        freedom = problem.values - len(problem.names)
+        return solution(problem, minimize([problem], points, solver, what="starts"))
+
+    def again(ends: Ends, turn: int) -> Ends | None:
+        """From twice as many points as before, where sigma contradicts what was found."""
+        least, freedom = np.nanmin(ends.squares), problem.values - len(problem.names)
         if problem.sigma is None or freedom < 1 or chdtrc(freedom, least) > REJECTED:
-            break
-        more = _rough_ends(problem, None, rng, solver, STARTS * 2**turn)
-        ends, idle = _both(ends, more), 0 if _gains(more, least) else idle + 1
-        if idle * IDLE_PARAMETERS >= len(problem.names):
-            break
+            return None
+        return _rough_ends(problem, None, rng, solver, STARTS * 2 ** (turn + 1))
+
+    ends = _rough_ends(problem, starts, rng, solver)
+    ends = _extended(ends, 0 if starts else TURNS - 1, len(problem.names), again)
     best = _groups(problem, ends)[0][:1]
-    fine = minimize(stacked([problem]), ends.y[best], solver, what="minima")
+    fine = minimize([problem], ends.y[best], solver, what="minima")
     fine = fine._replace(steps=fine.steps + ends.steps[best])
     for leaf, value in zip(jax.tree.leaves(ends), jax.tree.leaves(fine)):
         leaf[best] = value
@@ -226,33 +223,38 @@ def _rough_ends(
 
     def rough(points: np.ndarray) -> Ends:
         """To where minima can be told apart."""
-        many = stacked([problem], len(points))
-        return minimize(many, points, solver, COARSE, noise, "starts")
+        return minimize([problem], points, solver, COARSE, noise, "starts")
 
-    ends = rough((_first_points if scanned else start_points)(problem, far, rng))
-    idle = 0  # rounds without a gain, one after the other
-    for _ in range((1 if starts else ROUNDS) if count > far else 0):
+    def around(ends: Ends, _: int) -> Ends | None:
+        """From points around the best; None: the data see none of the parameters."""
         points = _near(problem, ends, SCANNED if scanned else count - far, noise, rng)
         if scanned:
             points = _lowest(problem, points, count - far)
-        if not len(points):  # the data see none of the parameters
+        return rough(points) if len(points) else None
+
+    ends = rough((_first_points if scanned else start_points)(problem, far, rng))
+    rounds = 1 if starts else ROUNDS
+    return _extended(ends, rounds if count > far else 0, len(log), around)
+
+
+def _extended(
+    ends: Ends, rounds: int, parameters: int, search: Callable[[Ends, int], Ends | None]
+) -> Ends:
+    """Ends with those of further rounds, as long as these lower the least sum of squares.
+
+    By more than the noise of a value.
+    """
+    idle = 0  # rounds without a gain, one after the other
+    for k in range(rounds):
+        more = search(ends, k)
+        if more is None:
             break
-        least, more = np.nanmin(ends.squares), rough(points)
-        ends = _both(ends, more)
-        idle = 0 if _gains(more, least) else idle + 1
-        if idle * IDLE_PARAMETERS >= len(log):
+        least = np.nanmin(ends.squares) * (1 - 1 / more.jacobian.shape[1])
+        idle = 0 if np.nanmin(more.squares) < least else idle + 1
+        ends = jax.tree.map(lambda a, b: np.concatenate([a, b]), ends, more)
+        if idle * IDLE_PARAMETERS >= parameters:
             break
     return ends
-
-
-def _both(first: Ends, second: Ends) -> Ends:
-    """All ends of two searches."""
-    return jax.tree.map(lambda a, b: np.concatenate([a, b]), first, second)
-
-
-def _gains(more: Ends, least: float) -> bool:
-    """Whether ends are lower than the least sum of squares by more than the noise of a value."""
-    return bool(np.nanmin(more.squares) < least * (1 - 1 / more.jacobian.shape[1]))
 
 
 def _box(problem: "FitProblem") -> np.ndarray:
@@ -263,7 +265,7 @@ def _box(problem: "FitProblem") -> np.ndarray:
     reach = np.where(log, np.log(START_FACTOR), START_SCALES)
     low = np.where(log | np.isinf(low), np.maximum(low, own - reach), low)
     high = np.where(log | np.isinf(high), np.minimum(high, own + reach), high)
-    elastic = np.array([field == "restitution" for field in problem.parameters.of_fields])
+    elastic = np.array(problem.parameters.of_fields) == "restitution"
     low = np.where(elastic & (high > START_RESTITUTION), np.maximum(low, START_RESTITUTION), low)
     return np.stack([low, high])
 
@@ -346,7 +348,7 @@ def _groups(problem: "FitProblem", ends: Ends) -> list[list[int]]:
     the user's own.
     """
     squares, y, least = ends.squares, ends.y[:, : len(problem.names)], np.nanmin(ends.squares)
-    unit, exact = SAME_COST / ends.jacobian.shape[1], ends.exact[0]
+    unit, exact = SAME_COST / ends.jacobian.shape[1], problem.exact_squares
     equal = squares <= least * (1 + unit) + exact
     order = np.lexsort((np.arange(len(y)), ~ends.converged, np.where(equal, least, squares)))
     groups: list[list[int]] = []
@@ -387,7 +389,7 @@ def settled(
     """
     each, start = len(points) // len(problems), points
     for _ in range(SETTLING):
-        ends = minimize(stacked(problems, each), start, solver, stop)
+        ends = minimize(problems, start, solver, stop)
         if ends.slopes is None:
             return problems, ends
         best = np.nanargmin(ends.squares.reshape(-1, each), axis=1)
@@ -397,7 +399,7 @@ def settled(
         start = ends.y
         if not moved.any():  # residuals and Jacobians with the weights of the final law
             last = solver._replace(max_steps=1)
-            return problems, minimize(stacked(problems, each), start, last)
+            return problems, minimize(problems, start, last)
     return problems, ends._replace(converged=ends.converged & ~moved)
 
 
@@ -436,13 +438,13 @@ def robust_minimum(
         share, slope = LOSSES[loss](error / scale)
         factor, before = np.sqrt(share), problem.point(found.value)
         weighed = problem.weighed(factor)
-        found = solution(weighed, minimize(stacked([weighed]), before[None], solver))
+        found = solution(weighed, minimize([weighed], before[None], solver))
         if np.abs(problem.point(found.value) - before).max() <= SETTLED:
             break
     else:
-        found = found._replace(converged=False)
+        found = replace(found, converged=False)
     psi = (share * error / scale)[here]
     noise = scale * np.sqrt(np.sum(psi**2)) / max(slope[here].mean(), LEAST_SLOPE)
     # weighted as in the problem, without the factors of the loss
-    minima = solution(problem, outcome_at(problem, found.value)).minima
-    return problem, found._replace(minima=minima), float(noise)
+    starts = solution(problem, outcome_at(problem, found.value)).starts
+    return problem, replace(found, starts=starts), float(noise)

@@ -284,7 +284,6 @@ class Ends(NamedTuple):
     converged: np.ndarray  # (S,) whether so close to a minimum that it stands
     stuck: np.ndarray  # (S,) no step lowers the sum of squares, although derivatives promise it
     steps: np.ndarray
-    exact: np.ndarray  # (S,) sums of squares up to which data count as reproduced
 
     def rows(self, which: Any) -> "Ends":
         """Some of them."""
@@ -292,7 +291,7 @@ class Ends(NamedTuple):
 
 
 def minimize(
-    problems: Any,
+    problems: "Sequence[FitProblem]",
     points: np.ndarray,
     solver: Solver,
     stop: float = 0.0,
@@ -300,34 +299,35 @@ def minimize(
     what: str = "fits",
     fixed: np.ndarray | None = None,
 ) -> Ends:
-    """Minima of S problems (`stacked`) from y (S, Q).
+    """Minima of problems from y (S, Q), equally many of each, one after the other.
 
-    As many as `problems.lanes(S)` are solved side by side; those that are done make room for
+    As many as `lanes(S)` are solved side by side; those that are done make room for
     others. `stop`: see `FINE`, which it is at least. `noise`: all are starts of one problem, whose
     residuals have this noise at least, and every few passes the worse half of them is given up
     (successive halving). Progress counts `what`. `fixed` (S, Q): which entries of y stay as they
     are. A matrix that must be admissible is sought without that, and then the best admissible one.
     """
-    points = points.astype(problems.low.dtype)
-    dtype, matrix = str(points.dtype), problems.matrix
+    many = stacked(problems, len(points) // len(problems))
+    points = points.astype(many.low.dtype)
+    dtype, matrix = str(points.dtype), many.matrix
     if fixed is not None:
-        low, high = (np.where(fixed, points, end) for end in (problems.low, problems.high))
-        problems, matrix = replace(problems, low=low, high=high), None
-    problems = replace(problems, matrix=None)
+        low, high = (np.where(fixed, points, end) for end in (many.low, many.high))
+        many, matrix = replace(many, low=low, high=high), None
+    many = replace(many, matrix=None)
     rule = (max(FINE[dtype], stop), noise, what)
-    states, converged = _descended(problems, points, solver, *rule)
+    states, converged = _descended(many, points, solver, *rule)
     y, steps, stuck = np.asarray(states.y), states.steps, states.stuck
     once, moved = solver._replace(max_steps=1), np.full(len(y), matrix is not None)
     for _ in range(SETTLING):
         if not moved.any():
             break
         inside = np.empty_like(y)
-        every = np.arange(len(y)), problems.lanes(len(y))
+        every = np.arange(len(y)), many.lanes(len(y))
         for rows, nearest in in_lanes(best_inside, *every, matrix, states):
             inside[rows] = nearest
-        states, _ = _descended(problems, inside, once, *rule)
+        states, _ = _descended(many, inside, once, *rule)
         moved, y = np.abs(inside - y).max(axis=1) > SETTLED, inside
-    size = np.asarray(problems.size, float)
+    size = np.asarray(many.size, float)
     return Ends(
         y=np.asarray(states.y, float),
         squares=2 * np.asarray(states.cost, float) * size**2,
@@ -339,7 +339,6 @@ def minimize(
         converged=converged & ~moved,
         stuck=np.asarray(stuck),
         steps=np.asarray(steps),
-        exact=EXACT[dtype] * size**2,
     )
 
 
@@ -347,7 +346,7 @@ def outcome_at(problem: "FitProblem", x: Any) -> Ends:
     """Residual, derivatives and predictions at x (P,), by the program that searches."""
     point = problem.point(np.asarray(x))[None]
     once, every = Solver(max_steps=1), np.ones(point.shape, bool)
-    return minimize(stacked([problem]), point, once, fixed=every)
+    return minimize([problem], point, once, fixed=every)
 
 
 def in_lanes(
@@ -387,13 +386,8 @@ def _descended(
     descends = solver.method != "levenberg-marquardt"
     if not descends:
         limit = np.asarray(limit)  # one program serves all limits
-    rule: Any = (solver.method, limit, np.asarray(stop, dtype))
-    states = begin(problems, points, solver)
-
-    def advance(problems: Any, states: SolverState) -> SolverState:
-        """Some of them."""
-        return advance_all(problems, states, *rule)
-
+    rule: Any = {"method": solver.method, "max_steps": limit, "stop": np.asarray(stop, dtype)}
+    advance, states = partial(advance_all, **rule), begin(problems, points, solver)
     converged = np.zeros(count, bool)
     active, lanes = np.arange(count), problems.lanes(count)
     while len(active):

@@ -8,6 +8,7 @@ from typing import Any, Generic, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.linalg import qr
 from scipy.special import ndtri, stdtrit
 
 from jimpact._checks import check_choice, check_kind, check_values
@@ -16,7 +17,7 @@ from jimpact.fits.data import Experiments
 from jimpact.fits.parameters import AnyLaw, LawInScene, tied_names, tied_value
 from jimpact.fits.problem import FitProblem
 from jimpact.fits.report import as_record, pieces_in_words, report, save_fit, verdict
-from jimpact.fits.search import FitMinimum, solution
+from jimpact.fits.search import FitMinimum, Solution, solution
 from jimpact.fits.solve import RANK_TOLERANCE, outcome_at
 from jimpact.law import parameters_of
 from jimpact.scene import Scene
@@ -37,8 +38,9 @@ PRIOR_ALONE = 0.95
 # ---------------------------------------------------------------------------- linearized errors
 
 
-class Uncertainty(NamedTuple):
-    """Errors of P parameters; see `Fit` for the meaning of inf and NaN."""
+@dataclass(frozen=True, eq=False)
+class Uncertainty:
+    """Errors of P parameters; see `Fit`."""
 
     rank: int
     singular_values: np.ndarray
@@ -47,7 +49,7 @@ class Uncertainty(NamedTuple):
     covariance: np.ndarray
     correlation: np.ndarray
     standard_error: np.ndarray
-    undetermined: tuple[str, ...]
+    identifiability: tuple[str, ...]
 
 
 def uncertainty(
@@ -84,20 +86,16 @@ def uncertainty(
     with np.errstate(divide="ignore", invalid="ignore"):
         correlation = covariance / np.outer(error, error)
     np.fill_diagonal(correlation, 1.0)
-    words = tuple(_in_words(problem, row, scale) for row in _reduced(null))
+    unseen = _reduced(null) if len(null) else null
+    words = (*problem.notes, *(_in_words(problem, row, scale) for row in unseen))
     return Uncertainty(rank, singular, freedom, noise, covariance, correlation, error, words)
 
 
 def _reduced(null: np.ndarray) -> np.ndarray:
     """The same subspace in reduced row echelon form: each direction with few parameters."""
-    rows = null.copy()
-    for i in range(len(rows)):
-        row, column = divmod(int(np.argmax(np.abs(rows[i:]))), rows.shape[1])
-        rows[[i, i + row]] = rows[[i + row, i]]
-        rows[i] /= rows[i, column]
-        others = np.arange(len(rows)) != i
-        rows[others] -= np.outer(rows[others, column], rows[i])
-    return rows
+    _, rows, pivots = qr(null, mode="economic", pivoting=True)
+    rows[:, pivots] = np.linalg.solve(rows[:, : len(rows)], rows)
+    return np.asarray(rows)
 
 
 def _in_words(problem: FitProblem, direction: np.ndarray, scale: np.ndarray) -> str:
@@ -209,8 +207,8 @@ class Predicted(NamedTuple):
     high: np.ndarray
 
 
-@dataclass(frozen=True, eq=False)
-class Fit(Tabular, Generic[AnyLaw]):
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Fit(Solution, Uncertainty, Tabular, Generic[AnyLaw]):
     """The result of `fit`. `print(fit)` gives its report.
 
     P free parameters, K shots of n velocities.
@@ -241,6 +239,8 @@ class Fit(Tabular, Generic[AnyLaw]):
         converged: whether the best start did.
         steps: iterations of the best start.
         lost_starts: how many were given up far above the best, or did not converge.
+        stuck: whether no step lowers the sum of squares, although derivatives promise it.
+        slopes: `dv+/dv-` (K, n, n) of the shots, where errors of v- are passed on, else None.
         warnings: what is wrong with data or fit, in words.
         problem: what was solved.
         jacobian: derivatives of what was measured in the parameters (K, n, P), NaN where no
@@ -254,25 +254,9 @@ class Fit(Tabular, Generic[AnyLaw]):
     law: AnyLaw
     method: str
     names: tuple[str, ...]
-    value: np.ndarray
-    standard_error: np.ndarray
-    covariance: np.ndarray
-    correlation: np.ndarray
     bounds: tuple[np.ndarray, np.ndarray]
-    at_bound: np.ndarray
-    predicted: np.ndarray
     residual: np.ndarray
     rms: float
-    noise: float
-    degrees_of_freedom: int
-    rank: int
-    singular_values: np.ndarray
-    identifiability: tuple[str, ...]
-    starts: tuple[FitMinimum, ...]
-    status: np.ndarray
-    converged: bool
-    steps: int
-    lost_starts: int
     warnings: tuple[str, ...]
     problem: FitProblem
     jacobian: np.ndarray
@@ -417,8 +401,7 @@ class Fit(Tabular, Generic[AnyLaw]):
         self._check_scene(largest, len(units))
         problem = self.problem.of_other(data, own)
         there = solution(problem, outcome_at(problem, self.value))
-        slope = problem.of_data(there.jacobian)
-        error = self.errors_of(problem.errors_of(slope / problem.steps_at(self.value)))
+        error = self.errors_of(problem.derivatives(there.starts[0]))
         value, noise = there.predicted, np.broadcast_to(self._noise_of(sigma), data.pre.shape)
         half = quantile * np.hypot(error, noise)
         return Predicted(value, error, np.asarray(there.status), noise, value - half, value + half)
@@ -429,11 +412,9 @@ class Fit(Tabular, Generic[AnyLaw]):
         values = [x.value for x in parameters_of(self.law).values() if x.domain.per_contact]
         counts = {np.shape(value)[0] for value in values if np.ndim(value) == 1}
         if scene.size != size or counts - {scene.contacts}:
-            contacts = (
-                f" and {min(counts)} contacts, one for each value of the law" if counts else ""
-            )
+            also = f" and {min(counts)} contacts, one for each value of the law" if counts else ""
             raise ValueError(
-                f"Argument `scene` must have {size} velocities as the fit{contacts}, but has "
+                f"Argument `scene` must have {size} velocities as the fit{also}, but has "
                 f"{scene.size} and {scene.contacts}."
             )
 

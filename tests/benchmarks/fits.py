@@ -17,7 +17,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 import jimpact as ji
-from jimpact.fits.solve import Solver, minimize, stacked
+from jimpact.fits.solve import Solver, minimize
 
 PROBLEMS, SIGMA = 40, 0.01
 LAWS = ("lzb", "lzb", "lzb", "compliant", "moreau", "matrix")
@@ -77,7 +77,7 @@ def by_scipy(start, scene, data, free, truth):
     """The minimum next to the truth, on the residual and Jacobian that `ji.fit` compiles."""
     fitted = ji.FitProblem.from_shots(start, scene, data, free)
     low, high = (end[: len(fitted.names)] for end in (fitted.low, fitted.high))
-    many, known = stacked([fitted]), {}
+    known = {}
 
     def at(y):
         """Residual and Jacobian, computed once a point."""
@@ -85,7 +85,7 @@ def by_scipy(start, scene, data, free, truth):
             point = np.zeros((1, len(fitted.low)))
             point[0, : len(y)] = y
             everything = np.ones(point.shape, bool)
-            ends = minimize(many, point, Solver(max_steps=1), fixed=everything)
+            ends = minimize([fitted], point, Solver(max_steps=1), fixed=everything)
             known[y.tobytes()] = ends.residual[0], ends.jacobian[0, :, : len(y)]
         return known[y.tobytes()]
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jimpact as ji
-from jimpact.fits.solve import Solver, minimize, stacked
+from jimpact.fits.solve import Solver, minimize
 
 PAGE = Path(__file__).parents[2] / "docs" / "coverage.md"
 PAIR, BALLS = ji.chain([1.0, 2.0]), ji.chain([1.0, 1.0, 1.0])
@@ -198,13 +198,13 @@ def covered(row, fits):
     )
     if row.loss != "squares":  # has no profiles
         return linear.mean(axis=0), []
-    many, inside = stacked([f.problem for f in fits]), []
+    problems, inside = [f.problem for f in fits], []
     best = np.array([f.problem.point(f.value) for f in fits])
     for i in range(len(truth)):
         y = best.copy()
         y[:, i] = [f.problem.point(truth)[i] for f in fits]
         fixed = np.broadcast_to(np.arange(y.shape[1]) == i, y.shape)
-        squares = minimize(many, y, Solver(), fixed=fixed).squares
+        squares = minimize(problems, y, Solver(), fixed=fixed).squares
         more = squares - [f.starts[0].sum_of_squares for f in fits]
         inside.append(more <= [(f.quantile(0.95) * f.noise) ** 2 for f in fits])
     return linear.mean(axis=0), np.mean(inside, axis=1)
