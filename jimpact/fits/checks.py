@@ -459,5 +459,7 @@ def fit_warnings(judged: Judged) -> list[Finding]:
     if data is not None:
         contacts = data.largest_scene(problem.scene).contacts
         stored = float(np.sum(np.broadcast_to(np.asarray(problem.law.stored), contacts)))
-        found += findings(DATA_CHECKS, DataBalances(data, problem.scene, stored))
+        found += findings(
+            DATA_CHECKS, DataBalances(data, problem.scene, stored, problem.law.uses_gaps)
+        )
     return found + findings(FIT_CHECKS, judged)

@@ -380,6 +380,12 @@ def closed_normals(scene: Scene) -> np.ndarray:
     return np.asarray(scene.normals, float)[:, np.asarray(scene.closed)]
 
 
+def possible_normals(scene: Scene) -> np.ndarray:
+    """Normals (n, c) of the contacts that are closed, or have a gap that may close."""
+    possible = scene.closed if scene.gaps is None else np.isfinite(scene.gaps)
+    return np.asarray(scene.normals, float)[:, np.asarray(possible)]
+
+
 def _as_rows(name: str, value: Any) -> jax.Array:
     """Velocities as (K, n)."""
     array = as_float_array(name, value)

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.special import ndtri, stdtr
 
 from jimpact.files.records import listed
-from jimpact.fits.data import ROUNDING, Experiments, closed_normals
+from jimpact.fits.data import ROUNDING, Experiments, closed_normals, possible_normals
 from jimpact.scene import Scene, dense_mass
 
 # ------------------------------------------------------------------ thresholds of the data
@@ -82,22 +82,26 @@ class DataBalances:
         experiments: the shots.
         scene: the common scene, None where the shots carry their own.
         stored_energy: what the law may add to the energy (precompression) [J].
+        uses_gaps: whether open contacts take part.
     """
 
-    def __init__(self, experiments: Experiments, scene: Scene | None, stored_energy: float):
+    def __init__(
+        self, experiments: Experiments, scene: Scene | None, stored_energy: float, uses_gaps: bool
+    ):
         self.experiments, self.scene = experiments, scene
         self.total = len(experiments.shots)
         self.momenta: dict[int, list[_Defect]] = {}  # by the momentum that is conserved
         self.energies: list[_Defect] = []
-        self.resting: list[int] = []  # shots in which no contact approaches
+        self.resting: list[int] = []  # shots in which no contact that takes part approaches
+        self.only_open = True  # whether open ones do in all of these
         known, unknown = (experiments.sigma, experiments.sigma_pre), np.ones(experiments.pre.shape)
         errors = [np.asarray(x, float) for x in known if x is not None] or [unknown]
-        normals, masses = (experiments.each(scene, f) for f in (closed_normals, dense_mass))
-        balances = zip(experiments.balances(scene), normals, masses, np.hstack(errors))
-        for k, ((rows, pre, post), normal, mass, sigma) in enumerate(balances):
-            slowest = -ROUNDING * np.abs(normal).T @ np.abs(pre)
-            if stored_energy == 0 and (normal.T @ pre >= slowest).all():
+        each = (experiments.each(scene, f) for f in (closed_normals, possible_normals, dense_mass))
+        balances = zip(experiments.balances(scene), *each, np.hstack(errors))
+        for k, ((rows, pre, post), closed, possible, mass, sigma) in enumerate(balances):
+            if stored_energy == 0 and not _approaches(possible if uses_gaps else closed, pre):
                 self.resting.append(k)
+                self.only_open &= _approaches(possible, pre)
             if np.isnan(post).any():
                 continue
             for j, row in enumerate(rows):
@@ -189,9 +193,11 @@ def _resting(data: DataBalances) -> Iterator[Finding]:
     """Shots in which no contact approaches."""
     if count := len(data.resting):
         labels = listed([data.experiments.shots[k] for k in data.resting])
+        why = "are pre and post swapped, or is a sign wrong?"
+        if data.only_open:
+            why = "only open ones do, which take part in `Compliant` and `Binary` alone."
         yield Finding(
-            f"No contact approaches in {count} of {data.total} shots ({labels}): are pre and post "
-            "swapped, or is a sign wrong?",
+            f"No contact approaches in {count} of {data.total} shots ({labels}): {why}",
             f"no contact approaches in {share(count, data.total)}",
         )
 
@@ -215,6 +221,11 @@ def _copies(data: DataBalances) -> Iterator[Finding]:
             "on the noise; without `sigma` or `resolution` the errors are meaningless.",
             f"{'the' if every else f'{count} of'} {total} shots are copies of one",
         )
+
+
+def _approaches(normals: np.ndarray, before: np.ndarray) -> bool:
+    """Whether contacts of normals (n, c) approach at v- (n,), by more than rounding."""
+    return bool((normals.T @ before < -ROUNDING * np.abs(normals).T @ np.abs(before)).any())
 
 
 DATA_CHECKS = (_units, _momentum, _energy, _resting, _copies)
