@@ -458,8 +458,8 @@ def fit_warnings(judged: Judged) -> list[Finding]:
     found = list(_left_out(judged))
     if data is not None:
         contacts = data.largest_scene(problem.scene).contacts
-        stored = float(np.sum(np.broadcast_to(np.asarray(problem.law.stored), contacts)))
-        found += findings(
-            DATA_CHECKS, DataBalances(data, problem.scene, stored, problem.law.uses_gaps)
-        )
+        law = problem.law
+        stored = float(np.sum(np.broadcast_to(np.asarray(law.stored), contacts)))
+        balances = DataBalances(data, problem.scene, stored, law.uses_gaps)
+        found += findings(DATA_CHECKS, balances)
     return found + findings(FIT_CHECKS, judged)

@@ -222,6 +222,14 @@ def test_swapped_velocities_are_reported():
     )
 
 
+def test_shots_in_which_only_open_contacts_approach_are_reported():
+    """By a law without gaps; with them nothing is wrong."""
+    apart = ji.chain([1.0, 1.0], gaps=[1e-3])
+    data = ji.Experiments(SHOTS, simulated(ji.Binary(0.8), apart, SHOTS), sigma=0.01)
+    assert "only open ones do" in reported(ji.fit(ji.Newton(0.9), apart, data, starts=1))
+    assert "approaches" not in reported(ji.fit(ji.Binary(0.9), apart, data, starts=1))
+
+
 def test_copies_of_a_shot_are_reported():
     pre = np.tile([[1.0, 0.0]], (6, 1))
     post = np.tile([[-0.2, 0.6]], (6, 1))
