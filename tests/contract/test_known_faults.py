@@ -2,6 +2,7 @@
 
 import warnings
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -237,6 +238,26 @@ def test_a_corner_that_slides_over_an_edge_takes_no_energy():
     known = np.isfinite(np.asarray(slope))
     assert known[:5].all()  # what comes before has derivatives
     assert not known[-3:].any()
+
+
+@pytest.mark.slow
+def test_bodies_at_rest_stay_in_contact():
+    """Rounding was a jump of a normal to them: a detachment at each sample, derivatives NaN."""
+    beads = ji.System(ji.Column([1.0, 1.0]), gravity=True)
+
+    def work(mass):
+        column = eqx.tree_at(lambda s: s.body.mass, beads, mass)
+        motion = ji.simulate(column, ji.LZB(0.5), [0.0, 0.0], [0.0, 0.0], 1.0, samples=11)
+        return motion.q.sum() + motion.contact_work.sum(), motion.events.count
+
+    slope, count = jax.jacfwd(work, has_aux=True)(jnp.ones(2))
+    assert count == 0
+    np.testing.assert_allclose(slope, 0, atol=1e-12)
+    block = ji.Block(0.2, 0.1)
+    on_ground = ji.System(block, gravity=True)
+    law = ji.LZB(0.5, friction=0.3)
+    rest = ji.simulate(on_ground, law, block.touching(), [0.0] * 3, 1.0, samples=11)
+    assert rest.events.count == 0
 
 
 # ------------------------------------------------------------------------------ fits
