@@ -320,7 +320,8 @@ def _resolved(law: Law, contact: Contact, happens: jax.Array) -> _Resolved:
     gamma = contact.gap_velocity
     # without an impact the law gets gamma- = -1 and its result is discarded: gradients stay finite
     harmless = jnp.where(happens, gamma, -jnp.ones_like(gamma))
-    impulses = Impulses(*law.impulses(eqx.tree_at(lambda c: c.gap_velocity, contact, harmless)))
+    approaching = eqx.tree_at(lambda c: c.gap_velocity, contact, harmless)
+    impulses = _impulses_of(law, law.impulses(approaching), contact)
     part = happens & (contact.closed | law.uses_gaps)
     p = jnp.where(part, impulses.normal, 0.0)
     tangential = jnp.zeros(contact.tangents * contact.contacts, p.dtype)
@@ -334,6 +335,23 @@ def _resolved(law: Law, contact: Contact, happens: jax.Array) -> _Resolved:
     code = jnp.where(happens, code, CODE["ok"])
     noise = jnp.sum(contact.noise * jnp.abs(p)) + tolerance * contact.size**2
     return _Resolved(p, tangential, code, contact.size, noise, jnp.asarray(accuracy, p.dtype))
+
+
+def _impulses_of(law: Law, returned: Any, contact: Contact) -> Impulses:
+    """What a law's `impulses` returned; raises unless they are impulses of these contacts."""
+    name = f"`{type(law).__name__}.impulses`"
+    if not isinstance(returned, tuple):  # an array would pass for its entries
+        raise TypeError(f"{name} must return `ji.Impulses`, but returns {type(returned).__name__}.")
+    impulses = Impulses(*returned)
+    t = contact.tangents * contact.contacts
+    for part, size in (("normal", contact.contacts), ("tangential", t)):
+        value = getattr(impulses, part)
+        if value is not None and jnp.shape(value) != (size,):
+            raise ValueError(
+                f"{name} must return `{part}` of shape ({size},), but returns one of shape "
+                f"{jnp.shape(value)}."
+            )
+    return impulses._replace(normal=jnp.asarray(impulses.normal))
 
 
 def _in_groups(

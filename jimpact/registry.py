@@ -4,7 +4,7 @@ import inspect
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
-from jimpact._checks import check_choice
+from jimpact._checks import check_choice, check_kind
 from jimpact.law import Law, options_of
 
 EVERY_PROPERTY = frozenset(
@@ -116,6 +116,8 @@ def register(
     ('restitution', 'friction', 'tangential_restitution')
     >>> del ji.REGISTRY["gentle"]
     """
+
+    check_kind("name", name, str)
 
     def enter(law: Any) -> Any:
         """The class, entered."""

@@ -405,10 +405,15 @@ def _check_kinds(bodies: tuple[Any, ...], fixed: tuple[Any, ...]) -> None:
     for name, some in (("bodies", bodies), ("fixed", fixed)):
         for body in some:
             kind = type(body).__name__
-            if not (isinstance(body, RigidBody) and body.dimension == bodies[0].dimension):
+            if not isinstance(body, RigidBody):
+                raise TypeError(
+                    f"Argument `{name}` must hold bodies with contact points (`RigidBody`), but "
+                    f"holds one of type {kind}."
+                )
+            if body.dimension != bodies[0].dimension:
                 raise TypeError(
                     f"Argument `{name}` must hold planar bodies, or bodies in space only, but "
-                    f"holds a {kind}."
+                    f"holds both: one of type {kind}."
                 )
             if not body.points.shape[1]:
                 raise TypeError(

@@ -189,7 +189,8 @@ class Table:
         text = [any(isinstance(x, str) for x in column) for column in zip(*self.rows)]
         left = [c.title for c, is_text in zip(self.columns, text) if is_text]
         titles = [self.columns[i].title for i in used]
-        lines = table(titles, [[row[i] for i in used] for row in cells], left, self.keys)
+        rows = [[row[i] for i in used] for row in cells]
+        lines = table(titles, rows, left, self.keys) if rows else []
         return "\n".join([*self.head, *lines, *self.notes])
 
     def to_dict(self) -> list[dict[str, Any]]:

@@ -45,7 +45,7 @@ class Force(Declared):
 
     def force(self, x: jax.Array, rate: jax.Array) -> jax.Array:
         """Force (m,) [N] at indentation x > 0 (m,) [m] and rate x' (m,) [m/s]."""
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} must define `force`.")
 
     def onset(self, x: jax.Array, rate: jax.Array) -> jax.Array:
         """Sign of the force at x > 0 and rate x'."""

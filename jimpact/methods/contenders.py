@@ -28,6 +28,8 @@ from jimpact.methods import schemes
 from jimpact.methods.schemes import Solution as Solution, Solve
 from jimpact.scene import Scene
 
+SETTING_KINDS = ("rtol", "step", "impulse step")  # what `Contender.setting` may be
+
 
 class Contender(NamedTuple):
     """A way to integrate an LZB impact.
@@ -148,6 +150,7 @@ def contender_of(argument: str, method: str | Contender, known: dict[str, Conten
     if not isinstance(method, Contender):
         check_choice(argument, method, known)
         return known[method]
+    check_choice(f"{argument}.setting", method.setting, SETTING_KINDS)
     if CONTENDERS.get(method.name, method) is not method:
         raise ValueError(
             f"Argument `{argument}` must have contenders of new names, but has {method.name!r}."

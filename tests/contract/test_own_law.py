@@ -77,6 +77,26 @@ def test_one_method_is_enough():
     np.testing.assert_allclose(out.energy_change, same.energy_change, atol=1e-14)
 
 
+@pytest.mark.parametrize(
+    ("returned", "error", "words"),
+    [
+        (lambda p: p, TypeError, r"`Returning.impulses` must return `ji.Impulses`"),
+        (lambda p: None, TypeError, "returns NoneType"),
+        (lambda p: ji.Impulses(p[0]), ValueError, r"`normal` of shape \(2,\), but .* \(\)"),
+        (lambda p: ji.Impulses(p, p), ValueError, r"`tangential` of shape \(0,\)"),
+    ],
+)
+def test_what_is_no_impulses_of_the_contacts_is_refused(returned, error, words):
+    """An array of two numbers was taken for normal and tangential impulses."""
+
+    class Returning(ji.Law):
+        def impulses(self, contact):
+            return returned(-contact.gap_velocity)
+
+    with pytest.raises(error, match=words):
+        ji.impact(Returning(), BALLS, V)
+
+
 def test_what_every_law_gets_for_nothing():
     """Open contacts, nothing happening, NaN, batches, gradients, domains."""
     law = Blended(0.8, 0.25)
