@@ -8,6 +8,7 @@ is installed), whose contacts are other ones: its error is that of the model. Tw
 """
 
 import functools
+import itertools
 
 import numpy as np
 from harness import arguments, save_figure, stage
@@ -112,28 +113,37 @@ def main():
         rows += [[name, *row] for row in charts[name].table.rows]
         print(name, charts[name], sep="\n")
     columns = [Column("scene"), *next(iter(charts.values())).table.columns]
-    Table(columns, rows).to_csv(options.out / "peers.csv")
-    save_figure(picture(charts), options.out / "peers.png")
+    table = Table(columns, rows)
+    table.to_csv(options.out / "peers.csv")
+    save_figure(picture(table.to_dict()), options.out / "peers.png")
 
 
-def picture(charts):
-    """Error of v+ over the time of one impact, a panel for each scene."""
+def picture(rows):
+    """Error of v+ over the time of one impact, a panel for each scene; laws are grey."""
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(
-        1, len(charts), figsize=(11, 4.6), sharex=True, sharey=True, layout="constrained"
+        1, len(SCENES), figsize=(11, 4.6), sharex=True, sharey=True, layout="constrained"
     )
-    for panel, (name, chart) in zip(axes, charts.items()):
-        for i, (method, points) in enumerate(chart.points.items()):
-            times = [1e6 * point.single.median for point in points]
-            errors = [max(point.error["velocity"], 1e-16) for point in points]
-            marker = "s" if points[0].setting is None else "o"
-            panel.loglog(times, errors, marker + "-", label=method, color=f"C{i % 10}")
-        panel.set_title(name)
+    colours, markers = (
+        itertools.cycle(f"C{i}" for i in (0, 1, 2, 3, 4, 5, 6, 8, 9)),
+        itertools.cycle("sD^v"),
+    )
+    styles = {}
+    for panel, scene in zip(axes, SCENES):
+        for method in dict.fromkeys(row["method"] for row in rows):
+            points = [r for r in rows if (r["scene"], r["method"]) == (scene, method)]
+            if method not in styles and points[0]["setting"] is None:
+                styles[method] = {"color": "0.45", "marker": next(markers), "linestyle": "none"}
+            elif method not in styles:
+                styles[method] = {"color": next(colours), "marker": "o"}
+            times = [1e6 * row["alone_s"] for row in points]
+            errors = [row["velocity"] for row in points]
+            panel.loglog(times, errors, label=method, **styles[method])
+        panel.set_title(scene)
         panel.set_xlabel("time of one impact [µs]")
     axes[0].set_ylabel("error of v+")
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=6)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=7)
     return figure
 
 
