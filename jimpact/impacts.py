@@ -25,6 +25,7 @@ from jimpact.precision import precision
 from jimpact.scene import (
     Scene,
     as_velocity,
+    gap_velocity,
     is_allowed,
     momentum,
     pad_scene,
@@ -147,15 +148,16 @@ def impact(
 
 def _warn_of_unused_gaps(law: Law, scene: Scene, v: jax.Array) -> None:
     """Warn where only open contacts approach, and the law leaves these out."""
-    if scene.gaps is None or law.uses_gaps or is_traced((scene, v)):
+    if scene.gaps is None or law.uses_gaps or is_traced((scene, v, law.stored)):
         return
-    approaches = np.asarray(scene.normals).T @ np.asarray(v) < 0
+    with jax.ensure_compile_time_eval():  # inside jit, too, where scene and v are known
+        approaches = np.asarray(gap_velocity(scene, v)) < 0
     closed = np.asarray(scene.gaps) == 0
     if approaches.any() and not (approaches & closed).any() and not np.any(law.stored):
         warnings.warn(
             f"Nothing happens: only open contacts (gap > 0) approach, and {type(law).__name__} "
             "leaves them out. Laws that use gaps are Compliant and Binary.",
-            stacklevel=3,
+            stacklevel=4,  # the line that calls `impact`, through `full_precision`
         )
 
 

@@ -73,6 +73,9 @@ def test_a_law_says_what_it_takes():
 
 def test_open_contacts_that_a_law_leaves_out_are_named():
     scene = ji.chain([1.0, 1.0, 1.0], gaps=[1e-5, 0.0])
-    with pytest.warns(UserWarning, match="only open contacts .* LZB leaves them out"):
+    with pytest.warns(UserWarning, match="only open contacts .* LZB leaves them out") as caught:
         out = ji.impact(ji.LZB(0.9), scene, [1.0, 0.0, 0.0])
+    assert caught[0].filename == __file__
+    with pytest.warns(UserWarning, match="only open contacts"):  # the scene is known inside jit
+        jax.eval_shape(lambda e: ji.impact(ji.LZB(e), scene, [1.0, 0.0, 0.0]).velocity, 0.9)
     assert "Compliant and Binary" in ji.summary(out, scene, [1.0, 0.0, 0.0])
