@@ -1,5 +1,6 @@
 """What laws with and without friction promise: tolerances, refusals, and errors that say why."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
