@@ -148,12 +148,13 @@ def impact(
 
 def _warn_of_unused_gaps(law: Law, scene: Scene, v: jax.Array) -> None:
     """Warn where only open contacts approach, and the law leaves these out."""
-    if scene.gaps is None or law.uses_gaps or is_traced((scene, v, law.stored)):
+    if scene.gaps is None or law.uses_gaps or is_traced((scene, v)):
         return
     with jax.ensure_compile_time_eval():  # inside jit, too, where scene and v are known
-        approaches = np.asarray(gap_velocity(scene, v)) < 0
+        approaches, stored = np.asarray(gap_velocity(scene, v)) < 0, law.stored
     closed = np.asarray(scene.gaps) == 0
-    if approaches.any() and not (approaches & closed).any() and not np.any(law.stored):
+    nothing = approaches.any() and not (approaches & closed).any()
+    if nothing and not is_traced(stored) and not np.any(stored):
         warnings.warn(
             f"Nothing happens: only open contacts (gap > 0) approach, and {type(law).__name__} "
             "leaves them out. Laws that use gaps are Compliant and Binary.",
