@@ -248,7 +248,7 @@ def _impact_first(
     t = state.t
     before = contacts_at(system, state.q, state.v, t, settings.friction)
     closed = before.normal.value <= settings.closed_below
-    scales = _grown(system, scales, before, t, state)
+    scales = _grown(system, settings, scales, before, state)
     rest = _rest(settings, scales)
     jams = approach > 0
     strikes = jnp.any(closed & (before.normal.rate < -rest)) | jams
@@ -457,16 +457,21 @@ def _with_friction(
 
 
 def _grown(
-    system: System, scales: Scales, contacts: Contacts, t: jax.Array, state: State
+    system: System, settings: Settings, scales: Scales, contacts: Contacts, state: State
 ) -> Scales:
     """The largest values so far, those of this instant included."""
     m = contacts.normal.rate.shape[0]
-    relative = state.v - carried_along(system, state.v, t)
+    relative = state.v - carried_along(system, state.v, state.t)
     energy = jnp.maximum(kinetic(system, state.q, state.v), kinetic(system, state.q, relative))
+    speed = speed_of(energy, jnp.diagonal(contacts.delassus))
+    # the terms of an acceleration may cancel: what bodies side by side leave of it is rounding, and
+    # so is what does not change the speed within the motion
+    terms = jnp.abs(contacts.directions[:, :m]).T @ jnp.abs(contacts.free)
+    acceleration = jnp.maximum(jnp.abs(contacts.approach[:m]), terms).max()
     now = Scales(
         jnp.abs(contacts.normal.rate).max(),
-        speed_of(energy, jnp.diagonal(contacts.delassus)),
-        jnp.abs(contacts.approach[:m]).max(),
+        speed,
+        jnp.maximum(acceleration, speed / settings.duration),
     )
     return jax.lax.stop_gradient(jax.tree.map(jnp.maximum, scales, now))
 

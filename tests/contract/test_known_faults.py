@@ -260,6 +260,22 @@ def test_bodies_at_rest_stay_in_contact():
     assert rest.events.count == 0
 
 
+@pytest.mark.slow
+def test_pendulums_that_swing_side_by_side_stay_together():
+    """Their gaps accelerate by rounding alone, which was compared with itself: `max_steps`."""
+    cradle = ji.System(ji.PendulumCradle([0.1] * 3, 0.15, 0.0125), gravity=True)
+
+    def swing(angle, speed):
+        start = jnp.full(3, angle), jnp.full(3, speed)
+        return ji.simulate(cradle, ji.LZB(0.9), *start, 1.0, samples=6, max_events=4)
+
+    angles, speeds = jnp.array([-0.3, -0.2, 0.1, 0.0, 0.0]), jnp.array([0.0, 0.0, 0.0, 1.0, 0.3])
+    motions = jax.jit(jax.vmap(swing))(angles, speeds)
+    np.testing.assert_array_equal(motions.status, 0)
+    np.testing.assert_array_equal(motions.events.count, 0)
+    np.testing.assert_allclose(motions.q - motions.q[..., :1], 0, atol=1e-15)
+
+
 # ------------------------------------------------------------------------------ fits
 
 WALL_SHOTS = np.array(
