@@ -413,7 +413,7 @@ def _check_kinds(bodies: tuple[Any, ...], fixed: tuple[Any, ...]) -> None:
             if body.dimension != bodies[0].dimension:
                 raise TypeError(
                     f"Argument `{name}` must hold planar bodies, or bodies in space only, but "
-                    f"holds both: one of type {kind}."
+                    f"holds a {kind}."
                 )
             if not body.points.shape[1]:
                 raise TypeError(

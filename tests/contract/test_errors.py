@@ -119,7 +119,7 @@ SCENES = [
         lambda: ji.advise(ji.chain([1.0, 1.0]), [1.0, 0.0], ji.Newton(0.5)),
         r"`tolerance` must be numeric, but has value Newton\(",
     ),
-    (lambda: ji.Bodies([ji.Column([1.0])]), r"`bodies` must hold planar bodies"),
+    (lambda: ji.Bodies([ji.Column([1.0])]), r"`bodies` must hold bodies with contact points"),
     (lambda: ji.Bodies([ji.Disc(1.0)], []), r"must give a contact"),
     (lambda: ji.Bodies([ji.Disc(1.0)], [np.nan]), r"`planes`"),
     (lambda: ji.Bodies([ji.Disc(1.0)], pairs=[(0, 1)]), r"bodies 0 to 0"),

@@ -21,7 +21,7 @@ def written(tmp_path, text, encoding="utf-8"):
 
 def data_defects(experiments, scene, stored_energy=0.0):
     """What the data break beyond their error, a line each."""
-    balances = DataBalances(experiments, scene, stored_energy)
+    balances = DataBalances(experiments, scene, stored_energy, uses_gaps=False)
     return [found.line for found in findings(DATA_CHECKS, balances)]
 
 
