@@ -33,6 +33,7 @@ from jimpact.plot.style import (
 )
 from jimpact.status import CODE, STATUS
 
+_LAW_MARKERS = "*phX8d"
 _LEAST = 1e-16  # smaller relative errors are drawn here: rounding
 _DEFAULT = "time"  # what `impact` does: a thick line
 
@@ -50,6 +51,7 @@ _CLASS_LABELS = {  # where the name of a class does not say why
     "unchecked": "unchecked: no reference",
     "wrong": "wrong, unnoticed",
 }
+_TICKS = 5  # labelled values along an axis, at most
 _STYLES = {"moreau": "--", "binary": ":"}
 
 
@@ -103,7 +105,7 @@ def _styles(points: Mapping[str, tuple[Point, ...]]) -> dict[str, dict[str, Any]
     for i, (name, marker) in enumerate(zip(methods, cycle(MARKERS))):
         line = "-" if i < len(COLOURS) else "--"
         styles[name] = {"marker": marker, "ms": 5, "ls": line, "lw": 1.2, "color": colour_of(i)}
-    for name, marker in zip(laws, cycle("*phX8d")):
+    for name, marker in zip(laws, cycle(_LAW_MARKERS)):
         styles[name] = {"marker": marker, "ms": 8, "ls": "none", "color": GREY}
     if _DEFAULT in styles:
         styles[_DEFAULT] |= {"lw": 2.6, "zorder": 3}
@@ -262,7 +264,7 @@ def _draw_classes(axes: Axes, codes: np.ndarray) -> None:
     axes.spines[:].set_visible(False)
 
 
-def _ticks(axes: Axes, which: str, name: str, values: np.ndarray, most: int = 5) -> None:
+def _ticks(axes: Axes, which: str, name: str, values: np.ndarray, most: int = _TICKS) -> None:
     """At most so many values of a map's axis as ticks of a panel's axis 'x' or 'y'."""
     at = range(0, len(values), -(-len(values) // most))
     axis = axes.xaxis if which == "x" else axes.yaxis

@@ -37,6 +37,9 @@ _GIF_CLOCK, _GIF_LEAST = 100.0, 2.0  # a GIF counts in 1/100 s; viewers do not s
 # [s] Frames last a little longer, because whole milliseconds are cut off the rounded numbers of a
 # GIF; a thousand times more would slow films down.
 _CUT_OFF = 1e-6
+_PLACE = (0.12, 0.08, 0.84, 0.8)  # of the axes in a film, for all frames
+# [MB] Largest page with its frames. matplotlib's own limit, 20, leaves out the end of a long film.
+_LARGEST_PAGE = 1000
 
 
 def animation(
@@ -98,8 +101,7 @@ def animation(
     path.parent.mkdir(parents=True, exist_ok=True)
     with counting_bar(count, "frames", progress) as advance:
         if path.suffix == ".html":
-            # [MB] matplotlib's own limit, 20, leaves out the end of a long film
-            with rc_context({"animation.embed_limit": 1000}):
+            with rc_context({"animation.embed_limit": _LARGEST_PAGE}):
                 page = frames.to_jshtml(fps=round(frames_per_second))
             path.write_text(page, encoding="utf-8")
             advance(count)
@@ -158,7 +160,7 @@ def _drawn(
 ) -> FuncAnimation:
     """Curves, planes and a caption, frame by frame."""
     figure = Figure(figsize=(4.8, 4.8), dpi=80)
-    axes = figure.add_axes((0.12, 0.08, 0.84, 0.8))  # for all frames
+    axes = figure.add_axes(_PLACE)
     floors = [plane_of(*floor) for floor in body.floors]
     set_limits(axes, curves, ground, floors)
     lines = [axes.plot([], [], color=colour)[0] for colour in colours]

@@ -21,6 +21,8 @@ from jimpact.plot.style import (
     styled,
 )
 
+_LABELLED = 16  # up to this number of shots each has a label
+
 
 @styled(Fit)
 def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> Figure:
@@ -141,7 +143,7 @@ def _shot_axis(axes: Axes, fit: Fit, dodge: np.ndarray) -> None:
         axes.set_xlabel("body")
         axes.set_xlim(-SPREAD * 0.5, SPREAD * 0.5)
         return
-    ticks = range(0, len(labels), -(-len(labels) // 16))  # so many are legible
+    ticks = range(0, len(labels), -(-len(labels) // _LABELLED))
     longest = max(len(labels[k]) for k in ticks)
     axes.set_xticks(list(ticks), [labels[k] for k in ticks], rotation=90 if longest > 4 else 0)
     axes.set_xlabel("shot" if data is not None else "value")

@@ -13,7 +13,12 @@ from jimpact._checks import check_choice, check_kind
 from jimpact.fits.uncertainty import Fit, Profile
 from jimpact.plot.style import COLOURS, GREY, SMALL, new_figure, new_panels, styled, write
 
+_TITLE = 45  # letters of a line of a panel's title
+_TOP = 3.0  # of a profile's axis, over the limit: only what is below matters
 MOST = 6  # parameters of a corner plot: more panels could not be read
+_WIDE = 3.5  # standard errors to each side in a corner plot
+_SHARES = (0.68, 0.95)  # of the regions in it
+_TWO_SIDED = 1.96  # standard errors: 95 % of normal noise lies within
 
 
 @styled()
@@ -43,14 +48,15 @@ def profiles(result: tuple[Profile, ...] | list[Profile]) -> Figure:
         axes.axhline(each.limit, color=GREY, lw=0.8, ls="--")
         for low, high in each.intervals:
             axes.axvspan(low, high, color=COLOURS[4], alpha=0.25, lw=0)
-        top = 3 * each.limit  # only what is below matters
-        near = each.value[each.deviance <= top]
+        near = each.value[each.deviance <= _TOP * each.limit]
         if np.ptp(near) > 0:
             edge = 0.15 * np.ptp(near)
             axes.set_xlim(near.min() - edge, near.max() + edge)
-        axes.set(ylim=(0, top), xlabel=each.name, ylabel="deviance")
+        axes.set_ylim(0, _TOP * each.limit)
+        axes.set_xlabel(each.name)
         words = f"{each.words} ({100 * each.level:g} %)"
-        axes.set_title(fill(words, 45), fontsize=SMALL)  # letters of a line
+        axes.set_title(fill(words, _TITLE), fontsize=SMALL)
+        axes.set_ylabel("deviance")
     return figure
 
 
@@ -135,7 +141,7 @@ def residuals(fit: Fit) -> Figure:
     third.axline((0.0, 0.0), slope=1.0 if known else float(np.std(scaled)) or 1.0, color=GREY)
     third.set(xlabel="normal quantile [standard errors]", ylabel=f"residual [{unit}]")
     if known:
-        for y in (-1.96, 1.96):  # standard errors: 95 % of normal noise lies within
+        for y in (-_TWO_SIDED, _TWO_SIDED):
             second.axhline(y, color=GREY, lw=0.6, ls="--")
     return figure
 
@@ -214,7 +220,7 @@ def _drawn(fit: Fit, draws: Any) -> np.ndarray:
 
 def _one(axes: Axes, fit: Fit, i: int, values: np.ndarray | None) -> None:
     """The density of one parameter."""
-    z, error = np.linspace(-3.5, 3.5, 121), fit.standard_error[i]
+    z, error = np.linspace(-_WIDE, _WIDE, 121), fit.standard_error[i]
     density = np.exp(-0.5 * z**2) / (error * np.sqrt(2 * np.pi))
     if values is not None:
         axes.hist(values[:, i], bins="auto", density=True, color=COLOURS[4], alpha=0.5)
@@ -229,7 +235,7 @@ def _pair(axes: Axes, fit: Fit, i: int, j: int, values: np.ndarray | None) -> No
     factor = np.linalg.cholesky(fit.covariance[np.ix_([i, j], [i, j])])
     angle = np.linspace(0, 2 * np.pi, 181)
     circle = np.stack([np.cos(angle), np.sin(angle)])
-    for share in (0.68, 0.95):
+    for share in _SHARES:
         edge = np.sqrt(chdtri(2, 1 - share)) * factor @ circle
         axes.plot(fit.value[i] + edge[0], fit.value[j] + edge[1], color=COLOURS[0], lw=1.2)
     axes.plot(fit.value[i], fit.value[j], "+", color="black", ms=7)

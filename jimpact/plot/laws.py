@@ -27,6 +27,8 @@ from jimpact.plot.style import (
 from jimpact.theory.admissible import admissible_set
 from jimpact.theory.dispersion import energy_dispersion, energy_ratio
 
+_OUTCOMES = 4000  # dots of a set of outcomes; ten times more would only be one area
+
 
 @styled(Comparison)
 def comparison(
@@ -113,8 +115,7 @@ def energy_plane(result: Comparison, title: str = "") -> Figure:
     'energy ratio K_ER = T+/T-'
     """
     figure, axes = new_figure(5.4, title)
-    # dots; ten times more would only be one area
-    allowed = admissible_set(result.scene, result.velocity).sample(0, 4000)
+    allowed = admissible_set(result.scene, result.velocity).sample(0, _OUTCOMES)
     axes.plot(
         *_kept_and_spread(result, allowed), ".", color=COLOURS[4], alpha=0.3, ms=3, label="allowed"
     )

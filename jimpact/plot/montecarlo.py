@@ -13,6 +13,12 @@ from jimpact.montecarlo.result import MonteCarlo
 from jimpact.montecarlo.statistics import FAILURE
 from jimpact.plot.style import SMALL, WIDTH, colour_of, styled
 
+_BARS = 30  # of a histogram: each is several pixels wide
+_MEAN_AT, _TOP = 1.12, 1.25  # height of the mean, and of the axis, over that of the highest bar
+_BODIES = 6  # histograms; of more bodies only the most scattered are drawn
+_DOT = 4.0  # area of a sample in the map [points^2]
+_TITLE = 80  # letters of a line of the title
+
 
 @styled(MonteCarlo)
 def monte_carlo(result: MonteCarlo, title: str = "") -> Figure:
@@ -41,11 +47,11 @@ def monte_carlo(result: MonteCarlo, title: str = "") -> Figure:
     5
     """
     scattered = np.argsort(-result.std, kind="stable")
-    bodies = sorted(scattered[:6].tolist())  # of more bodies the most scattered
+    bodies = sorted(scattered[:_BODIES].tolist())
     mapped = result.first["gaps"].shape[1] > 0
     mosaic: Any = [[str(body), "map"] if mapped else [str(body)] for body in bodies]
     figure = Figure(figsize=(WIDTH, max(4.8, 1.5 * len(bodies))))
-    figure.suptitle(title or textwrap.fill(result.description, 80), x=0.01, ha="left")
+    figure.suptitle(title or textwrap.fill(result.description, _TITLE), x=0.01, ha="left")
     panels = figure.subplot_mosaic(mosaic)
     unit = _unit(result)
     for body in bodies:
@@ -68,7 +74,7 @@ def _unit(result: MonteCarlo) -> str:
 def _histogram(axes: Axes, result: MonteCarlo, body: int) -> None:
     """Share of the samples by velocity; above it mean, and the 5 % and 95 % quantiles."""
     counts, edges = result.counts[body, 1:-1], result.edges[body]
-    each = max(1, len(counts) // 30)  # bars, each several pixels wide
+    each = max(1, len(counts) // _BARS)
     whole = len(counts) // each * each
     bars = counts[:whole].reshape(-1, each).sum(axis=1)
     bars[-1] += counts[whole:].sum()
@@ -76,11 +82,12 @@ def _histogram(axes: Axes, result: MonteCarlo, body: int) -> None:
     colour = colour_of(body)
     ends = np.append(edges[:whole:each], edges[-1])
     axes.stairs(share, ends, color=colour, fill=True)
+    top = float(share.max())
     mean, (low, high) = result.mean[body], result.quantile([0.05, 0.95])[:, body]
-    height = 1.12 * float(share.max())  # above the highest bar
+    height = _MEAN_AT * top
     axes.plot([low, high], [height, height], "|-", color="black", ms=7, lw=1)
     axes.plot(mean, height, "o", color="black", ms=4)  # it may lie outside that range
-    axes.set_ylim(0, 1.12 * height)
+    axes.set_ylim(0, _TOP * top)
     label = f"body {body + 1}: mean {mean:.3f}, std {result.std[body]:.3f} {_unit(result)}"
     axes.set_title(label, fontsize=SMALL, color=colour)
     axes.set_ylabel("samples [%]")
@@ -105,7 +112,7 @@ def _map(axes: Axes, result: MonteCarlo, body: int) -> None:
         return
     axes.set_ylabel(x[1][1])
     colours = matplotlib.colormaps["cividis"]
-    dots = axes.scatter(x[0][0], x[1][0], s=4, c=velocity, cmap=colours, lw=0, rasterized=True)
+    dots = axes.scatter(x[0][0], x[1][0], s=_DOT, c=velocity, cmap=colours, lw=0, rasterized=True)
     axes.figure.colorbar(dots, ax=axes, label=label)
     axes.set_aspect("equal" if _alike(x[0][0], x[1][0]) else "auto")
 

@@ -21,6 +21,7 @@ from jimpact.plot.style import COLOURS, GREY, colour_of, new_figure, styled
 POINT = 0.02  # radius in which a point mass is drawn, of the range of its coordinates
 _MARKED = ("accumulation", "detachment", "friction")  # events with a line style of their kind
 _MANY = 20  # up to this number of impacts each is marked by a line; more are a grey block
+_BASEPOINTS = 1000  # at which a base is drawn
 _FEW = 6  # curves that one panel shows by default, each with its entry in the legend
 # Share of the scale of its unit below which what a panel shows is rounding. Ten times more would
 # flatten motions that a thousandth of a hair's width is a lot for.
@@ -228,7 +229,7 @@ def _moving_base(axes: Axes, system: System, motion: Motion) -> None:
     reached = np.asarray(motion.time)[np.isfinite(np.asarray(motion.energy))]
     if not len(reached):
         return
-    time = np.linspace(reached[0], reached[-1], 1000)
+    time = np.linspace(reached[0], reached[-1], _BASEPOINTS)
     path = base_path(system, time)
     words = ("",) if path.shape[1] == 1 else (" x", " y", " z")
     for values, word, style in zip(path.T, words, ("--", ":", "-."), strict=False):

@@ -29,6 +29,8 @@ SPREAD = 0.6  # width that the bodies of one group take, of the distance between
 WIDTH = 7.2  # of every picture [in]: legible at half a page's width
 COLUMNS = 2  # panels side by side
 
+_UPRIGHT = 8  # names of laws that stand side by side, at most
+_DECADES = 100.0  # an axis that spans less is labelled within its decades, too
 _PLAIN = (1e-3, 1e5)  # numbers within are written without a power of ten
 
 P = ParamSpec("P")
@@ -123,7 +125,7 @@ def panels_of_laws(
         axes.set_ylabel(label)
     for axes in panels:
         axes.grid(False, axis="x")
-    many = len(laws) > 8
+    many = len(laws) > _UPRIGHT
     words = laws if many else [law.replace(", ", ",\n").replace("_", "\n") for law in laws]
     at = range(len(laws))
     panels[-1].set_xticks(at, words, fontsize=SMALL, rotation=90 if many else 0)
@@ -177,7 +179,7 @@ def logarithmic(axes: Axes, which: str) -> None:
     if high / low < 5:
         axis.set_major_locator(MaxNLocator(4))
     else:
-        few = high / low < 100  # labelled within its decades, too
+        few = high / low < _DECADES
         axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,), numticks=7))
     axis.set_major_formatter(FuncFormatter(lambda x, _: in_words(x)))
     axis.set_minor_formatter(NullFormatter())

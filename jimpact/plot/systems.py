@@ -16,6 +16,12 @@ from jimpact.plot.motions import draw_body
 from jimpact.plot.style import COLOURS, GREY, colour_of, new_figure, styled, write
 from jimpact.scene import PairNormals, Scene, as_velocity
 
+_GAP = 0.5  # how wide an open contact is drawn, in radii of the largest body
+_LEAST = 0.35  # radius of a small body, likewise
+_ARROW = 2.2  # length of the fastest velocity, likewise
+_THICKEST = 8.0  # line of the largest impulse [points]; ten times more hides the bodies
+_FAINT = 1e-3  # impulses over the largest one that are not drawn; ten times more breaks chains
+
 
 @styled()
 def system(drawn: Scene | Body | System, state: Any, title: str = "") -> Figure:
@@ -94,14 +100,14 @@ def force_chains(pile: Bodies, q: Any, scene: Scene, impulse: Any, title: str = 
     first, second = scene.pairs.neighbours.bodies.T
     ends = np.where((second < 0)[:, None], _on_walls(pile, scene.pairs, centres), centres[second])
     size = np.abs(p) / (np.abs(p).max() or 1.0)
-    drawn = np.flatnonzero(size > 1e-3)  # ten times more breaks chains
+    drawn = np.flatnonzero(size > _FAINT)
     drawn = drawn[np.argsort(size[drawn])]
     figure, axes = new_figure(5.0, title)
     for outline in pile.outlines(np.asarray(q, float), 0.0):
         axes.plot(*outline.T, color=GREY, lw=0.4, alpha=0.5)
     lines = np.stack([centres[first], ends], axis=1)[drawn]
     lines = lines if d == 2 else projected(lines)
-    widths = 8 * size[drawn]  # points; ten times more hides the bodies
+    widths = _THICKEST * size[drawn]
     chains = LineCollection(list(lines), linewidths=widths, colors=COLOURS[0], alpha=0.8)
     axes.add_collection(chains)
     axes.autoscale_view()
@@ -127,10 +133,9 @@ def _on_walls(pile: Bodies, pairs: PairNormals, centres: np.ndarray) -> np.ndarr
 def _row(axes: Axes, scene: Scene, velocity: np.ndarray) -> None:
     """A chain as a row of circles with arrows."""
     mass = np.asarray(scene.mass, float)
-    radius = np.maximum((mass / mass.max()) ** 0.5, 0.35)  # small ones are drawn larger
+    radius = np.maximum((mass / mass.max()) ** 0.5, _LEAST)
     left, right = scene.walls or (False, False)
-    # in radii of the largest body, as all lengths here
-    apart = np.where(np.asarray(scene.closed), 0.0, 0.5)
+    apart = np.where(np.asarray(scene.closed), 0.0, _GAP)
     before = np.concatenate([apart[:1] if left else [0.0], apart[left : len(mass) - 1 + left]])
     centre = np.cumsum(before + np.concatenate([radius[:1], radius[:-1] + radius[1:]]))
     end = centre[-1] + radius[-1]
@@ -142,7 +147,7 @@ def _row(axes: Axes, scene: Scene, velocity: np.ndarray) -> None:
         write(axes, (x, -1.35), f"{mass[i]:.3g} kg")
         write(axes, (x, 1.75), f"{v:.3g} m/s")
         if v:
-            tip = x + 2.2 * v / fastest / 2
+            tip = x + _ARROW * v / fastest / 2
             arrow = {"arrowstyle": "-|>", "color": colour, "lw": 2}
             axes.annotate("", (tip, 1.3), (2 * x - tip, 1.3), arrowprops=arrow)
     for wall, x in ((left, -0.3), (right, end + (apart[-1] if right else 0.0))):

@@ -34,6 +34,10 @@ from jimpact.theory.rocking import (
 )
 
 _FILL = "#DCE9F3"
+# Beyond two contacts: projections onto pairs of the first ones up to this number.
+_MOST_CONTACTS = 4
+_SAMPLES = 2000  # points drawn of a set of outcomes
+_SHORTEST = 0.5  # sides shorter than this part of the radius are not drawn: no space for a name
 
 _OUTCOME_COLOURS = ("#999999", "#009E73", "#E69F00", "#56B4E9", "#EEEEEE")  # as OUTCOMES
 
@@ -151,7 +155,7 @@ def _line(
     b = start @ direction
     length = -b + np.sqrt(max(b * b + frame.radius**2 - start @ start, 0.0))
     end = start + length * direction
-    if length < 0.5 * frame.radius:  # no space for a name
+    if length < _SHORTEST * frame.radius:
         return
     axes.plot(*np.stack([start, end]).T, color=GREY, lw=1.0, ls=style)
     angle = np.degrees(np.arctan2(direction[1], direction[0]))
@@ -165,8 +169,8 @@ def _projections(
     result: AdmissibleSet, marked: Mapping[str, np.ndarray], closed: np.ndarray, title: str
 ) -> Figure:
     """Samples of the set in pairs of normalized gap velocities."""
-    contacts = closed[:4]  # projections onto pairs of the first ones
-    samples = result.sample(0, 2000)
+    contacts = closed[:_MOST_CONTACTS]
+    samples = result.sample(0, _SAMPLES)
     norm = np.asarray(kinetic_norm(result.scene), float)
     unit = (np.asarray(result.scene.normals, float) / norm)[:, contacts]
     cloud, energies = samples @ unit, _energy_ratio(result, samples)
