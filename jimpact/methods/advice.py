@@ -2,7 +2,6 @@
 
 import itertools
 import math
-from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -24,9 +23,9 @@ from jimpact.methods.advice_report import Advice, Candidate, ContactBlock, Unkno
 from jimpact.methods.points import (
     EnergyNorm,
     Outcomes,
+    at_points,
     in_batches,
     in_turns,
-    left_out_if_it_raises,
     varied_impacts,
 )
 from jimpact.montecarlo.gaps import gap_scale
@@ -216,12 +215,10 @@ def _advice(
 ) -> Advice:
     """Runs every law over stiffnesses k (r, m), chooses the reference and the simplest near it."""
     v = situation.velocity
-    outcomes: dict[str, Outcomes] = {}
-    left_out: dict[str, str] = {}
-    for name, law in laws.items():
-        is_reference = name in ("lzb", "compliant")  # one of them is; its error ends the advice
-        with nullcontext() if is_reference else left_out_if_it_raises(name, left_out):
-            outcomes[name] = _outcomes(law, v, k, progress)
+    each = {name: partial(_outcomes, law, v, progress=progress) for name, law in laws.items()}
+    outcomes, left_out = at_points(each, k)
+    for name in {"lzb", "compliant"} & set(left_out):
+        raise RuntimeError(f"The reference law {name} {left_out[name]}")
     laws = {name: laws[name] for name in outcomes}
     apart = _reclosing(situation, outcomes)
     follows_gaps = situation.gapped.any() or apart > tolerance / SMALL_PART

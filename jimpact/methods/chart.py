@@ -1,9 +1,9 @@
 """Speed against accuracy: every way to compute an impact, on one chart."""
 
-import functools
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -15,12 +15,18 @@ from jimpact._checks import as_whole, check_choice, check_values, in_common_dtyp
 from jimpact.compiling import full_precision
 from jimpact.files.records import Column, Table, Tabular, fields_as_data, microseconds
 from jimpact.fits.parameters import with_entries
-from jimpact.impacts import Impact, impact
+from jimpact.impacts import impact
 from jimpact.law import Law, check_law
 from jimpact.laws.lzb import LZB
-from jimpact.methods.contenders import CONTENDERS, Contender, contender_of, outcome
-from jimpact.methods.points import in_turns, left_out_if_it_raises, left_out_notes, relative_error
-from jimpact.methods.schemes import UNCOUNTED
+from jimpact.methods.contenders import CONTENDERS, Contender, contenders_of, solved
+from jimpact.methods.points import (
+    UNCOUNTED,
+    Outcomes,
+    at_points,
+    in_turns,
+    left_out_notes,
+    relative_error,
+)
 from jimpact.progress import counting_bar
 from jimpact.registry import registered_laws
 from jimpact.scene import Scene, as_velocity, kinetic_energy
@@ -218,12 +224,9 @@ def work_precision(
     programs |= {name: _law_programs(other, case) for name, other in laws.items()}
     ladders: dict[str, Any] = {m.name: m.ladder for m in chosen} | dict.fromkeys(laws, (None,))
     truth, other_truth = programs[exact.name].at(FINEST), programs[second.name].at(SECOND)
-    solutions: dict[str, list[Solved]] = {}
     with counting_bar(sum(map(len, ladders.values())), "errors", progress) as advance:
-        for name, ladder in ladders.items():
-            with left_out_if_it_raises(name, left_out):
-                solutions[name] = [programs[name].at(setting) for setting in ladder]
-            advance(len(ladder))
+        climbed = {name: partial(_climbed, programs[name], name, advance) for name in ladders}
+        solutions, raised = at_points(climbed, ladders)
     rows = [(n, setting, s) for n, row in solutions.items() for setting, s in zip(ladders[n], row)]
     times = _times([(programs[name], setting) for name, setting, _ in rows], repeats, progress)
     labels = {m.name: m.label or m.name for m in chosen} | {name: f"law: {name}" for name in laws}
@@ -237,12 +240,12 @@ def work_precision(
         reference=Reference(
             how=f"{exact.name} at rtol {FINEST:g} against {second.name} at {SECOND:g}",
             uncertainty=_errors(case, other_truth, truth),
-            velocity=np.asarray(truth.out.velocity[0]),
-            impulse=np.asarray(truth.out.impulse[0]),
+            velocity=np.asarray(truth.velocity[0]),
+            impulse=np.asarray(truth.impulse[0]),
             duration=float(np.ravel(truth.duration)[0]),
         ),
         compile_time={name: programs[name].compile_time for name in points},
-        left_out=left_out,
+        left_out=left_out | raised,
         without_gradient={m.name: HOST for m in chosen if gradients and not m.jax},
         batch=batch,
         sample=case.sample,
@@ -305,43 +308,35 @@ def _chosen(
         reasons = {name: each.supports(case.law) for name, each in CONTENDERS.items()}
         left_out = {name: why for name, why in reasons.items() if why is not None}
         methods = [name for name in CONTENDERS if name not in left_out]
-    chosen = [_supported("methods", each, case) for each in methods]
+    chosen = _supporting("methods", methods, case)
     for name, values in settings.items():
         check_choice("settings", name, [each.name for each in chosen])
         check_values(f"settings[{name!r}]", values, low=0.0, open_low=True)
     return [m._replace(ladder=tuple(settings.get(m.name, m.ladder))) for m in chosen], left_out
 
 
-def _supported(argument: str, contender: str | Contender, case: Case) -> Contender:
-    """The contender, or that of this name, if it supports the law."""
-    contender = contender_of(argument, contender, CONTENDERS)
-    reason = contender.supports(case.law)
-    if reason is not None:
-        raise ValueError(
-            f"Argument `{argument}` must be able to solve the impact, but has {contender.name!r}: "
-            f"it {reason}."
-        )
-    return contender
+def _supporting(argument: str, methods: Sequence[str | Contender], case: Case) -> list[Contender]:
+    """These contenders, if they support the law."""
+    chosen = contenders_of(argument, methods, CONTENDERS)
+    for contender in chosen:
+        reason = contender.supports(case.law)
+        if reason is not None:
+            raise ValueError(
+                f"Argument `{argument}` must be able to solve the impact, but has "
+                f"{contender.name!r}: it {reason}."
+            )
+    return chosen
 
 
 def _reference(name: str | None, case: Case) -> Contender:
     """The contender that errors are measured from."""
-    contender = _supported("reference", name or "time", case)
+    (contender,) = _supporting("reference", [name or "time"], case)
     if contender.setting != "rtol":
         raise ValueError(f"Argument `reference` must take an rtol, but is {name!r}.")
     return contender
 
 
 # ------------------------------------------------------------------------------- programs
-
-
-class Solved(NamedTuple):
-    """An outcome or a batch of them, duration [s], field evaluations, Jacobian; JAX or numpy."""
-
-    out: Impact
-    duration: Any
-    evaluations: Any
-    jacobian: Any = None
 
 
 @dataclass(frozen=True)
@@ -355,23 +350,26 @@ class Programs:
     single: Callable[[Any], Any]
     batched: Callable[[Any], Any]
     batch: int
-    sampled: Callable[[Any], Solved]
+    sampled: Callable[[Any], Outcomes]
     gradient: Callable[[Any], Any] | None = None
     compile_time: dict[str, float] = field(default_factory=dict)
 
-    def at(self, setting: float | None) -> Solved:
-        """Solution and Jacobian of the sample, as numpy; evaluations NaN where not counted."""
+    def at(self, setting: float | None) -> Outcomes:
+        """Outcomes and Jacobian of the sample, as numpy; evaluations NaN where not counted."""
         solution = jax.tree.map(np.asarray, self.sampled(setting))
         work = np.where(solution.evaluations == UNCOUNTED, np.nan, solution.evaluations)
         jacobian = None if self.gradient is None else np.asarray(self.gradient(setting))
         return solution._replace(evaluations=work, jacobian=jacobian)
 
 
-def _solved(contender: Contender, law: LZB, case: Case, setting: Any) -> Solved:
-    """One impact by a contender."""
-    solution = contender.solve(law, case.scene, case.velocity, setting)
-    out = outcome(law, case.scene, case.velocity, solution)
-    return Solved(out, solution.duration, solution.evaluations)
+def _climbed(
+    programs: Programs, name: str, advance: Callable[[int], None], ladders: Mapping[str, Any]
+) -> list[Outcomes]:
+    """The sample at every setting of a contender's ladder."""
+    try:
+        return [programs.at(setting) for setting in ladders[name]]
+    finally:
+        advance(len(ladders[name]))
 
 
 def _method_programs(
@@ -382,11 +380,12 @@ def _method_programs(
         return _host_programs(contender, case)
     names, apart = tuple(shared_parameters(case.law)), contender.duration_apart
 
-    def solve(k: jax.Array, case: Case, setting: jax.Array) -> Solved:
+    def solve(k: jax.Array, case: Case, setting: jax.Array) -> Outcomes:
         """The impact with stiffness k (m,)."""
-        return _solved(contender, with_entries(case.law, ("stiffness",), k), case, setting)
+        law = with_entries(case.law, ("stiffness",), k)
+        return solved(contender, law, case.scene, case.velocity, setting)[1]
 
-    def timed(k: jax.Array, case: Case, setting: jax.Array) -> Solved:
+    def timed(k: jax.Array, case: Case, setting: jax.Array) -> Outcomes:
         """The same, without a duration that would cost a run of its own."""
         solution = solve(k, case, setting)
         return solution._replace(duration=jnp.nan) if apart or not durations else solution
@@ -400,7 +399,7 @@ def _method_programs(
             for name in names:
                 law = with_entries(law, (name,), at[name])
             factor = jnp.exp(at["ln k"])
-            return timed(k * factor, case._replace(law=law), setting).out.velocity
+            return timed(k * factor, case._replace(law=law), setting).velocity
 
         at = {"ln k": jnp.zeros_like(k)} | {name: getattr(case.law, name) for name in names}
         parts = jax.jacfwd(velocity)(at)
@@ -430,7 +429,7 @@ def _compiled(
 ) -> Callable[[Any], Any]:
     """The function of a setting; its first call enters the time of compiling."""
 
-    @functools.cache
+    @cache
     def compiled() -> Callable[..., Any]:
         """The compiled function."""
         begin = time.perf_counter()
@@ -448,16 +447,16 @@ def _host_programs(contender: Contender, case: Case) -> Programs:
     laws = [with_entries(case.law, ("stiffness",), k) for k in case.stiffness[:SAMPLE]]
     rows = min(HOST_BATCH, len(laws))
 
-    def sampled(setting: Any) -> Solved:
+    def sampled(setting: Any) -> Outcomes:
         """All outcomes, one after the other."""
-        solved = [_solved(contender, law, case, setting) for law in laws]
-        return jax.tree.map(lambda *a: jnp.stack(a), *solved)
+        each = [solved(contender, law, case.scene, case.velocity, setting)[1] for law in laws]
+        return jax.tree.map(lambda *a: jnp.stack(a), *each)
 
     def alone(setting: Any, count: int = 1) -> list[Any]:
         """The solver itself, for its time."""
         return [contender.solve(law, case.scene, case.velocity, setting) for law in laws[:count]]
 
-    batched = functools.partial(alone, count=rows)
+    batched = partial(alone, count=rows)
     return Programs(single=alone, batched=batched, batch=rows, sampled=sampled)
 
 
@@ -466,9 +465,9 @@ def _law_programs(law: Law, case: Case) -> Programs:
     law, batch = in_common_dtype(law, case.velocity)[0], len(case.stiffness)
     compile_time: dict[str, float] = {}
 
-    def run(v: jax.Array, law: Law, scene: Scene, setting: jax.Array) -> Solved:
+    def run(v: jax.Array, law: Law, scene: Scene, setting: jax.Array) -> Outcomes:
         """One impact."""
-        return Solved(impact(law, scene, v), jnp.nan, UNCOUNTED)
+        return Outcomes.of(impact(law, scene, v))
 
     many, v = jax.vmap(run, in_axes=(0, None, None, None)), case.velocity
     one = _compiled(compile_time, "single", run, v, law, case.scene)
@@ -485,17 +484,16 @@ def _law_programs(law: Law, case: Case) -> Programs:
 # ------------------------------------------------------------------------- errors and times
 
 
-def _errors(case: Case, solution: Solved, truth: Solved) -> dict[str, float]:
+def _errors(case: Case, tried: Outcomes, truth: Outcomes) -> dict[str, float]:
     """Relative errors, the largest over the impacts that were solved."""
-    out, exact = solution.out, truth.out
-    fastest = float(jnp.max(jnp.abs(case.velocity))) or np.abs(exact.velocity).max()
-    before = float(kinetic_energy(case.scene, case.velocity)) or np.abs(exact.energy_change).max()
+    fastest = float(jnp.max(jnp.abs(case.velocity))) or np.abs(truth.velocity).max()
+    before = float(kinetic_energy(case.scene, case.velocity)) or np.abs(truth.energy_change).max()
     compared = {
-        "velocity": (out.velocity, exact.velocity, fastest),
-        "impulse": (out.impulse, exact.impulse, np.abs(exact.impulse).max()),
-        "energy": (out.energy_change, exact.energy_change, before),
-        "duration": (solution.duration, truth.duration, np.abs(truth.duration).max()),
-        "gradient": (solution.jacobian, truth.jacobian, fastest),
+        "velocity": (tried.velocity, truth.velocity, fastest),
+        "impulse": (tried.impulse, truth.impulse, np.abs(truth.impulse).max()),
+        "energy": (tried.energy_change, truth.energy_change, before),
+        "duration": (tried.duration, truth.duration, np.abs(truth.duration).max()),
+        "gradient": (tried.jacobian, truth.jacobian, fastest),
     }
     return {
         name: float("nan")
@@ -506,11 +504,11 @@ def _errors(case: Case, solution: Solved, truth: Solved) -> dict[str, float]:
 
 
 def _point(
-    label: str, setting: float | None, error: dict[str, float], solution: Solved, timings: Any
+    label: str, setting: float | None, error: dict[str, float], tried: Outcomes, timings: Any
 ) -> Point:
     """A row of the chart."""
-    status = STATUS[int(np.max(solution.out.status))].name
-    return Point(label, setting, error, float(np.mean(solution.evaluations)), status, *timings)
+    status = STATUS[int(np.max(tried.status))].name
+    return Point(label, setting, error, float(np.mean(tried.evaluations)), status, *timings)
 
 
 def _times(
@@ -518,7 +516,7 @@ def _times(
 ) -> list[list[Timing]]:
     """Single and batched time of each row, and with its gradient if it has one; all in turns."""
     tasks = [
-        (row, impacts, functools.partial(run, value))
+        (row, impacts, partial(run, value))
         for row, (programs, value) in enumerate(rows)
         for run, impacts in (
             (programs.single, 1),

@@ -13,7 +13,7 @@ from jimpact.audits import Audit, audit, nothing_approaches
 from jimpact.files.records import Column, Table, Tabular, as_data, fields_as_data, microseconds
 from jimpact.impacts import Impact, impact
 from jimpact.law import Law
-from jimpact.methods.points import in_turns, left_out_if_it_raises, left_out_notes, seconds
+from jimpact.methods.points import at_points, in_turns, left_out_notes, seconds
 from jimpact.registry import registered_laws
 from jimpact.scene import Scene, as_velocity, dense_mass
 from jimpact.status import STATUS
@@ -175,12 +175,8 @@ def compare(
             "came with it."
         )
     check_kind("laws", laws, Mapping)
-    runs, first = {}, {}
-    for name, law in laws.items():
-        run = partial(impact, law, scene, v)
-        with left_out_if_it_raises(name, left_out):
-            first[name] = seconds(run)
-            runs[name] = run
+    first, raised = at_points({n: partial(_first_call, law, scene) for n, law in laws.items()}, v)
+    runs = {name: partial(impact, laws[name], scene, v) for name in first}
     each = dict(zip(runs, in_turns(list(runs.values()), _REPEATS)))
     times = {name: float(np.median(x)) for name, x in each.items()}
     entries = {
@@ -195,4 +191,9 @@ def compare(
         )
         for name, run in runs.items()
     }
-    return Comparison(scene, np.asarray(v), entries, left_out)
+    return Comparison(scene, np.asarray(v), entries, left_out | raised)
+
+
+def _first_call(law: Law, scene: Scene, velocity: Any) -> float:
+    """Time [s] of a law's first impact, with compiling."""
+    return seconds(partial(impact, law, scene, velocity))

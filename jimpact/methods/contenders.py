@@ -13,6 +13,7 @@ A contender of your own is a function and its settings, and stands in the chart 
 True
 """
 
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import diffrax
@@ -25,7 +26,8 @@ from jimpact.impacts import Impact, impact
 from jimpact.law import Impulses, Law
 from jimpact.laws.lzb import LZB
 from jimpact.methods import schemes
-from jimpact.methods.schemes import Solution as Solution, Solve
+from jimpact.methods.points import Outcomes, Solution as Solution
+from jimpact.methods.schemes import Solve
 from jimpact.scene import Scene
 
 SETTING_KINDS = ("rtol", "step", "impulse step")  # what `Contender.setting` may be
@@ -87,6 +89,15 @@ def outcome(law: LZB, scene: Scene, velocity: Any, solution: Solution) -> Impact
     return impact(known, scene, velocity)
 
 
+def solved(
+    contender: Contender, law: LZB, scene: Scene, velocity: Any, setting: Any
+) -> tuple[Impact, Outcomes]:
+    """One impact by a contender, and what is compared of it."""
+    solution = contender.solve(law, scene, velocity, setting)
+    out = outcome(law, scene, velocity, solution)
+    return out, Outcomes.of(out, solution)
+
+
 _TIME_STEPS = (0.2, 0.1, 0.03, 0.01, 0.003)  # in units of `time_scale`, coarse to fine
 _TO_NINE, _TO_ELEVEN = (1e-3, 1e-5, 1e-7, 1e-9), (1e-3, 1e-5, 1e-7, 1e-9, 1e-11)
 _ALL = (
@@ -145,8 +156,25 @@ _ALL = (
 CONTENDERS: dict[str, Contender] = {each.name: each for each in _ALL}
 
 
-def contender_of(argument: str, method: str | Contender, known: dict[str, Contender]) -> Contender:
-    """The contender of this name among those known, or one of your own, with a name of its own."""
+def contenders_of(
+    argument: str, methods: Sequence[str | Contender], known: Mapping[str, Contender]
+) -> list[Contender]:
+    """Contenders of these names among those known, or ones of your own, with names of their own."""
+    if isinstance(methods, str | Contender):
+        raise TypeError(f"Argument `{argument}` must be a list, but is {methods!r}.")
+    chosen = [_contender_of(argument, method, known) for method in methods]
+    names = [each.name for each in chosen]
+    if not names or len(set(names)) < len(names):
+        raise ValueError(
+            f"Argument `{argument}` must have one contender or more, each once, but has {names}."
+        )
+    return chosen
+
+
+def _contender_of(
+    argument: str, method: str | Contender, known: Mapping[str, Contender]
+) -> Contender:
+    """One of them."""
     if not isinstance(method, Contender):
         check_choice(argument, method, known)
         return known[method]

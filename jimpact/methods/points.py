@@ -1,10 +1,9 @@
 """Candidates at points against a reference: outcomes in batches, their errors, and their times."""
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -15,26 +14,55 @@ from jimpact.fits.parameters import with_entries
 from jimpact.impacts import Impact, impact
 from jimpact.law import Law
 from jimpact.scene import Scene, dense_mass, with_gaps
-from jimpact.status import STATUS
+from jimpact.status import CODE, STATUS
+
+Result = TypeVar("Result")
 
 SHORT = 2e-3  # [s]: calls that are faster are run several times for one measurement, so that the
 MOST_RUNS = 20  # clock's resolution does not count, but no more often than this
+UNCOUNTED = -1  # evaluations of a method that does not count them
 BUDGET = 2.0  # [s] for one call, after which it is not repeated
 LEAST_REPEATS = 3  # more often than this
 
 
+class Solution(NamedTuple):
+    """Impulses (m,) [N s], status (), duration () [s], field evaluations (), impulses (t,) [N s].
+
+    NaN: a duration that is not known; `UNCOUNTED`: evaluations likewise; None: no friction.
+    """
+
+    impulse: Any
+    code: Any = CODE["ok"]
+    duration: Any = np.nan
+    evaluations: Any = UNCOUNTED
+    tangential: Any = None
+
+
+TIMELESS = Solution(None)  # of a law, whose impacts are not integrated in time
+
+
 class Outcomes(NamedTuple):
-    """v+ (r, n), p (r, m), p_t (r, t) or None, status (r,) of impacts; JAX, then numpy."""
+    """Impacts at points (r,), what tables of methods compare of them; JAX, then numpy.
+
+    v+ (r, n) [m/s], p (r, m) and p_t (r, t) [N s], T+ - T- [J] and status (r,); of a contender its
+    own status, duration [s] and field evaluations (r,); a Jacobian of v+ where one was asked for.
+    """
 
     velocity: Any
     impulse: Any
     tangential: Any
+    energy_change: Any
     status: Any
+    code: Any
+    duration: Any
+    evaluations: Any
+    jacobian: Any = None
 
     @classmethod
-    def of(cls, out: Impact) -> "Outcomes":
-        """What is compared of an impact."""
-        return cls(out.velocity, out.impulse, out.tangential_impulse, out.status)
+    def of(cls, out: Impact, solution: Solution = TIMELESS) -> "Outcomes":
+        """What is compared of an impact, and of the contender's solution behind it, if any."""
+        energy, work = out.energy_change, (solution.code, solution.duration, solution.evaluations)
+        return cls(out.velocity, out.impulse, out.tangential_impulse, energy, out.status, *work)
 
     @property
     def failed(self) -> np.ndarray:
@@ -50,7 +78,7 @@ class Outcomes(NamedTuple):
         """The same, NaN where it failed."""
         lost = self.failed[:, None]
         v, p, side = jax.tree.map(lambda x: np.where(lost, np.nan, x), self[:3])
-        return Outcomes(v, p, side, self.status)
+        return self._replace(velocity=v, impulse=p, tangential=side)
 
 
 @precise_jit
@@ -123,14 +151,22 @@ def in_batches(
     return jax.tree.map(lambda *x: np.concatenate(x)[:count], *parts)
 
 
-@contextmanager
-def left_out_if_it_raises(name: str, left_out: dict[str, str]) -> Iterator[None]:
-    """An error of this candidate is the reason why it is left out; the others stand."""
-    try:
-        yield
-    except Exception as error:  # a user's law or contender may fail in any way
-        reason = next(iter(str(error).splitlines()), "-")
-        left_out[name] = f"raised {type(error).__name__}: {reason}"
+def at_points(
+    candidates: Mapping[str, Callable[[Any], Result]], points: Any
+) -> tuple[dict[str, Result], dict[str, str]]:
+    """What each candidate, a function of the points, makes of them; and why one is left out.
+
+    A user's law or contender may fail in any way: one that raises is left out, the others stand.
+    """
+    results: dict[str, Result] = {}
+    left_out: dict[str, str] = {}
+    for name, run in candidates.items():
+        try:
+            results[name] = run(points)
+        except Exception as error:
+            reason = next(iter(str(error).splitlines()), "-")
+            left_out[name] = f"raised {type(error).__name__}: {reason}"
+    return results, left_out
 
 
 def left_out_notes(left_out: Mapping[str, str], what: str = "is left out") -> list[str]:

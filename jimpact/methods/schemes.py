@@ -38,6 +38,7 @@ from jimpact.events.impact_dynamics import Dynamics, evaluate, first_indentation
 from jimpact.events.implicit_steps import FORCES_A_STEP
 from jimpact.events.stepper import STAGES
 from jimpact.laws.lzb import LZB
+from jimpact.methods.points import UNCOUNTED, Solution
 from jimpact.scene import Scene
 from jimpact.solvers.dense import unit
 from jimpact.solvers.sparse import Neighbours, Sparse
@@ -45,26 +46,12 @@ from jimpact.solvers.tangential import per_tangent
 from jimpact.solvers.tridiagonal import Tridiagonal, as_matrix
 from jimpact.status import CODE
 
-UNCOUNTED = -1  # evaluations of a method that does not count them
 # Part of the largest energy below which that of a contact is rounding, and the contact unloaded.
 # Ten times more would unload contacts that still push.
 EMPTY = 1e-14
 FINEST = 100 * float(np.finfo(float).eps)  # scipy takes no smaller rtol
 GIVE_UP = 5000  # evaluations a contact: LSODA may creep without end at an opening
 FOREVER = 1e6  # in units of the impact's time scale: a contact alone lasts about pi
-
-
-class Solution(NamedTuple):
-    """Impulses (m,) [N s], status (), duration () [s], field evaluations (), impulses (t,) [N s].
-
-    NaN: a duration that is not known; `UNCOUNTED`: evaluations likewise; None: no friction.
-    """
-
-    impulse: Any
-    code: Any = CODE["ok"]
-    duration: Any = np.nan
-    evaluations: Any = UNCOUNTED
-    tangential: Any = None
 
 
 Solve = Callable[[LZB, Scene, Any, Any], Solution]

@@ -28,8 +28,8 @@ from jimpact.audits import audit
 from jimpact.compiling import full_precision
 from jimpact.files.records import Column, Table, Tabular, as_data, fields_as_data
 from jimpact.laws.lzb import LZB
-from jimpact.methods.contenders import CONTENDERS, Contender, contender_of, outcome
-from jimpact.methods.points import in_batches, left_out_if_it_raises, left_out_notes, relative_error
+from jimpact.methods.contenders import CONTENDERS, Contender, contenders_of, solved
+from jimpact.methods.points import Outcomes, at_points, in_batches, left_out_notes, relative_error
 from jimpact.progress import counting_bar
 from jimpact.scene import Scene, as_velocity, chain
 from jimpact.status import CODE
@@ -256,21 +256,19 @@ def stability_map(
     points = np.concatenate([*(part.reshape(-1, len(AXES)) for part in parts), sampled])
     runners = cache(partial(runner, max_steps, place))
     total = len(points) * (len(chosen) + 1)
-    by_slice: dict[str, tuple[Slice, ...]] = {}
-    by_sample: dict[str, Slice] = {}
-    left_out: dict[str, str] = {}
-    ends = np.cumsum([part[..., 0].size for part in parts])
     with counting_bar(total, "impacts", progress) as advance:
         exact, confirmation = references(points, place, runners, advance)
-        for m in chosen:
-            with left_out_if_it_raises(m.name, left_out):
-                columns = classes_of(m, points, place, exact, runners, advance)
-                codes, errors = (np.split(column, ends) for column in columns)
-                by_slice[m.name] = tuple(
-                    Slice(names, code.reshape(part.shape[:-1]), error.reshape(part.shape[:-1]))
-                    for names, part, code, error in zip(axis_sets, parts, codes, errors)
-                )
-                by_sample[m.name] = Slice(("samples",), codes[-1], errors[-1])
+        classes = {m.name: partial(classes_of, m, place, exact, runners, advance) for m in chosen}
+        classified, left_out = at_points(classes, points)
+    ends = np.cumsum([part[..., 0].size for part in parts])
+    by_slice, by_sample = {}, {}
+    for name, columns in classified.items():
+        codes, errors = (np.split(column, ends) for column in columns)
+        by_slice[name] = tuple(
+            Slice(names, code.reshape(part.shape[:-1]), error.reshape(part.shape[:-1]))
+            for names, part, code, error in zip(axis_sets, parts, codes, errors)
+        )
+        by_sample[name] = Slice(("samples",), codes[-1], errors[-1])
     return StabilityMap(
         methods=tuple(by_slice),
         axes=lines,
@@ -346,8 +344,7 @@ def _methods(methods: Sequence[str | Contender] | None, place: Place) -> list[Co
     able = [m for m in CONTENDERS.values() if m.jax and (m.friction or not place.friction)]
     known = {m.name: m for m in able}
     defaults = FRICTION_NAMES if place.friction else NAMES
-    chosen = tuple(defaults if methods is None else methods)
-    return [contender_of("methods", each, known) for each in chosen or ("",)]
+    return contenders_of("methods", defaults if methods is None else methods, known)
 
 
 def _checked(argument: str, values: Mapping[str, Any], names: tuple[str, ...]) -> Mapping[str, Any]:
@@ -447,32 +444,23 @@ def stiffness_of(kappa: Any, contacts: int) -> jax.Array:
     return jnp.where(jnp.arange(contacts) >= (contacts + 1) // 2, kappa, jnp.ones_like(kappa))
 
 
-class PointOutcomes(NamedTuple):
-    """Velocities after (L, n), status of the method and of the impact, energy gained over T-."""
-
-    velocity: Any
-    code: Any
-    status: Any
-    gain: Any
-
-
-Runner = Callable[[np.ndarray, Any], PointOutcomes]  # of points (L, 7) and settings () or (L,)
+# Of points (L, 7) and settings () or (L,): outcomes (L,), and the energy gained (L,) over T-
+Runner = Callable[[np.ndarray, Any], tuple[Outcomes, np.ndarray]]
 Runners = Callable[[Contender, int], Runner]
 
 
 def runner(max_steps: int, place: Place, method: Contender, balls: int) -> Runner:
     """A function of points (L, 7) and settings: one method on chains of N balls or a scene."""
 
-    def one(point: jax.Array, setting: jax.Array) -> PointOutcomes:
+    def one(point: jax.Array, setting: jax.Array) -> tuple[Outcomes, jax.Array]:
         """The outcome at one point."""
         law, scene, v = place.impact_at(point, balls, max_steps)
-        solution = method.solve(law, scene, v, setting)
-        out, code = outcome(law, scene, v, solution), jnp.asarray(solution.code)
-        return PointOutcomes(out.velocity, code, out.status, audit(scene, v, out).energy_gain)
+        out, compared = solved(method, law, scene, v, setting)
+        return compared, audit(scene, v, out).energy_gain
 
     batch = jax.jit(jax.vmap(one))
 
-    def run(points: np.ndarray, settings: Any) -> PointOutcomes:
+    def run(points: np.ndarray, settings: Any) -> tuple[Outcomes, np.ndarray]:
         """The outcomes at all points, a batch at a time."""
         rows = points, np.broadcast_to(settings, len(points))
         return in_batches(lambda part: batch(*part), rows, BATCH)
@@ -492,7 +480,7 @@ def references(
     for at, n in groups:
         unique, back = np.unique(points[at, 1:], axis=0, return_inverse=True)
         rows = np.column_stack([np.zeros(len(unique)), unique])
-        out = runners(CONTENDERS["time"], n)(rows, REFERENCE_RTOL)
+        out, _ = runners(CONTENDERS["time"], n)(rows, REFERENCE_RTOL)
         ended = (out.code == CODE["ok"]) | (out.code == CODE["plastic_limit"])
         velocity = np.where(ended[:, None], out.velocity, np.nan)[np.ravel(back)]
         exact[at, : place.size(n)] = velocity
@@ -514,9 +502,8 @@ def _confirm(points: np.ndarray, place: Place, exact: np.ndarray) -> Confirmatio
     for i in candidates[::stride]:
         balls = int(points[i, AXES.index("balls")])
         law, scene, v = place.impact_at(list(map(float, points[i])), balls, CHECK_STEPS)
-        result = CONTENDERS[name].solve(law, scene, v, rtol)
-        after = outcome(law, scene, v, result).velocity
-        differences.append(float(relative_error(after, exact[i, : len(v)])))
+        _, out = solved(CONTENDERS[name], law, scene, v, rtol)
+        differences.append(float(relative_error(out.velocity, exact[i, : len(v)])))
     agree = sum(x <= within for x in differences)
     largest = max(differences, default=float("nan"))
     return Confirmation(len(points), len(differences), agree, largest, within)
@@ -539,11 +526,11 @@ def _is_quick(point: np.ndarray, place: Place) -> bool:
 
 def classes_of(
     method: Contender,
-    points: np.ndarray,
     place: Place,
     exact: np.ndarray,
     runners: Runners,
     advance: Callable[[int], None],
+    points: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Class and error (over the largest |v-|, which is 1) of every point."""
     codes, errors = np.full(len(points), FLAGGED), np.full(len(points), np.nan)
@@ -556,26 +543,28 @@ def classes_of(
         run, size = runners(method, n), place.size(n)
         at = group[e[group] > 0] if method.divides else group
         if len(at):
-            out = run(points[at], setting[at])
+            out, gain = run(points[at], setting[at])
             errors[at] = relative_error(out.velocity, exact[at, :size])
-            codes[at] = _classified(out, errors[at], allowed[at])
+            codes[at] = _classified(out, gain, errors[at], allowed[at])
         wrong = at[codes[at] == WRONG]
         if len(wrong):
-            finer = run(points[wrong], FINER * setting[wrong])
+            finer, _ = run(points[wrong], FINER * setting[wrong])
             falls = relative_error(finer.velocity, exact[wrong, :size]) < FALLS * errors[wrong]
             codes[wrong[(finer.code == CODE["ok"]) & ~falls]] = STALLS
         advance(len(group))
     return codes, errors
 
 
-def _classified(out: PointOutcomes, error: np.ndarray, allowed: np.ndarray) -> np.ndarray:
+def _classified(
+    out: Outcomes, gain: np.ndarray, error: np.ndarray, allowed: np.ndarray
+) -> np.ndarray:
     """Classes (L,) before a finer setting is tried; `error` NaN where there is no reference."""
     status = np.where(out.code == CODE["ok"], out.status, out.code)
     cases = {
         NOT_FINITE: status == CODE["not_finite"],
         ENDLESS: status == CODE["max_steps"],
         RIGHT: error <= allowed,
-        GAINS_ENERGY: (status == CODE["energy_gain"]) | (out.gain > allowed),
+        GAINS_ENERGY: (status == CODE["energy_gain"]) | (gain > allowed),
         FLAGGED: status != CODE["ok"],
         WRONG: np.isfinite(error),
     }

@@ -12,7 +12,6 @@ import numpy as np
 from jimpact._checks import as_axis, as_numbers, check_choice, check_values
 from jimpact.files.records import Column, Table, Tabular, fields_as_data
 from jimpact.impacts import impact
-from jimpact.law import Law
 from jimpact.laws.binary import Binary
 from jimpact.laws.kinematic import Moreau
 from jimpact.laws.lzb import LZB
@@ -138,7 +137,7 @@ def validity_map(
     law = LZB(e.astype(v.dtype), k[0], eta[0])
     out = varied_impacts(law, scene, v, {"stiffness": k, "exponent": exponents})
     spread = jax.vmap(partial(dispersion_index, scene))(out.velocity)
-    laws: dict[str, Law] = {"moreau": Moreau(e), "binary": Binary(e)}
+    laws = {"moreau": Moreau(e), "binary": Binary(e)}
     after = {name: impact(law, scene, v).velocity for name, law in laws.items()}
     return ValidityMap(
         scene=scene,
