@@ -4,9 +4,7 @@ Programs that compile in half of the time run a few percent slower.
 """
 
 import functools
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -18,12 +16,6 @@ import numpy as np
 QUICK = {"xla_cpu_use_fusion_emitters": False}
 
 Function = TypeVar("Function", bound=Callable[..., Any])
-
-# Runs a jitted program of (static arguments, arrays); the second argument is the public function
-# by which the program is known.
-Runner = Callable[[Callable[..., Any], Callable[..., Any], Any, list[jax.Array]], Any]
-
-_runner: "ContextVar[Runner | None]" = ContextVar("runner", default=None)
 
 
 def full_precision(function: Function) -> Function:
@@ -47,16 +39,6 @@ def full_precision(function: Function) -> Function:
 def precise_jit(function: Function) -> Function:
     """`eqx.filter_jit(function)` in full precision."""
     return full_precision(eqx.filter_jit(function))  # type: ignore[return-value]
-
-
-@contextmanager
-def run_programs_with(runner: Runner | None) -> Iterator[None]:
-    """Within, `runner` runs the library's programs; None: they run as JAX compiles them."""
-    before = _runner.set(runner)
-    try:
-        yield
-    finally:
-        _runner.reset(before)
 
 
 @functools.cache
@@ -96,7 +78,7 @@ def quick_jit(function: Function) -> Function:
     inside = eqx.filter_jit(function)
 
     @functools.cache
-    def program(stored: bool) -> Callable[..., Any]:
+    def program() -> Callable[..., Any]:
         """The compiled function of (structure, other leaves), arrays."""
 
         def of_arrays(rest: Any, arrays: list[Any]) -> Any:
@@ -107,8 +89,7 @@ def quick_jit(function: Function) -> Function:
             args, keywords = jax.tree.unflatten(tree, leaves)
             return function(*args, **keywords)
 
-        # JAX's cache goes by names, too, and must not hand out what a runner stores.
-        of_arrays.__name__ = f"whole_{function.__name__}" if stored else function.__name__
+        of_arrays.__name__ = function.__name__
         return jax.jit(of_arrays, static_argnums=0, compiler_options=known_options())
 
     @full_precision
@@ -119,10 +100,6 @@ def quick_jit(function: Function) -> Function:
             return inside(*args, **keywords)
         leaves, tree = jax.tree.flatten((args, keywords))
         fixed = tree, tuple(None if eqx.is_array(x) else (x,) for x in leaves)
-        arrays = [x for x in leaves if eqx.is_array(x)]
-        runner = _runner.get()
-        if runner is None or any(isinstance(x, jax.core.Tracer) for x in arrays):
-            return program(False)(fixed, arrays)
-        return runner(program(True), call, fixed, arrays)
+        return program()(fixed, [x for x in leaves if eqx.is_array(x)])
 
     return call  # type: ignore[return-value]

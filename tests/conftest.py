@@ -146,7 +146,6 @@ def pytest_configure(config):
         os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = WORTH_SHARING
         jax.config.update("jax_compilation_cache_dir", folder.name)
         jax.config.update("jax_persistent_cache_min_compile_time_secs", float(WORTH_SHARING))
-    os.environ.setdefault("JIMPACT_CACHE", os.environ["JAX_COMPILATION_CACHE_DIR"])
 
 
 class Workers:

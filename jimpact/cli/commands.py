@@ -20,7 +20,6 @@ import numpy as np
 
 import jimpact as ji
 from jimpact.cli import options
-from jimpact.cli.program_cache import stored_programs
 from jimpact.cli.study import Study, impact_study, motion_study, read_study
 from jimpact.cli.study_file import NO_DATA, without_none
 from jimpact.cli.study_motion import MotionStudy
@@ -65,14 +64,10 @@ class CommandResult(NamedTuple):
     failure: str = ""  # what went wrong
 
 
-def run(command: options.DrawingCommand, steps: Steps, folder: str | None = None) -> str:
-    """Run a command and print its result; returns what went wrong, '' if nothing did.
-
-    Compiled programs are stored in the folder, if there is one.
-    """
+def run(command: options.DrawingCommand, steps: Steps) -> str:
+    """Run a command and print its result; returns what went wrong, '' if nothing did."""
     jax.config.update("jax_enable_x64", True)  # the program's choice; the library sets none
-    with stored_programs(folder):
-        result = _COMMANDS[command.name()](command, steps)
+    result = _COMMANDS[command.name()](command, steps)
     _show(command, result, steps)
     return result.failure
 

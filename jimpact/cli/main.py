@@ -130,12 +130,12 @@ def run_command(call: Call, arguments: list[str]) -> int:
     command.check()
     if command.light:
         return command.run()
-    folder = keep_programs(command.no_cache)
+    keep_programs(command.no_cache)
     from jimpact.cli.commands import run
     from jimpact.progress import Steps
 
     call.steps = Steps(call.name)
-    failure = run(command, call.steps, folder)
+    failure = run(command, call.steps)
     return call.fail(failure, FAILURE) if failure else 0
 
 
@@ -164,25 +164,23 @@ def parse(arguments: list[str]) -> Any:
     )
 
 
-def keep_programs(no_cache: bool) -> str | None:
+def keep_programs(no_cache: bool) -> None:
     """Tell JAX, before it is imported, where to keep what it compiles, unless the user has done so.
 
     The place is in the folder `JIMPACT_CACHE` (empty: nowhere), else in the user's cache folder.
-    Returns the folder for whole programs, which contains JAX's own; None: nowhere.
     """
     root = os.environ.get("JIMPACT_CACHE")
     if no_cache:
         os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"
     if no_cache or root == "":
-        return None
+        return
     import platformdirs
 
     # One for each kind of processor: a home may be shared by machines that differ.
     root = root or platformdirs.user_cache_dir("jimpact")
     folder = os.path.join(root, f"programs-{_processor()}")
-    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", os.path.join(folder, "jax"))
+    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", folder)
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", LEAST_COMPILE_TIME)
-    return folder
 
 
 def _processor() -> str:

@@ -44,7 +44,7 @@ class Command:
     """Print JSON instead of text."""
     csv: Flag = False
     """Print the table as CSV instead of text."""
-    # Compile anew. Else compiled programs are stored in the user's cache folder (up to 1 GB), or in
+    # Compile anew. Else compiled programs are stored in the user's cache folder, or in
     # the folder that the environment variable JIMPACT_CACHE names (empty: nowhere).
     no_cache: Flag = False
 

@@ -38,19 +38,18 @@ def test_where_programs_are_kept(tmp_path, monkeypatch):
         monkeypatch.setenv(name, "")
         monkeypatch.delenv(name)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    kept = keep_programs(no_cache=False)
-    assert kept.startswith(str(tmp_path / "jimpact"))
-    assert os.environ.pop(folder) == os.path.join(kept, "jax")
+    keep_programs(no_cache=False)
+    assert os.environ.pop(folder).startswith(str(tmp_path / "jimpact"))
     monkeypatch.setenv("JIMPACT_CACHE", "")
-    assert keep_programs(no_cache=False) is None
+    keep_programs(no_cache=False)
     assert folder not in os.environ
     monkeypatch.setenv("JIMPACT_CACHE", "mine")
-    assert keep_programs(no_cache=False).startswith("mine")
+    keep_programs(no_cache=False)
     monkeypatch.setenv("JIMPACT_CACHE", "other")
     keep_programs(no_cache=False)  # what is set already stays
     assert os.environ[folder].startswith("mine")
     assert enabled not in os.environ
-    assert keep_programs(no_cache=True) is None
+    keep_programs(no_cache=True)
     assert os.environ[enabled] == "false"
 
 
