@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -44,6 +44,14 @@ def numbered(names: Sequence[str], count: int) -> tuple[str, ...]:
         return tuple(names)
     parts = [split_name(name) for name in names]
     return tuple(f"{word}{i + 1} [{unit}]" for i in range(count) for word, unit in parts)
+
+
+class Directions(NamedTuple):
+    """Gaps at one configuration, and along which velocities they and the bodies' slip change."""
+
+    gaps: jax.Array  # f (m,)
+    normals: jax.Array  # N (n, m)
+    tangents: jax.Array | None  # H_t (n, m), in space (n, 2 m)
 
 
 class Body(eqx.Module):
@@ -101,17 +109,20 @@ class Body(eqx.Module):
         """Displacements (m,) [m] along the contact planes at q; their rates are sliding speeds."""
         return None
 
-    def gaps_and_normals(self, q: jax.Array) -> tuple[jax.Array, jax.Array] | None:
-        """f (m,) and N (n, m) at q, where N has a formula; None: N is found by differentiation."""
+    def directions(self, q: jax.Array, tangents: bool = True) -> Directions | None:
+        """f, N and, where they are asked for, tangents at q by a formula; None: there is none."""
         return None
 
     def normals(self, q: jax.Array) -> jax.Array:
         """N (n, m) at q: gap velocities are `N^T v`."""
-        both = self.gaps_and_normals(q)
-        return self._gradient(self.gap_function, q) if both is None else both[1]
+        known = self.directions(q, tangents=False)
+        return self._gradient(self.gap_function, q) if known is None else known.normals
 
     def tangents(self, q: jax.Array) -> jax.Array | None:
         """H_t (n, m) at q, in space (n, 2 m), contact-major: `v_t = H_t^T v`; None: no friction."""
+        known = self.directions(q)
+        if known is not None:
+            return known.tangents
         if self.tangent_function(q) is None:
             return None
         return self._gradient(self.tangent_function, q)

@@ -12,6 +12,7 @@ from jimpact.bodies.base import (
     CIRCLE,
     PLANAR,
     Body,
+    Directions,
     LinearPotential,
     dot,
     lengths,
@@ -269,16 +270,14 @@ class RigidBodies(Body):
         return self.contacts(q).gap
 
     @full_precision
-    def gaps_and_normals(self, q: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Gaps (m,) and N (n, m)."""
+    def directions(self, q: jax.Array, tangents: bool = True) -> Directions:
+        """f, N and H_t: how fast body i comes away from body j, and slides along it."""
         gap, point, normal = self.contacts(q)
-        return gap, self._of_all(q, point, normal[:, None])
-
-    @full_precision
-    def tangents(self, q: jax.Array) -> jax.Array:
-        """H_t (n, m), in space (n, 2 m): how fast body i slides along body j."""
-        _, point, normal = self.contacts(q)
-        return self._of_all(q, point, self.ways(normal))
+        ways = normal[:, None]
+        if not tangents:
+            return Directions(gap, self._of_all(q, point, ways)[..., 0], None)
+        rows = self._of_all(q, point, jnp.concatenate([ways, self.ways(normal)], axis=1))
+        return Directions(gap, rows[..., 0], rows[..., 1:].reshape(len(rows), -1))
 
     def ways(self, normal: jax.Array) -> jax.Array:
         """Unit tangents (m, d - 1, d) of normals (m, d)."""
@@ -297,7 +296,7 @@ class RigidBodies(Body):
         return jnp.concatenate([ways, around], axis=2)
 
     def _of_all(self, q: jax.Array, point: jax.Array, ways: jax.Array) -> jax.Array:
-        """(n, m k): velocities along ways (m, k, d) of all bodies."""
+        """(n, m, k): velocities along ways (m, k, d) of all bodies."""
         velocities = self.dimension + self.angular
         rows = jnp.zeros((*ways.shape[:2], self.count, velocities), q.dtype)
         moving = np.arange(self.count, dtype=np.int32)[None]
@@ -306,7 +305,7 @@ class RigidBodies(Body):
                 own = jnp.asarray(body)[:, None] == moving
                 speeds = sign * self.speeds(q, point, ways, body)[:, :, None]
                 rows = rows + jnp.where(own[:, None, :, None], speeds, 0.0)
-        return rows.reshape(-1, self.count * velocities).T
+        return jnp.moveaxis(rows.reshape(*ways.shape[:2], -1), 2, 0)
 
     @full_precision
     def at(self, positions: Any, turns: Any = None) -> jax.Array:

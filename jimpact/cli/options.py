@@ -212,7 +212,7 @@ class StabilityCommand(DrawingCommand):
     """Where methods of integration are right, wrong, gain energy or do not end."""
 
     methods: Names = ()
-    """Methods by name; default: default, rk4, verlet and impulse_euler."""
+    """Methods by name; default: time, rk4, verlet and impulse_euler."""
     full: Flag = False
     """Also other numbers of balls, all pairs of axes, 300 points between them."""
 

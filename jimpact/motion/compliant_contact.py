@@ -18,7 +18,7 @@ from jimpact.motion.compliant_flow import (
     phases_of,
     stable_step,
 )
-from jimpact.motion.dynamics import gaps, kinematics, kinematics_with_tangents, not_rounding
+from jimpact.motion.dynamics import gaps, kinematics, not_rounding
 from jimpact.motion.event_driven import why_stuck
 from jimpact.motion.flow import (
     Flight,
@@ -148,10 +148,9 @@ def _begin(problem: MotionProblem, max_events: int) -> _CompliantRun:
 
 def _rates(problem: MotionProblem, at: State) -> tuple[jax.Array, jax.Array]:
     """Gap velocities (m,) and speeds of slip (m,), 0 without friction."""
-    if problem.mu is None:
-        gamma = kinematics(problem.system, at.q, at.v, at.t).rate
-        return gamma, jnp.zeros_like(gamma)
-    normal, tangent = kinematics_with_tangents(problem.system, at.q, at.v, at.t)
+    normal, tangent = kinematics(problem.system, at.q, at.v, at.t, problem.mu is not None)
+    if tangent is None:
+        return normal.rate, jnp.zeros_like(normal.rate)
     return normal.rate, length(by_contact(tangent.rate, problem.contacts))
 
 

@@ -141,7 +141,7 @@ class CompliantFlow(MotionFlow):
         """Where a gap closes, a force ends or returns; where compression or friction turns."""
         at = unpacked(self.like, y)
         if self.mu is None:
-            rate = kinematics(self.system, at.q, at.v, at.t).rate
+            rate = kinematics(self.system, at.q, at.v, at.t)[0].rate
             return self.from_margins(self._normal_margins(const.phase, rate, at.contact[0]), at)
         contacts, force = self.pushed(const, at)
         normal = self._normal_margins(const.phase, contacts.normal.rate, at.contact[0])

@@ -70,10 +70,40 @@ def recorded_gaps(system: System, q: jax.Array, t: jax.Array) -> jax.Array:
     return gaps(system, q, t)
 
 
-def kinematics(system: System, q: jax.Array, v: jax.Array, t: jax.Array) -> Kinematics:
-    """Value, rate, drift and gradient of the gaps."""
-    if _has_formula(system, q):
-        return _along(system, q, v, t, system.body.gaps_and_normals)
+def kinematics(
+    system: System, q: jax.Array, v: jax.Array, t: jax.Array, friction: bool = False
+) -> tuple[Kinematics, Kinematics | None]:
+    """That of the gaps, and with friction that of what slides (its value is 0)."""
+    body = system.body
+
+    def tangents(at: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """What slides has no value."""
+        h = body.tangents(at)
+        assert h is not None
+        return jnp.zeros_like(h[0]), h
+
+    if not _has_formula(system, q):
+        normal = _differentiated(system, q, v, t)
+        return normal, _along(system, q, v, t, tangents) if friction else None
+
+    def all_directions(at: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Gaps; normals, then tangents."""
+        known = body.directions(at, friction)
+        assert known is not None
+        each = [x for x in known[1:] if x is not None]
+        return known.gaps, jnp.concatenate(each, axis=1)
+
+    both = _along(system, q, v, t, all_directions)
+    m = len(both.value)
+    normal = Kinematics(both.value, both.rate[:m], both.drift[:m], both.gradient[:, :m])
+    if not friction:
+        return normal, None
+    slip = both.rate[m:]
+    return normal, Kinematics(jnp.zeros_like(slip), slip, both.drift[m:], both.gradient[:, m:])
+
+
+def _differentiated(system: System, q: jax.Array, v: jax.Array, t: jax.Array) -> Kinematics:
+    """That of the gaps by two derivatives."""
     zero, one = jnp.zeros_like(t), jnp.ones_like(t)
 
     def rates(s: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -84,49 +114,19 @@ def kinematics(system: System, q: jax.Array, v: jax.Array, t: jax.Array) -> Kine
     return Kinematics(value, rate, drift, normals_at(system, q, t))
 
 
-def kinematics_with_tangents(
-    system: System, q: jax.Array, v: jax.Array, t: jax.Array
-) -> tuple[Kinematics, Kinematics]:
-    """That of the gaps, and that of what slides (its value is 0)."""
-    body = system.body
-
-    def tangents(at: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """What slides has no value."""
-        h = body.tangents(at)
-        assert h is not None
-        return jnp.zeros_like(h[0]), h
-
-    if not _has_formula(system, q):
-        return kinematics(system, q, v, t), _along(system, q, v, t, tangents)
-
-    def all_directions(at: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Gaps; normals, then tangents."""
-        found = body.gaps_and_normals(at)
-        assert found is not None
-        return found[0], jnp.concatenate([found[1], tangents(at)[1]], axis=1)
-
-    both = _along(system, q, v, t, all_directions)
-    m = len(both.value)
-    normal = Kinematics(both.value, both.rate[:m], both.drift[:m], both.gradient[:, :m])
-    slip = both.rate[m:]
-    return normal, Kinematics(jnp.zeros_like(slip), slip, both.drift[m:], both.gradient[:, m:])
-
-
 def _along(
     system: System,
     q: jax.Array,
     v: jax.Array,
     t: jax.Array,
-    directions: Callable[[jax.Array], tuple[jax.Array, jax.Array] | None],
+    directions: Callable[[jax.Array], tuple[jax.Array, jax.Array]],
 ) -> Kinematics:
     """Velocities along the directions (n, k) that a function of q gives, with some values."""
     body, zero, one = system.body, jnp.zeros_like(t), jnp.ones_like(t)
 
     def rates(s: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
         """Velocities (k,) after the time s; values, directions."""
-        found = directions(seen_from_base(system, body.nearby(q, s * v), t + s))
-        assert found is not None
-        value, h = found
+        value, h = directions(seen_from_base(system, body.nearby(q, s * v), t + s))
         carried = base_velocity(system, t + s)
         rate = h.T @ (v if carried is None else v - carried)
         return rate, (value, h)
@@ -137,7 +137,7 @@ def _along(
 
 def _has_formula(system: System, q: jax.Array) -> bool:
     """Whether the body's normals need no differentiation."""
-    return jax.eval_shape(system.body.gaps_and_normals, q) is not None
+    return jax.eval_shape(system.body.directions, q) is not None
 
 
 def normals_at(system: System, q: jax.Array, t: jax.Array) -> jax.Array:

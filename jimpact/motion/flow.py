@@ -284,7 +284,7 @@ class MechanicalFlow(MotionFlow):
     ) -> list[jax.Array]:
         """Those of gaps first."""
         of_u = of_q if self.system.body.coordinates is None else h * jnp.abs(state.v)
-        normal = kinematics(self.system, state.q, state.v, state.t)
+        normal, _ = kinematics(self.system, state.q, state.v, state.t)
         of_gap = (
             jnp.abs(normal.value) + h * jnp.abs(normal.rate) + jnp.abs(normal.gradient).T @ of_u
         )

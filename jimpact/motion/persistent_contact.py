@@ -16,7 +16,6 @@ from jimpact.motion.dynamics import (
     base_velocity,
     free_acceleration,
     kinematics,
-    kinematics_with_tangents,
     mass_at,
     not_rounding,
     user_force,
@@ -150,11 +149,7 @@ def contacts_at(
 ) -> Contacts:
     """Contact space of the system at (q, v, t); in space with tangents `along` (m, 2)."""
     mass = mass_at(system, q)
-    normal, tangent = (
-        kinematics_with_tangents(system, q, v, t)
-        if friction
-        else (kinematics(system, q, v, t), None)
-    )
+    normal, tangent = kinematics(system, q, v, t, friction)
     directions, drift = normal.gradient, normal.drift
     if tangent is not None and along is not None:
         tangent = _turned(tangent, along)
