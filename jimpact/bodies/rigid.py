@@ -305,7 +305,8 @@ class RigidBodies(Body):
                 own = jnp.asarray(body)[:, None] == moving
                 speeds = sign * self.speeds(q, point, ways, body)[:, :, None]
                 rows = rows + jnp.where(own[:, None, :, None], speeds, 0.0)
-        return jnp.moveaxis(rows.reshape(*ways.shape[:2], -1), 2, 0)
+        rows = rows.reshape(*ways.shape[:2], self.count * velocities)
+        return jnp.moveaxis(rows, 2, 0)
 
     @full_precision
     def at(self, positions: Any, turns: Any = None) -> jax.Array:

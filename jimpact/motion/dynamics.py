@@ -104,14 +104,28 @@ def kinematics(
 
 def _differentiated(system: System, q: jax.Array, v: jax.Array, t: jax.Array) -> Kinematics:
     """That of the gaps by two derivatives."""
-    zero, one = jnp.zeros_like(t), jnp.ones_like(t)
+    here, along = _in_time(v, t)
 
-    def rates(s: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Gaps and gap velocities (m,) after the time s."""
-        return jax.jvp(lambda s: gaps(system, system.body.nearby(q, s * v), t + s), (s,), (one,))
+    def value_at(u: jax.Array, s: jax.Array) -> jax.Array:
+        """Gaps (m,) after the displacement u and the time s."""
+        return gaps(system, system.body.nearby(q, u), t + s)
 
-    (value, rate), (_, drift) = jax.jvp(rates, (zero,), (one,))
+    def rates(u: jax.Array, s: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Gaps and gap velocities (m,) there."""
+        return jax.jvp(value_at, (u, s), along)
+
+    (value, rate), (_, drift) = jax.jvp(rates, here, along)
     return Kinematics(value, rate, drift, normals_at(system, q, t))
+
+
+def _in_time(
+    v: jax.Array, t: jax.Array
+) -> tuple[tuple[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
+    """No displacement, no time; and how both grow.
+
+    Displacements that do not depend on v: at one q, several velocities share all but rates.
+    """
+    return (jnp.zeros_like(v), jnp.zeros_like(t)), (v, jnp.ones_like(t))
 
 
 def _along(
@@ -122,16 +136,16 @@ def _along(
     directions: Callable[[jax.Array], tuple[jax.Array, jax.Array]],
 ) -> Kinematics:
     """Velocities along the directions (n, k) that a function of q gives, with some values."""
-    body, zero, one = system.body, jnp.zeros_like(t), jnp.ones_like(t)
+    here, along = _in_time(v, t)
 
-    def rates(s: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-        """Velocities (k,) after the time s; values, directions."""
-        value, h = directions(seen_from_base(system, body.nearby(q, s * v), t + s))
+    def rates(u: jax.Array, s: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+        """Velocities (k,) after the displacement u and the time s; values, directions."""
+        value, h = directions(seen_from_base(system, system.body.nearby(q, u), t + s))
         carried = base_velocity(system, t + s)
         rate = h.T @ (v if carried is None else v - carried)
         return rate, (value, h)
 
-    rate, drift, (value, h) = jax.jvp(rates, (zero,), (one,), has_aux=True)
+    rate, drift, (value, h) = jax.jvp(rates, here, along, has_aux=True)
     return Kinematics(value, rate, drift, h)
 
 
