@@ -354,6 +354,11 @@ def _impulses_of(law: Law, returned: Any, contact: Contact) -> Impulses:
                 f"{name} must return `{part}` of shape ({size},), but returns one of shape "
                 f"{jnp.shape(value)}."
             )
+    if isinstance(impulses.status, int) and impulses.status not in CODE.values():
+        raise ValueError(
+            f"{name} must return `status` of a row of `ji.STATUS`, below {len(STATUS)}, but returns "
+            f"{impulses.status}."
+        )
     return impulses._replace(normal=jnp.asarray(impulses.normal))
 
 

@@ -84,6 +84,8 @@ class _KnownImpulses(Law):
 
 def outcome(law: LZB, scene: Scene, velocity: Any, solution: Solution) -> Impact:
     """Velocities, energy and full status (`impact`'s own checks included) of a solution."""
+    if law.friction is not None and solution.tangential is None:
+        raise ValueError("A contender with friction must return `tangential` impulses (t,).")
     code = jax.numpy.asarray(solution.code)
     known = _KnownImpulses(solution.impulse, solution.tangential, code, law.initial_energy)
     return impact(known, scene, velocity)

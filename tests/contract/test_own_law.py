@@ -84,6 +84,7 @@ def test_one_method_is_enough():
         (lambda p: None, TypeError, "returns NoneType"),
         (lambda p: ji.Impulses(p[0]), ValueError, r"`normal` of shape \(2,\), but .* \(\)"),
         (lambda p: ji.Impulses(p, p), ValueError, r"`tangential` of shape \(0,\)"),
+        (lambda p: ji.Impulses(p, status=99), ValueError, r"`status` of a row of `ji.STATUS`"),
     ],
 )
 def test_what_is_no_impulses_of_the_contacts_is_refused(returned, error, words):

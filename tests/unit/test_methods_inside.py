@@ -172,3 +172,13 @@ def test_a_contender_of_ones_own_has_a_name_of_its_own():
     mine = CONTENDERS["rk4"]._replace(divides=False)
     with pytest.raises(ValueError, match=r"`methods` must have contenders of new names.*'rk4'"):
         ji.stability_map([mine])
+
+
+def test_a_contender_with_friction_returns_tangential_impulses():
+    def without(law, scene, velocity, setting):
+        return CONTENDERS["verlet"].solve(law, scene, velocity, setting)._replace(tangential=None)
+
+    mine = CONTENDERS["verlet"]._replace(name="mine", solve=without, ladder=(0.1,))
+    law, options = ji.LZB(0.6, friction=0.1), {"laws": {}, "batch": 2, "gradients": False}
+    chart = ji.work_precision(DISC, SLIDES, law, [mine], **options)
+    assert "must return `tangential` impulses" in chart.left_out["mine"]
