@@ -356,8 +356,8 @@ def _impulses_of(law: Law, returned: Any, contact: Contact) -> Impulses:
             )
     if isinstance(impulses.status, int) and impulses.status not in CODE.values():
         raise ValueError(
-            f"{name} must return `status` of a row of `ji.STATUS`, below {len(STATUS)}, but returns "
-            f"{impulses.status}."
+            f"{name} must return `status` of a row of `ji.STATUS`, below {len(STATUS)}, but "
+            f"returns {impulses.status}."
         )
     return impulses._replace(normal=jnp.asarray(impulses.normal))
 
