@@ -23,6 +23,7 @@ x = limit until it expands, and what it takes up meanwhile is lost.
 """
 
 import dataclasses
+import enum
 import functools
 import math
 from typing import Any, NamedTuple, TypeVar
@@ -35,7 +36,16 @@ from jimpact.solvers.dense import COLUMNS_WRITTEN_OUT, times, unit
 from jimpact.solvers.sparse import Neighbours, neighbour_sum
 from jimpact.solvers.tridiagonal import tridiagonal_product
 
-OPEN, COMPRESSION, EXPANSION, SLACK, YIELD = 0, 1, 2, 3, 4
+
+class Phase(enum.IntEnum):
+    """What a contact does within a step."""
+
+    OPEN = 0
+    COMPRESSION = 1
+    EXPANSION = 2
+    SLACK = 3
+    YIELD = 4
+
 
 # The first two are in tolerances of velocity. Margins closer to 0 than SNAP are 0; ten times more
 # would move events by a tenth of the tolerance. An approach or a load below NEGLIGIBLE does nothing
@@ -303,15 +313,15 @@ class ContactFlow(Flow):
 
     def start(self, gamma: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Modes and state before the impact; a touching contact at rest starts in compression."""
-        phase = jnp.where((gamma <= 0) | (x > 0), COMPRESSION, OPEN)
-        phase = jnp.where(x < 0, OPEN, phase)
+        phase = jnp.where((gamma <= 0) | (x > 0), Phase.COMPRESSION, Phase.OPEN)
+        phase = jnp.where(x < 0, Phase.OPEN, phase)
         expands = (x > 0) & (gamma > 0)
         if not self.slackens:
-            phase = jnp.where(expands, EXPANSION, phase)
+            phase = jnp.where(expands, Phase.EXPANSION, phase)
         # loaded, separating and e = 0: it opens at once and returns nothing
-        spent = (phase == EXPANSION) & (self.restitution == 0)
-        phase, x = jnp.where(spent, OPEN, phase), jnp.where(spent, 0.0, x)
-        g = gamma / jnp.where(phase == EXPANSION, self.restitution, 1.0)
+        spent = (phase == Phase.EXPANSION) & (self.restitution == 0)
+        phase, x = jnp.where(spent, Phase.OPEN, phase), jnp.where(spent, 0.0, x)
+        g = gamma / jnp.where(phase == Phase.EXPANSION, self.restitution, 1.0)
         modes = jnp.concatenate([phase, jnp.zeros_like(phase)]).astype(jnp.int32)
         last = jnp.zeros_like(g[:1])
         watched = [last] if self.watches else []
@@ -319,7 +329,7 @@ class ContactFlow(Flow):
 
     def scales(self, modes: jax.Array) -> jax.Array:
         """s_j = gamma_j / g_j (m, B)."""
-        return jnp.where(modes[: self.contacts] == EXPANSION, self.restitution, 1.0)
+        return jnp.where(modes[: self.contacts] == Phase.EXPANSION, self.restitution, 1.0)
 
     # ---- the protocol
 
@@ -336,10 +346,10 @@ class ContactFlow(Flow):
             else jnp.take_along_axis(s, jnp.argmin(s, axis=0, keepdims=True), axis=0)
         )
         ratio = jnp.where(s > 0, least / jnp.where(s > 0, s, 1.0), 1.0)
-        moves = jnp.ones_like(phase, bool) if self.gapped else phase != OPEN
-        loaded = (phase == COMPRESSION) | (phase == EXPANSION)
+        moves = jnp.ones_like(phase, bool) if self.gapped else phase != Phase.OPEN
+        loaded = (phase == Phase.COMPRESSION) | (phase == Phase.EXPANSION)
         if self.limit is not None:
-            moves, loaded = moves & (phase != YIELD), loaded | (phase == YIELD)
+            moves, loaded = moves & (phase != Phase.YIELD), loaded | (phase == Phase.YIELD)
         closing = jnp.where(moves, -ratio * self.omega, 0.0)
         stiffness = (per_row(self.exponent, self.omega) + 1) / 2 * self.omega
         return Frozen(least, ratio, closing, jnp.where(loaded, stiffness, 0.0), s)
@@ -371,26 +381,27 @@ class ContactFlow(Flow):
         """By indentation (an opening, a gap that closes, the onset of a force), by velocity."""
         x, g, _ = self.rows(y)
         phase = modes[: self.contacts]
-        by_x = jnp.where(phase == EXPANSION, x, 1.0)
-        by_g = jnp.where(phase == COMPRESSION, -g, g)
+        by_x = jnp.where(phase == Phase.EXPANSION, x, 1.0)
+        by_g = jnp.where(phase == Phase.COMPRESSION, -g, g)
         if self.limit is not None:
-            by_x = jnp.where(phase == COMPRESSION, self.limit - x, by_x)
-            by_g = jnp.where(phase == YIELD, -g, by_g)
+            by_x = jnp.where(phase == Phase.COMPRESSION, self.limit - x, by_x)
+            by_g = jnp.where(phase == Phase.YIELD, -g, by_g)
         if not self.gapped:
             return jnp.concatenate(
-                [by_x, by_g + jnp.where(phase == OPEN, NEGLIGIBLE * self.tolerance, 0.0)]
+                [by_x, by_g + jnp.where(phase == Phase.OPEN, NEGLIGIBLE * self.tolerance, 0.0)]
             )
-        by_x = jnp.where(phase == OPEN, -x, by_x)
-        by_g = jnp.where(phase == OPEN, 1.0, by_g)
+        by_x = jnp.where(phase == Phase.OPEN, -x, by_x)
+        by_g = jnp.where(phase == Phase.OPEN, 1.0, by_g)
         if self.slackens:
             onset = self.viscous.onset(x, g)  # type: ignore[union-attr]
-            by_x = jnp.where(phase == COMPRESSION, onset, jnp.where(phase == SLACK, -onset, by_x))
-            by_g = jnp.where(phase == COMPRESSION, 1.0, jnp.where(phase == SLACK, x, by_g))
+            compressed, slack = phase == Phase.COMPRESSION, phase == Phase.SLACK
+            by_x = jnp.where(compressed, onset, jnp.where(slack, -onset, by_x))
+            by_g = jnp.where(compressed, 1.0, jnp.where(slack, x, by_g))
         return jnp.concatenate([by_x, by_g])
 
     def rooted(self, modes: jax.Array) -> jax.Array:
         """Openings: x falls to 0 like the square of the time left."""
-        opens = modes[: self.contacts] == EXPANSION
+        opens = modes[: self.contacts] == Phase.EXPANSION
         return jnp.concatenate([opens, jnp.zeros_like(opens)])
 
     def switch(
@@ -403,24 +414,24 @@ class ContactFlow(Flow):
         by_x, by_g = which[:m], which[m : 2 * m]
         if self.slackens:
             after = self._slackening(phase, by_x, by_g)
-            opened = by_g & (phase == SLACK)
-            closed = by_x & (phase == OPEN)
+            opened = by_g & (phase == Phase.SLACK)
+            closed = by_x & (phase == Phase.OPEN)
             x = jnp.where(opened | closed, 0.0, x)
         else:
-            opened = by_x & (phase == EXPANSION)
-            closed = (by_x | by_g) & (phase == OPEN)
+            opened = by_x & (phase == Phase.EXPANSION)
+            closed = (by_x | by_g) & (phase == Phase.OPEN)
             # what is left in it would do nothing more: it need not be unloaded
             idle = power(x, plus_one(self.exponent)) <= (NEGLIGIBLE * self.tolerance) ** 2
-            turned = by_g & (phase == COMPRESSION)
-            after = jnp.where(turned, jnp.where(idle, OPEN, EXPANSION), phase)
+            turned = by_g & (phase == Phase.COMPRESSION)
+            after = jnp.where(turned, jnp.where(idle, Phase.OPEN, Phase.EXPANSION), phase)
             if self.limit is not None:
-                yields = by_x & (phase == COMPRESSION) & ~turned
-                after, x = jnp.where(yields, YIELD, after), jnp.where(yields, self.limit, x)
-                after = jnp.where(by_g & (phase == YIELD), EXPANSION, after)
-            after = jnp.where(by_g & (phase == EXPANSION), COMPRESSION, after)
-            after = jnp.where(opened, OPEN, jnp.where(closed, COMPRESSION, after))
+                yields = by_x & (phase == Phase.COMPRESSION) & ~turned
+                after, x = jnp.where(yields, Phase.YIELD, after), jnp.where(yields, self.limit, x)
+                after = jnp.where(by_g & (phase == Phase.YIELD), Phase.EXPANSION, after)
+            after = jnp.where(by_g & (phase == Phase.EXPANSION), Phase.COMPRESSION, after)
+            after = jnp.where(opened, Phase.OPEN, jnp.where(closed, Phase.COMPRESSION, after))
             g = jnp.where(opened, self.restitution * g, g)
-            g = jnp.where(by_g & (phase != OPEN), 0.0, g)
+            g = jnp.where(by_g & (phase != Phase.OPEN), 0.0, g)
             x = jnp.where(opened | (turned & idle) | (closed & self.gapped), 0.0, x)
         count = count + closed.astype(count.dtype)
         modes = jnp.concatenate([after, count, modes[2 * m :]]).astype(modes.dtype)
@@ -428,9 +439,10 @@ class ContactFlow(Flow):
 
     def _slackening(self, phase: jax.Array, by_x: jax.Array, by_g: jax.Array) -> jax.Array:
         """Phases (m, B) after events where forces may vanish before the indentation."""
-        after = jnp.where(by_x & (phase == COMPRESSION), SLACK, phase)
-        after = jnp.where(by_x & ((phase == SLACK) | (phase == OPEN)), COMPRESSION, after)
-        return jnp.where(by_g & (phase == SLACK), OPEN, after)
+        after = jnp.where(by_x & (phase == Phase.COMPRESSION), Phase.SLACK, phase)
+        free = (phase == Phase.SLACK) | (phase == Phase.OPEN)
+        after = jnp.where(by_x & free, Phase.COMPRESSION, after)
+        return jnp.where(by_g & (phase == Phase.SLACK), Phase.OPEN, after)
 
     def begins(self, before: jax.Array, after: jax.Array) -> jax.Array:
         """Behind a gap x sets in like t; without gaps like t^2, and forces are smooth enough."""
@@ -444,7 +456,7 @@ class ContactFlow(Flow):
         if not self.gapped:
             return None
         phase = modes[: self.contacts]
-        return ~any_of((phase == COMPRESSION) | (phase == EXPANSION) | (phase == YIELD))
+        return ~any_of((phase != Phase.OPEN) & (phase != Phase.SLACK))
 
     # ---- results
 
@@ -512,7 +524,7 @@ class ContactFlow(Flow):
         energy = self.energy(x, g)
         works = ((x > 0) | (gamma < 0)) & (energy > tolerance**2)
         if self.viscous is not None:
-            loaded = (phase == COMPRESSION) | (phase == EXPANSION)
+            loaded = (phase == Phase.COMPRESSION) | (phase == Phase.EXPANSION)
             works = loaded & (x > 0) | (gamma < 0)
             works = works & ((x > tolerance) | (jnp.abs(g) > tolerance))
         rebound = self.restitution * jnp.sqrt(jnp.where(works, energy, 1.0))
@@ -538,7 +550,7 @@ class ContactFlow(Flow):
         _, gamma, rebound = self.at_work(modes, y, self.tolerance)
         if not self.closed_form:
             rebound = gamma
-        phase = jnp.full_like(modes[:m], OPEN)
+        phase = jnp.full_like(modes[:m], Phase.OPEN)
         return jnp.concatenate([phase, modes[m:]]), jnp.concatenate(
             [jnp.zeros_like(x), rebound, p + rebound - gamma, y[3 * m :]]
         )

@@ -25,13 +25,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact.events.contact_flow import (
-    COMPRESSION,
-    EXPANSION,
-    OPEN,
     SNAP,
     ContactFlow,
     ContactStates,
     Frozen,
+    Phase,
     as_pytree,
     plus_one,
     power,
@@ -117,7 +115,7 @@ class FrictionFlow(ContactFlow):
         modes, y = self.start(gamma, x)
         modes = jnp.concatenate([modes, jnp.sign(u).astype(jnp.int32)])
         y = jnp.concatenate([y[: 3 * m], u, jnp.zeros_like(u), y[3 * m :]])
-        closed = modes[:m] != OPEN
+        closed = modes[:m] != Phase.OPEN
         return self.decided(modes, y, jnp.zeros_like(closed), closed)
 
     # ---- the protocol
@@ -134,7 +132,7 @@ class FrictionFlow(ContactFlow):
     def loaded(self, modes: jax.Array) -> jax.Array:
         """Contacts (m, B) in compression or expansion."""
         phase = modes[: self.contacts]
-        return (phase == COMPRESSION) | (phase == EXPANSION)
+        return (phase == Phase.COMPRESSION) | (phase == Phase.EXPANSION)
 
     def constants(self, modes: jax.Array) -> Any:
         """Those of the normal flow, and which contacts stick or slide."""

@@ -25,7 +25,7 @@ from jimpact.events import stepper
 from jimpact.events.contact_flow import OFTEN, ContactFlow
 from jimpact.events.driver import until_over
 from jimpact.events.look_ahead import comes_to_rest
-from jimpact.events.stepper import GOES_ON, OVER, PAUSED, any_of, total
+from jimpact.events.stepper import Mark, any_of, total
 from jimpact.loops import cond, fori_loop, scan
 from jimpact.status import CODE
 from jimpact.tangents import dual_like, pushforward, value_of
@@ -74,7 +74,7 @@ class ImpactEnd(NamedTuple):
     @property
     def over(self) -> jax.Array:
         """Whether (1, B) the impact has ended, not given up."""
-        return self.carry.progress[2:3] == OVER
+        return self.carry.progress[2:3] == Mark.OVER
 
     @property
     def finishes(self) -> jax.Array:
@@ -125,11 +125,11 @@ def to_the_end(
         carry, accept = stepper.advance(flow, run.carry, most)
         if observe is not None:
             run = run._replace(seen=observe(run.seen, run.carry, accept))
-        paused = carry.progress[2:3] == PAUSED
+        paused = carry.progress[2:3] == Mark.PAUSED
         if not value_of(flow).self_similar:
             return run._replace(carry=carry)
         rest = _inspected(flow, gamma, carry, run.rest, paused, jnp.zeros_like(run.rest.contacts))
-        settled = jnp.where(rest.ended, OVER, GOES_ON)
+        settled = jnp.where(rest.ended, Mark.OVER, Mark.GOES_ON)
         mark = jnp.where(paused, settled, carry.progress[2:3])
         progress = carry.progress.at[2:3].set(jax.lax.stop_gradient(mark))
         return _Run(carry._replace(progress=progress), rest, run.seen)
@@ -145,7 +145,7 @@ def to_the_end(
 def _finished(flow: Any, gamma: jax.Array, run: _Run) -> ImpactEnd:
     """The end of a run; the flow finishes the state where it has ended by itself."""
     carry, rest, seen = run
-    over = (carry.progress[2:3] == OVER) & ~rest.ended
+    over = (carry.progress[2:3] == Mark.OVER) & ~rest.ended
     quiet = over & at_rest(*_values(flow, carry))
 
     def at_end(flow: ContactFlow, y: jax.Array) -> jax.Array:
@@ -206,7 +206,7 @@ def contacts_at_rest(
     count = modes[m : 2 * m]
     since = count - last.closings
     most, before = (jnp.max(x, axis=0, keepdims=True) for x in (count, last.closings))
-    paused = (carry.progress[2:3] == PAUSED) & (most > before) & (most >= OFTEN)
+    paused = (carry.progress[2:3] == Mark.PAUSED) & (most > before) & (most >= OFTEN)
     often = paused & (2 * since >= jnp.max(since, axis=0, keepdims=True)) & (count > 0)
     rest = quiet | often
     now = gamma + flow.change(state)

@@ -22,6 +22,7 @@ creeps with r = 0. Sticking forces are eliminated from the field once a step.
 """
 
 import dataclasses
+import enum
 from typing import Any, NamedTuple
 
 import jax
@@ -35,7 +36,14 @@ from jimpact.loops import cond
 from jimpact.solvers.dense import product, pseudoinverse, solve, times, unit
 from jimpact.solvers.friction import distribute
 
-STICKS, SLIPS, CREEPS = 0, 1, 2
+
+class Slip(enum.IntEnum):
+    """How a contact with friction moves along its plane, see above."""
+
+    STICKS = 0
+    SLIPS = 1
+    CREEPS = 2
+
 
 # Speeds in tolerances: slip below FLOOR has stopped; contacts below REST may stick when others
 # stop. Ten times more would lose a hundredth, a tenth of the tolerance.
@@ -183,7 +191,8 @@ class SlipFlow(FrictionFlow):
     def sliding(self, modes: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Which loaded contacts (m, B) stick, slip and creep."""
         slip, loaded = modes[2 * self.contacts :], self.loaded(modes)
-        return loaded & (slip == STICKS), loaded & (slip == SLIPS), loaded & (slip == CREEPS)
+        sticks, slips, creeps = (loaded & (slip == kind) for kind in Slip)
+        return sticks, slips, creeps
 
     def speed(self, modes: jax.Array, q: jax.Array) -> jax.Array:
         """r (m, B) of loaded contacts; 0 of those that stick."""
@@ -442,7 +451,7 @@ class SlipFlow(FrictionFlow):
         logarithm = jnp.log(jnp.where(grows, q[:, 0], 1.0))
         q = jnp.where(breaks[:, None], jnp.stack([jnp.zeros_like(away), away], 1), q)
         q = jnp.where(grows[:, None], jnp.stack([logarithm, q[:, 1]], 1), q)
-        slip = jnp.where(breaks, CREEPS, jnp.where(grows, SLIPS, slip))
+        slip = jnp.where(breaks, Slip.CREEPS, jnp.where(grows, Slip.SLIPS, slip))
         after, y = ContactFlow.switch(self, modes, y, which[: 2 * m])
         after = jnp.concatenate([after[: 2 * m], slip.astype(after.dtype)])
         remains = self.loaded(after)
@@ -455,13 +464,13 @@ class SlipFlow(FrictionFlow):
         """Which contacts stick, and where the others creep to, after slip has stopped or begun."""
         m = self.contacts
         q, slip, loaded = self.slip(y), modes[2 * m :], self.loaded(modes)
-        stick = loaded & (slip == STICKS) & ~closed
+        stick = loaded & (slip == Slip.STICKS) & ~closed
         r = jnp.where(closed, length(q), self.speed(modes, q))
         resting = loaded & (r <= REST * self.tolerance) & ~stick
         slips = closed & ~resting
         moving = jnp.where(slips[:, None], q, 1.0)
         q = jnp.where(slips[:, None], jnp.stack([jnp.log(length(moving)), angle_of(moving)], 1), q)
-        slip = jnp.where(slips, SLIPS, slip)
+        slip = jnp.where(slips, Slip.SLIPS, slip)
         check = any_of(stopped | (closed & resting))
         to_check = check & loaded & (stopped | resting | stick)
         still, state = jax.lax.stop_gradient((self, y))
@@ -476,5 +485,6 @@ class SlipFlow(FrictionFlow):
         towards = angle_of(pairs(towards))
         begins = jnp.stack([jnp.zeros_like(towards), jnp.where(inside, 0.0, towards)], 1)
         q = jnp.where(to_check[:, None], begins, q)
-        slip = jnp.where(to_check, jnp.where(inside, STICKS, CREEPS), slip).astype(modes.dtype)
+        checked = jnp.where(inside, Slip.STICKS, Slip.CREEPS)
+        slip = jnp.where(to_check, checked, slip).astype(modes.dtype)
         return jnp.concatenate([modes[: 2 * m], slip]), self.with_slip(y, q)

@@ -30,6 +30,7 @@ arrays, `Step.clock` and `StepperState.progress`.
 """
 
 import abc
+import enum
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -368,14 +369,24 @@ def _with_row(table: Any, new: list[Any], i: jax.Array) -> Any:
     return Dual(value, tangents)
 
 
-# State of an impact: it goes on, is over, or waits until the caller has inspected it.
-GOES_ON, OVER, PAUSED = 0.0, 1.0, 2.0
+class Mark(enum.IntEnum):
+    """State of an impact: it goes on, is over, or waits until the caller has inspected it."""
 
-# What the next step does about a margin, the most urgent first, and what its distance means. The
-# numbers leave a gap for distances from 0 to 1 between them: their sum is the order of urgency.
-SHORTEN = -2.0  # it dips, or cannot be landed on from here: at this part of the step
-LAND = 0.0  # it vanishes at this part of the step: repeat the step as a landing on it
-AHEAD = 1.0  # expected to vanish this many steps ahead: land on it if the next step reaches it
+    GOES_ON = 0
+    OVER = 1
+    PAUSED = 2
+
+
+class Intention(enum.IntEnum):
+    """What the next step does about a margin, the most urgent first, and what its distance means.
+
+    The numbers leave a gap for distances from 0 to 1 between them: their sum is the order of
+    urgency.
+    """
+
+    SHORTEN = -2  # it dips, or cannot be landed on from here: at this part of the step
+    LAND = 0  # it vanishes at this part of the step: repeat the step as a landing on it
+    AHEAD = 1  # expected to vanish this many steps ahead: land on it if the next step reaches it
 
 
 class StepperState(NamedTuple):
@@ -384,7 +395,7 @@ class StepperState(NamedTuple):
     y: Any  # (n, B), which may be `Dual`
     step: Step  # the one to try
     # (4, B): time it is expected to take; whether a landing already had to aim at another event;
-    # GOES_ON | OVER | PAUSED; number of passes
+    # `Mark`; number of passes
     progress: jax.Array
 
 
@@ -400,13 +411,13 @@ def begin(flow: Any, modes: jax.Array, start: Any) -> StepperState:
     targets = jax.eval_shape(lambda: flow.margins(flow.constants(modes), modes, y)).shape
     step = Step(modes, jnp.zeros(targets, bool), clock)
     over = flow.over(modes, y, 0 * one)
-    state = jnp.where(over, OVER, GOES_ON).astype(y.dtype)
+    state = jnp.where(over, Mark.OVER, Mark.GOES_ON).astype(y.dtype)
     return StepperState(start, step, jnp.concatenate([FIRST * one, 0 * one, state, 0 * one]))
 
 
 def goes_on(carry: StepperState, most: int) -> jax.Array:
     """Impacts (1, B) that are neither over nor given up nor paused."""
-    return (carry.progress[2:3] == GOES_ON) & (carry.progress[3:4] < most)
+    return (carry.progress[2:3] == Mark.GOES_ON) & (carry.progress[3:4] < most)
 
 
 def advance(flow: Flow, state: StepperState, most: int) -> tuple[StepperState, jax.Array]:
@@ -427,7 +438,7 @@ def advance(flow: Flow, state: StepperState, most: int) -> tuple[StepperState, j
     slopes = d0 * duration, d1 * duration
     urgent = _most_urgent(*_intentions(flow, s, aimed_twice, (c0, c1), slopes))
     active = goes_on(state, most)
-    accept = ok & (urgent.intention == AHEAD) & active
+    accept = ok & (urgent.intention == Intention.AHEAD) & active
     landed = accept & (lands > 0)
     events = s.target & landed  # one-hot
     # the field has no value, however short the step: given up, and the status reports it
@@ -443,10 +454,10 @@ def advance(flow: Flow, state: StepperState, most: int) -> tuple[StepperState, j
     step, next_duration = _next_step(flow, s, modes, urgent, accept, error2, duration)
     passes = passes + active.astype(y.dtype)
     pauses = flow.pauses(s.modes, modes, passes)
-    mark = mark if pauses is None else jnp.where(active & pauses, PAUSED, mark)
+    mark = mark if pauses is None else jnp.where(active & pauses, Mark.PAUSED, mark)
     over = flow.over(modes, value_of(end), passes) | broken
-    aimed_twice = (step.clock[3:4] > 0) & (lands > 0) & (urgent.intention < AHEAD)
-    mark = jnp.where(over, OVER, mark)
+    aimed_twice = (step.clock[3:4] > 0) & (lands > 0) & (urgent.intention < Intention.AHEAD)
+    mark = jnp.where(over, Mark.OVER, mark)
     progress = jnp.concatenate([next_duration, aimed_twice.astype(y.dtype), mark, passes])
     return StepperState(end, *jax.lax.stop_gradient((step, progress))), accept
 
@@ -497,8 +508,8 @@ def _intentions(
     ahead = free & ~turns & (d1 < 0) & (c1 > zero) & (discriminant > 0) & ~lands
     w = 2 * c1 / (jnp.sqrt(jnp.where(ahead, discriminant, 1.0)) - jnp.where(ahead, d1, 0.0))
     w = jnp.where(ahead, w, jnp.inf)
-    intention = jnp.where(dipped, SHORTEN, AHEAD)
-    intention = jnp.where(crossed, jnp.where(direct, LAND, SHORTEN), intention)
+    intention = jnp.where(dipped, Intention.SHORTEN, Intention.AHEAD)
+    intention = jnp.where(crossed, jnp.where(direct, Intention.LAND, Intention.SHORTEN), intention)
     u = jnp.where(crossed & direct & at_once, 0.0, u)
     return intention, jnp.where(crossed | dipped, u, w)
 
@@ -539,7 +550,8 @@ def _most_urgent(intention: jax.Array, distance: jax.Array) -> _Urgent:
     """The least intention and, of equal ones, the least distance; ties go by the row."""
     order = intention + distance + TIE * jnp.arange(len(distance), dtype=distance.dtype)[:, None]
     first = jnp.min(order, axis=0, keepdims=True)
-    chosen = jnp.where(first < LAND, SHORTEN, jnp.where(first <= AHEAD, LAND, AHEAD))
+    not_before = jnp.where(first <= Intention.AHEAD, Intention.LAND, Intention.AHEAD)
+    chosen = jnp.where(first < Intention.LAND, Intention.SHORTEN, not_before)
     return _Urgent(chosen, first - chosen, order == first)
 
 
@@ -557,11 +569,11 @@ def _next_step(
     `duration` is the time that `s` takes, `error2` its error in tolerances, squared.
     """
     start, length, in_root, lands = _rows(s.clock)
-    ok, event, lands = error2 <= 1, urgent.intention < AHEAD, lands > 0
+    ok, event, lands = error2 <= 1, urgent.intention < Intention.AHEAD, lands > 0
     in_root = (in_root > 0) & ~lands
     start = jnp.where(in_root, start + jnp.where(accept, length, 0.0), 0.0)
     shorter = _shorter_length(flow, s, in_root, urgent, ok, duration)
-    at_event = jnp.where(urgent.intention == SHORTEN, shorter, length)
+    at_event = jnp.where(urgent.intention == Intention.SHORTEN, shorter, length)
     after_landing = jnp.where(ok, length, shorter)
     proposed = jnp.where(lands, after_landing, _length_from_error(length, error2))
     proposed = jnp.where(ok & event, at_event, proposed)
@@ -572,7 +584,7 @@ def _next_step(
     # xi is the root of time: from `start` on a step takes this long
     expected = jnp.where(in_root, (start + proposed) ** 2 - start**2, proposed)
     reached = _reaches_event(flow, s.modes, urgent.distance, duration, expected)
-    aim = ok & jnp.where(event, urgent.intention == LAND, ~lands & reached)
+    aim = ok & jnp.where(event, urgent.intention == Intention.LAND, ~lands & reached)
     proposed = jnp.where(aim & in_root, expected, proposed)
     in_root = in_root & ~aim
     flags = [x.astype(length.dtype) for x in (in_root, aim)]
@@ -593,7 +605,7 @@ def _shorter_length(
 ) -> jax.Array:
     """The length (1, B) that ends before an event, or half of the time of a failed landing."""
     part = 1 - flow.near if flow.near else CUT
-    cut = jnp.where(ok & (urgent.intention == SHORTEN), part * urgent.distance, 0.5)
+    cut = jnp.where(ok & (urgent.intention == Intention.SHORTEN), part * urgent.distance, 0.5)
     length, lands = s.clock[1:2], s.clock[3:4] > 0
     # a landing is not in time: the shorter step is
     return jnp.where(in_root, jnp.sqrt(cut) * length, cut * jnp.where(lands, duration, length))

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jimpact.events.contact_flow import COMPRESSION, EXPANSION, OPEN
+from jimpact.events.contact_flow import Phase
 from jimpact.events.driver import until_over
 from jimpact.loops import any_lane
 from jimpact.motion.compliant_flow import (
@@ -124,9 +124,9 @@ def _begin(problem: MotionProblem, max_events: int) -> _CompliantRun:
     state = _start(problem)
     gamma, slip = _rates(problem, state)
     x = state.contact[0]
-    phase = jnp.where((x > 0) | ((x == 0) & (gamma <= 0)), COMPRESSION, OPEN)
+    phase = jnp.where((x > 0) | ((x == 0) & (gamma <= 0)), Phase.COMPRESSION, Phase.OPEN)
     if not force.slackens:
-        phase = jnp.where((x > 0) & (gamma > 0), EXPANSION, phase)
+        phase = jnp.where((x > 0) & (gamma > 0), Phase.EXPANSION, phase)
     phase, watched, fastest = phase.astype(jnp.int32), 2 * m, jnp.maximum(-gamma, 0.0)
     if mu is not None:
         phase = mode_rows(Phases(phase, no_modes(m, x.dtype)))
@@ -142,7 +142,7 @@ def _begin(problem: MotionProblem, max_events: int) -> _CompliantRun:
         empty_table(problem, state, max_events),
         jnp.int32(0),
         status_at_start(system, state, times[-1], jnp.inf),
-        jnp.all((phase[:m] == OPEN) & (gamma >= 0)),
+        jnp.all((phase[:m] == Phase.OPEN) & (gamma >= 0)),
     )
 
 
@@ -216,7 +216,8 @@ def _one_pass(max_events: int, problem: MotionProblem, run: _CompliantRun) -> _C
     rows = jnp.concatenate([ledger, settings.rtol * jnp.concatenate(sizes)])
     flown, _ = one_pass(flow, settings, rows, times, flight)
     before, after = flight.aim.modes[:m, 0], flown.aim.modes[:m, 0]
-    closed, opened = (before == OPEN) & (after != OPEN), (before != OPEN) & (after == OPEN)
+    was_open, is_open = before == Phase.OPEN, after == Phase.OPEN
+    closed, opened = was_open & ~is_open, ~was_open & is_open
     gamma, slip = _rates(problem, flown.state)
     fastest, none = jnp.maximum(-gamma, 0.0), jnp.zeros(m, bool)
     turned, stopped = none, none
@@ -247,7 +248,7 @@ def _one_pass(max_events: int, problem: MotionProblem, run: _CompliantRun) -> _C
         table,
         run.event_count + written.astype(jnp.int32),
         status.astype(jnp.int32),
-        jnp.all((after == OPEN) & (gamma >= 0)),
+        jnp.all((after == Phase.OPEN) & (gamma >= 0)),
     )
 
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jimpact.events.contact_flow import COMPRESSION, EXPANSION, OPEN, SLACK
+from jimpact.events.contact_flow import Phase
 from jimpact.events.stepper import any_of
 from jimpact.laws.forces import Force
 from jimpact.motion.dynamics import kinematics, user_force
@@ -156,17 +156,17 @@ class CompliantFlow(MotionFlow):
         gamma, depth = rate / self.scales.speed, x / self.scales.depth
         if self.force.slackens:
             onset = self.force.onset(x, -rate) / self.scales.force
-            by_x = jnp.where(const == COMPRESSION, onset, -onset)
-            by_g = jnp.where(const == SLACK, depth, 1.0)
+            by_x = jnp.where(const == Phase.COMPRESSION, onset, -onset)
+            by_g = jnp.where(const == Phase.SLACK, depth, 1.0)
         else:
-            by_x = jnp.where(const == EXPANSION, depth, 1.0)
-            by_g = jnp.where(const == COMPRESSION, -gamma, gamma)
-        by_x = jnp.where(const == OPEN, -depth, by_x)
-        return jnp.concatenate([by_x, jnp.where(const == OPEN, 1.0, by_g)])
+            by_x = jnp.where(const == Phase.EXPANSION, depth, 1.0)
+            by_g = jnp.where(const == Phase.COMPRESSION, -gamma, gamma)
+        by_x = jnp.where(const == Phase.OPEN, -depth, by_x)
+        return jnp.concatenate([by_x, jnp.where(const == Phase.OPEN, 1.0, by_g)])
 
     def rooted(self, modes: jax.Array) -> jax.Array:
         """Openings, by the root of the indentation."""
-        opens = self.constants(modes).phase[:, None] == EXPANSION
+        opens = self.constants(modes).phase[:, None] == Phase.EXPANSION
         rest = jnp.zeros((self.rounding.shape[0] - opens.shape[0], 1), bool)
         return jnp.concatenate([opens, rest])
 
@@ -177,19 +177,19 @@ class CompliantFlow(MotionFlow):
         at, (phase, side) = unpacked(self.like, y), self.constants(modes)
         m = len(phase)
         by_x, by_g = which[:m, 0], which[m : 2 * m, 0]
-        closed = by_x & (phase == OPEN)
+        closed = by_x & (phase == Phase.OPEN)
         if self.force.slackens:
-            after = jnp.where(by_x & (phase == COMPRESSION), SLACK, phase)
-            after = jnp.where(by_x & (phase == SLACK), COMPRESSION, after)
-            opened = by_g & (phase == SLACK)
+            after = jnp.where(by_x & (phase == Phase.COMPRESSION), Phase.SLACK, phase)
+            after = jnp.where(by_x & (phase == Phase.SLACK), Phase.COMPRESSION, after)
+            opened = by_g & (phase == Phase.SLACK)
         else:
-            turned = by_g & (phase == COMPRESSION)
-            after = jnp.where(turned, EXPANSION, phase)
-            after = jnp.where(by_g & (phase == EXPANSION), COMPRESSION, after)
-            opened = by_x & (phase == EXPANSION)
+            turned = by_g & (phase == Phase.COMPRESSION)
+            after = jnp.where(turned, Phase.EXPANSION, phase)
+            after = jnp.where(by_g & (phase == Phase.EXPANSION), Phase.COMPRESSION, after)
+            opened = by_x & (phase == Phase.EXPANSION)
             if self.force.bistiffness is not None:  # e = 0 returns nothing
                 opened = opened | (turned & (self.force.bistiffness.restitution == 0))
-        after = jnp.where(opened, OPEN, jnp.where(closed, COMPRESSION, after))
+        after = jnp.where(opened, Phase.OPEN, jnp.where(closed, Phase.COMPRESSION, after))
         x, impulses = at.contact[:1], at.contact[1:]
         indentation = jnp.where(opened | closed, 0.0, x)
         contact = jnp.concatenate([indentation, jnp.where(closed, 0.0, impulses)])
@@ -204,7 +204,8 @@ class CompliantFlow(MotionFlow):
     def begins(self, before: jax.Array, after: jax.Array) -> jax.Array:
         """Where a force sets in."""
         before, after = (self.constants(x).phase[:, None] for x in (before, after))
-        return any_of((after == COMPRESSION) & ((before == OPEN) | (before == SLACK)))
+        free = (before == Phase.OPEN) | (before == Phase.SLACK)
+        return any_of((after == Phase.COMPRESSION) & free)
 
     def projected(self, const: Phases, at: State) -> tuple[State, jax.Array]:
         """Slip of contacts that stick set to 0, in the metric of M; normals may turn."""
@@ -231,7 +232,7 @@ class CompliantFlow(MotionFlow):
 
 def loaded(phase: jax.Array) -> jax.Array:
     """Whether the force of a contact acts."""
-    return (phase == COMPRESSION) | (phase == EXPANSION)
+    return (phase == Phase.COMPRESSION) | (phase == Phase.EXPANSION)
 
 
 def normal_forces(force: Force, phase: jax.Array, contacts: Contacts, at: State) -> jax.Array:
@@ -308,4 +309,4 @@ def _unloading(force: Force, phase: jax.Array, rate: jax.Array) -> jax.Array:
     if force.bistiffness is None:
         return rate
     e = jnp.where(force.bistiffness.restitution > 0, force.bistiffness.restitution, 1.0)
-    return jnp.where(phase == EXPANSION, rate / e**2, rate)
+    return jnp.where(phase == Phase.EXPANSION, rate / e**2, rate)
