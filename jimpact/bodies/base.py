@@ -109,23 +109,25 @@ class Body(eqx.Module):
         """Displacements (m,) [m] along the contact planes at q; their rates are sliding speeds."""
         return None
 
-    def directions(self, q: jax.Array, tangents: bool = True) -> Directions | None:
-        """f, N and, where they are asked for, tangents at q by a formula; None: there is none."""
-        return None
+    def directions(self, q: jax.Array, tangents: bool = True) -> Directions:
+        """f, N and, if asked for, H_t at q; by differentiation, unless a body has formulas."""
+        normals, h = self._gradient(self.gap_function, q), None
+        if tangents and self.tangent_function(q) is not None:
+            h = self._gradient(self.tangent_function, q)
+        return Directions(self.gap_function(q), normals, h)
+
+    @property
+    def has_formulas(self) -> bool:
+        """Whether `directions` needs no differentiation."""
+        return type(self).directions is not Body.directions
 
     def normals(self, q: jax.Array) -> jax.Array:
         """N (n, m) at q: gap velocities are `N^T v`."""
-        known = self.directions(q, tangents=False)
-        return self._gradient(self.gap_function, q) if known is None else known.normals
+        return self.directions(q, tangents=False).normals
 
     def tangents(self, q: jax.Array) -> jax.Array | None:
         """H_t (n, m) at q, in space (n, 2 m), contact-major: `v_t = H_t^T v`; None: no friction."""
-        known = self.directions(q)
-        if known is not None:
-            return known.tangents
-        if self.tangent_function(q) is None:
-            return None
-        return self._gradient(self.tangent_function, q)
+        return self.directions(q).tangents
 
     def mass_matrix(self, q: jax.Array) -> jax.Array:
         """M(q) (n, n), or (n,) its diagonal."""
@@ -155,9 +157,7 @@ class Body(eqx.Module):
         return jax.vjp(lambda u: self.nearby(q, u), still)[1](gradient)[0]
 
     def _gradient(self, function: Callable[[jax.Array], Any], q: jax.Array) -> jax.Array:
-        """(n, k) of a function q -> (k,), in the displacements."""
-        if self.coordinates is None:
-            return jax.jacobian(function)(q).T
+        """(n, k) of a function q -> (k,), in the displacements; forward, as it may have loops."""
         still = jnp.zeros(self.mass_matrix(q).shape[:1], q.dtype)
         return jax.jacfwd(lambda u: function(self.nearby(q, u)))(still).T
 
@@ -307,9 +307,9 @@ Parts = tuple[jax.Array, jax.Array, jax.Array | None, jax.Array, jax.Array]
 
 def parts_at(body: Body, q: jax.Array) -> Parts:
     """What a scene at q needs; normals are NaN out of the range of the gap function."""
-    margin = body.valid(q)
-    normals = jnp.where(margin >= 0, body.normals(q), jnp.nan)
-    return body.mass_matrix(q), normals, body.tangents(q), body.gap_function(q), margin
+    margin, (gaps, normals, tangents) = body.valid(q), body.directions(q)
+    normals = jnp.where(margin >= 0, normals, jnp.nan)
+    return body.mass_matrix(q), normals, tangents, gaps, margin
 
 
 @quick_jit

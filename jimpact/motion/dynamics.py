@@ -82,14 +82,13 @@ def kinematics(
         assert h is not None
         return jnp.zeros_like(h[0]), h
 
-    if not _has_formula(system, q):
+    if not body.has_formulas:
         normal = _differentiated(system, q, v, t)
         return normal, _along(system, q, v, t, tangents) if friction else None
 
     def all_directions(at: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Gaps; normals, then tangents."""
         known = body.directions(at, friction)
-        assert known is not None
         each = [x for x in known[1:] if x is not None]
         return known.gaps, jnp.concatenate(each, axis=1)
 
@@ -115,7 +114,7 @@ def _differentiated(system: System, q: jax.Array, v: jax.Array, t: jax.Array) ->
         return jax.jvp(value_at, (u, s), along)
 
     (value, rate), (_, drift) = jax.jvp(rates, here, along)
-    return Kinematics(value, rate, drift, normals_at(system, q, t))
+    return Kinematics(value, rate, drift, system.body.normals(seen_from_base(system, q, t)))
 
 
 def _in_time(
@@ -147,19 +146,6 @@ def _along(
 
     rate, drift, (value, h) = jax.jvp(rates, here, along, has_aux=True)
     return Kinematics(value, rate, drift, h)
-
-
-def _has_formula(system: System, q: jax.Array) -> bool:
-    """Whether the body's normals need no differentiation."""
-    return jax.eval_shape(system.body.directions, q) is not None
-
-
-def normals_at(system: System, q: jax.Array, t: jax.Array) -> jax.Array:
-    """N (n, m); by forward differentiation, as gap functions may have loops."""
-    if _has_formula(system, q):
-        return system.body.normals(seen_from_base(system, q, t))
-    still = jnp.zeros(mass_at(system, q).shape[:1], q.dtype)
-    return jax.jacfwd(lambda u: gaps(system, system.body.nearby(q, u), t))(still).T
 
 
 def mass_at(system: System, q: jax.Array) -> jax.Array:

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from jimpact.bodies.closed_pairs import ActivePairs, block, over_blocks, with_block
-from jimpact.motion.dynamics import gaps, is_pile, mass_at, normals_at, seen_from_base
+from jimpact.motion.dynamics import is_pile, mass_at, seen_from_base
 from jimpact.motion.system import System
 from jimpact.solvers.dense import solve_mass_matrix
 
@@ -168,11 +168,10 @@ def contacts_of_step(
         pairs = pairs if friction else pairs._replace(directions=pairs.directions[:, :1])
         of_bodies = 1 / mass.reshape(-1, pairs.directions.shape[-1])
         return ActiveContacts(pairs, jnp.pad(of_bodies, ((0, 1), (0, 0))))
-    gap, normals = gaps(system, q, t), normals_at(system, q, t)
+    gap, normals, tangents = system.body.directions(at, friction)
     n, m = normals.shape
     directions = (normals + 0 * gap[None])[:, :, None]  # NaN where the gap is
     if friction:
-        tangents = system.body.tangents(at)
         assert tangents is not None
         directions = jnp.concatenate([directions, tangents.reshape(n, m, -1)], axis=2)
     least = jnp.minimum(gap, jnp.atleast_1d(system.body.gap_function(end)))

@@ -11,7 +11,6 @@ from jimpact.motion.dynamics import (
     carried_along,
     kinetic,
     mass_at,
-    normals_at,
     not_rounding,
     seen_from_base,
 )
@@ -72,9 +71,9 @@ def no_jump(state: State, m: int, sides: int) -> Jump:
 
 def scene_at(system: System, q: jax.Array, t: jax.Array, closed: jax.Array) -> Scene:
     """The scene that a law sees: normals and tangents at q; open contacts are out of reach."""
-    tangents = system.body.tangents(seen_from_base(system, q, t))
+    _, normals, tangents = system.body.directions(seen_from_base(system, q, t))
     away = jnp.where(closed, 0.0, jnp.inf).astype(q.dtype)
-    return Scene(mass_at(system, q), normals_at(system, q, t), tangents, away)
+    return Scene(mass_at(system, q), normals, tangents, away)
 
 
 def impact_jump(
