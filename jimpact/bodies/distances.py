@@ -8,7 +8,6 @@ import numpy as np
 
 from jimpact.bodies.base import dot, lengths
 from jimpact.bodies.rigid import ContactPoints
-from jimpact.compiling import full_precision
 
 # [m] More than rounding: it decides neither between parallel sides nor whether a point at the end
 # of a side is over it.
@@ -105,28 +104,33 @@ class Facing(NamedTuple):
     normal: jax.Array  # (g, 2) from the first one to the second one
 
 
-@full_precision
-@jax.vmap
+def _of_one(is_chosen: jax.Array, of_sides: jax.Array) -> jax.Array:
+    """What belongs (2, g, ..) to the chosen side (2, g, K) of each polygon, of (2, g, K, ..)."""
+    chosen = is_chosen.reshape(*is_chosen.shape, *[1] * (of_sides.ndim - 3))
+    return jnp.sum(jnp.where(chosen, of_sides, 0.0), axis=2)
+
+
 def facing_sides(a: jax.Array, b: jax.Array) -> Facing:
-    """Sides of two polygons that face each other, and the normal from a to b.
+    """Sides of pairs of polygons that face each other, and the normal from a to b.
 
     The line of one side keeps the polygons apart most. The other polygon's nearest corner to this
     line is an end of its side that is most opposite.
     """
     both = jnp.stack([a, b])
     _, normals = sides(both)
-    heights = dot(both[::-1, :, None] - both[:, None], normals[:, None])  # polygon, corner, side
-    beyond = _of_sides(jnp.min(heights, axis=1), normals)
-    (side_a, side_b), (n_a, n_b) = jnp.argmax(beyond, axis=1), normals
-    opposite = n_a @ n_b.T
-    by_b = jnp.max(beyond[1]) > jnp.max(beyond[0]) + PARALLEL
-    side_a = jnp.where(by_b, jnp.argmin(opposite[:, side_b]), side_a)
-    side_b = jnp.where(by_b, side_b, jnp.argmin(opposite[side_a]))
-    return Facing(side_a, side_b, jnp.where(by_b, -n_b[side_b], n_a[side_a]))
+    heights = dot(both[::-1, :, :, None] - both[:, :, None], normals[:, :, None])  # corner, side
+    beyond = _of_sides(jnp.min(heights, axis=2), normals)
+    own = jnp.argmax(beyond, axis=2)
+    n = _of_one(jax.nn.one_hot(own, a.shape[1], dtype=bool), normals)
+    other = jnp.argmin(dot(normals[::-1], n[:, :, None]), axis=2)
+    most = jnp.max(beyond, axis=2)
+    by_b = most[1] > most[0] + PARALLEL
+    first, second = jnp.where(by_b, other[1], own[0]), jnp.where(by_b, own[1], other[0])
+    return Facing(first, second, jnp.where(by_b[:, None], -n[1], n[0]))
 
 
 def polygon_on_polygon(
-    a: jax.Array, b: jax.Array, facing: Facing, swapped: jax.Array | None = None
+    a: jax.Array, b: jax.Array, facing: Facing, swapped: jax.Array
 ) -> ContactPoints:
     """Two contacts (g, 2) a pair, at the begin and at the end of the first body's side.
 
@@ -136,27 +140,20 @@ def polygon_on_polygon(
     """
     corners = jnp.stack([a, b])
     is_facing = jax.nn.one_hot(jnp.stack(facing[:2]), a.shape[1], dtype=bool)
-
-    def of_facing(points: jax.Array) -> jax.Array:
-        """That of the sides that face each other (2, g, 2) of points of all sides."""
-        return jnp.sum(jnp.where(is_facing[..., None], points, 0.0), axis=2)
-
-    begin, end = of_facing(corners), of_facing(jnp.roll(corners, -1, axis=2))
-    side = end - begin
-    # of each body its ends, in the order of those of the first one, from the other body's side
-    ends = jnp.stack([jnp.stack([begin[0], end[0]]), jnp.stack([end[1], begin[1]])])
-    lines = [x[::-1, None] for x in (begin, side, outward(side))]
-    gaps, points, normals = _from_side(ends, *lines)
+    ends = jnp.stack([corners, jnp.roll(corners, -1, axis=2)], axis=3)
+    ends = _of_one(is_facing, ends)  # body, pair, begin and end
+    begin, side = ends[:, :, 0], ends[:, :, 1] - ends[:, :, 0]
+    # of each body its ends, in the order of the contacts, from the other body's side
+    turned = jnp.stack([swapped, ~swapped])[:, :, None, None]
+    ends = jnp.where(turned, ends[:, :, ::-1], ends)
+    others = (x[::-1, :, None] for x in (begin, side, outward(side)))
+    gaps, points, normals = _from_side(ends, *others)
     first = (gaps[0] <= gaps[1])[..., None]
-    both = ContactPoints(
-        jnp.minimum(*gaps),
+    return ContactPoints(
+        jnp.minimum(gaps[0], gaps[1]),
         jnp.where(first, points[0], points[1]),
         jnp.where(first, normals[0], -normals[1]),
     )
-    if swapped is not None:
-        each = [swapped.reshape(-1, *[1] * (x.ndim - 2)) for x in both]
-        both = ContactPoints(*(jnp.where(swap, x[::-1], x) for swap, x in zip(each, both)))
-    return ContactPoints(*(jnp.swapaxes(x, 0, 1) for x in both))
 
 
 def changed_places(
@@ -210,7 +207,7 @@ def any_pair(a: jax.Array, b: jax.Array, r: jax.Array, s: jax.Array) -> ContactP
     a, b (g, K, 2) are corners, or the middle of a disc, r, s (g,) radii, 0 of polygons.
     """
     discs = round_on_round(a[:, 0], b[:, 0], r, s)
-    faces = polygon_on_polygon(a, b, facing_sides(a, b))
+    faces = polygon_on_polygon(a, b, facing_sides(a, b), jnp.zeros(len(a), bool))
     first = r[:, None] > 0
     disc = jnp.where(first, a[:, 0], b[:, 0])
     rolling = disc_on_polygon(disc, jnp.maximum(r, s), jnp.where(first[..., None], b, a))

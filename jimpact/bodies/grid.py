@@ -238,5 +238,5 @@ def _of_contacts(
         lowest = corners[row, corner] - bodies.rims[i][:, None] * n
         point = jnp.where(on_plane, lowest, point)
     ways = jnp.concatenate([n[:, None], tangents_of(n)], axis=1)
-    sides = bodies.speeds(q, point, ways, i), -bodies.speeds(q, point, ways, other)
+    sides = bodies.speeds(at[i], point, ways), -bodies.speeds(at[other], point, ways)
     return i, jnp.minimum(partner, bodies.count), jnp.stack(sides, axis=2)

@@ -232,13 +232,13 @@ class RigidBodies(Body):
     # ---- where points are and how they move
 
     def turns(self, at: jax.Array) -> jax.Array:
-        """R (b, d, d) of bodies at (b, ..)."""
+        """R (.., d, d) of bodies at (.., coordinates)."""
         if self.quaternions:
-            return rotation(at[:, 3:])
+            return rotation(at[..., 3:])
         if self.dimension == 3:
-            return jnp.broadcast_to(jnp.eye(3, dtype=at.dtype), (len(at), 3, 3))
-        c, s = jnp.cos(at[:, 2]), jnp.sin(at[:, 2])
-        return jnp.stack([jnp.stack([c, -s], axis=1), jnp.stack([s, c], axis=1)], axis=1)
+            return jnp.broadcast_to(jnp.eye(3, dtype=at.dtype), (*at.shape[:-1], 3, 3))
+        c, s = jnp.cos(at[..., 2]), jnp.sin(at[..., 2])
+        return jnp.stack([c, -s, s, c], axis=-1).reshape(*c.shape, 2, 2)
 
     def placed(self, q: jax.Array) -> Placed:
         """All bodies at q, in a `Bodies` the fixed ones last."""
@@ -283,30 +283,30 @@ class RigidBodies(Body):
         """Unit tangents (m, d - 1, d) of normals (m, d)."""
         return tangents_of(normal)
 
-    def speeds(self, q: jax.Array, point: jax.Array, ways: jax.Array, body: Any) -> jax.Array:
-        """(m, k, velocities of a body): of points (m, d) of these bodies along ways (m, k, d)."""
-        at = self.of_bodies(q)[body]
-        lever = (point - at[:, : self.dimension])[:, None]
+    def speeds(self, at: jax.Array, point: jax.Array, ways: jax.Array) -> jax.Array:
+        """(.., k, velocities of a body): of points (.., d) along ways (.., k, d).
+
+        Of bodies at (.., coordinates); leading axes of all three are broadcast.
+        """
+        lever = (point - at[..., : self.dimension])[..., None, :]
         if self.dimension == 2:
             around = (lever[..., 0] * ways[..., 1] - lever[..., 1] * ways[..., 0])[..., None]
         else:
             around = cross(lever, ways)
         if self.quaternions:  # omega is in the axes of the body
-            around = times(jnp.swapaxes(self.turns(at), 1, 2)[:, None], around)
-        return jnp.concatenate([ways, around], axis=2)
+            around = times(jnp.swapaxes(self.turns(at), -1, -2)[..., None, :, :], around)
+        along = jnp.broadcast_to(ways, (*around.shape[:-1], self.dimension))
+        return jnp.concatenate([along, around], axis=-1)
 
     def _of_all(self, q: jax.Array, point: jax.Array, ways: jax.Array) -> jax.Array:
         """(n, m, k): velocities along ways (m, k, d) of all bodies."""
-        velocities = self.dimension + self.angular
-        rows = jnp.zeros((*ways.shape[:2], self.count, velocities), q.dtype)
-        moving = np.arange(self.count, dtype=np.int32)[None]
-        for sign, body in zip((1.0, -1.0), self.pairs_in_contact().T):
-            if (body >= 0).any():  # a plane does not move
-                own = jnp.asarray(body)[:, None] == moving
-                speeds = sign * self.speeds(q, point, ways, body)[:, :, None]
-                rows = rows + jnp.where(own[:, None, :, None], speeds, 0.0)
-        rows = rows.reshape(*ways.shape[:2], self.count * velocities)
-        return jnp.moveaxis(rows, 2, 0)
+        i, j = self.pairs_in_contact().T[:, :, None]
+        moving = np.arange(self.count)
+        sign = ((i == moving).astype(q.dtype) - (j == moving))[:, :, None, None]
+        speeds = self.speeds(self.of_bodies(q)[None], point[:, None], ways[:, None])
+        rows = jnp.where(sign != 0, sign * speeds, 0.0)  # (m, bodies, k, velocities)
+        velocities = self.count * (self.dimension + self.angular)
+        return rows.transpose(1, 3, 0, 2).reshape(velocities, *ways.shape[:2])
 
     @full_precision
     def at(self, positions: Any, turns: Any = None) -> jax.Array:
