@@ -204,6 +204,12 @@ def check_kind(name: str, value: Any, kind: type) -> None:
         )
 
 
+def check_function(name: str, value: Any) -> None:
+    """Raise a TypeError unless `value` can be called."""
+    if not callable(value):
+        raise TypeError(f"Argument `{name}` must be a function, but is {short_repr(value)}.")
+
+
 def short_repr(value: Any) -> str:
     """The value as messages show it: its type where it takes more than 80 characters."""
     text = repr(value)

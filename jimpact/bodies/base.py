@@ -109,25 +109,25 @@ class Body(eqx.Module):
         """Displacements (m,) [m] along the contact planes at q; their rates are sliding speeds."""
         return None
 
-    def directions(self, q: jax.Array, tangents: bool = True) -> Directions:
-        """f, N and, if asked for, H_t at q; by differentiation, unless a body has formulas."""
-        normals, h = self._gradient(self.gap_function, q), None
-        if tangents and self.tangent_function(q) is not None:
-            h = self._gradient(self.tangent_function, q)
-        return Directions(self.gap_function(q), normals, h)
+    def normals(self, q: jax.Array) -> jax.Array:
+        """N (n, m) at q: gap velocities are `N^T v`."""
+        return self._gradient(self.gap_function, q)
+
+    def tangents(self, q: jax.Array) -> jax.Array | None:
+        """H_t (n, m) at q, in space (n, 2 m), contact-major: `v_t = H_t^T v`; None: no friction."""
+        if self.tangent_function(q) is None:
+            return None
+        return self._gradient(self.tangent_function, q)
+
+    def directions(self, q: jax.Array, with_tangents: bool = True) -> Directions:
+        """f, N and, `with_tangents`, H_t at q; a body with formulas finds them in one go."""
+        tangents = self.tangents(q) if with_tangents else None
+        return Directions(self.gap_function(q), self.normals(q), tangents)
 
     @property
     def has_formulas(self) -> bool:
         """Whether `directions` needs no differentiation."""
         return type(self).directions is not Body.directions
-
-    def normals(self, q: jax.Array) -> jax.Array:
-        """N (n, m) at q: gap velocities are `N^T v`."""
-        return self.directions(q, tangents=False).normals
-
-    def tangents(self, q: jax.Array) -> jax.Array | None:
-        """H_t (n, m) at q, in space (n, 2 m), contact-major: `v_t = H_t^T v`; None: no friction."""
-        return self.directions(q).tangents
 
     def mass_matrix(self, q: jax.Array) -> jax.Array:
         """M(q) (n, n), or (n,) its diagonal."""

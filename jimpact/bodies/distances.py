@@ -148,11 +148,12 @@ def polygon_on_polygon(
     ends = jnp.where(turned, ends[:, :, ::-1], ends)
     others = (x[::-1, :, None] for x in (begin, side, outward(side)))
     gaps, points, normals = _from_side(ends, *others)
-    first = (gaps[0] <= gaps[1])[..., None]
+    first = gaps[0] <= gaps[1]
+    of_first = first[..., None]
     return ContactPoints(
-        jnp.minimum(gaps[0], gaps[1]),
-        jnp.where(first, points[0], points[1]),
-        jnp.where(first, normals[0], -normals[1]),
+        jnp.where(first, gaps[0], gaps[1]),
+        jnp.where(of_first, points[0], points[1]),
+        jnp.where(of_first, normals[0], -normals[1]),
     )
 
 

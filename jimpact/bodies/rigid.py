@@ -169,7 +169,7 @@ class RigidBodies(Body):
     @property
     def mass(self) -> jax.Array:
         """M (n,), its diagonal, or (n, n)."""
-        places = jnp.repeat(self.masses[:, None], self.dimension, axis=1)
+        places = jnp.broadcast_to(self.masses[:, None], (self.count, self.dimension))
         if self.inertias.ndim == 2:
             return jnp.concatenate([places, self.inertias], axis=1).reshape(-1)
         each = zip(places, self.inertias)
@@ -258,7 +258,8 @@ class RigidBodies(Body):
     def on_planes(self, points: jax.Array) -> ContactPoints:
         """Contacts (w p,) of all contact points, of (b, P, d), with all planes."""
         (body, which), d = self.rows(), self.dimension
-        points, rim = points[body, which], self.rims[body]
+        row = body * points.shape[1] + which
+        points, rim = points.reshape(-1, d)[row], self.rims[body]
         n = jnp.broadcast_to(self.planes[:, None, :d], (len(self.planes), *points.shape))
         gap = jnp.sum(n * points[None], axis=2) - self.planes[:, d:] - rim[None]
         point = points[None] - rim[None, :, None] * n
@@ -270,11 +271,21 @@ class RigidBodies(Body):
         return self.contacts(q).gap
 
     @full_precision
-    def directions(self, q: jax.Array, tangents: bool = True) -> Directions:
-        """f, N and H_t: how fast body i comes away from body j, and slides along it."""
+    def normals(self, q: jax.Array) -> jax.Array:
+        """N (n, m): how fast body i comes away from body j."""
+        return self.directions(q, with_tangents=False).normals
+
+    @full_precision
+    def tangents(self, q: jax.Array) -> jax.Array | None:
+        """H_t (n, m), in space (n, 2 m): how fast body i slides along body j."""
+        return self.directions(q).tangents
+
+    @full_precision
+    def directions(self, q: jax.Array, with_tangents: bool = True) -> Directions:
+        """f, N and H_t."""
         gap, point, normal = self.contacts(q)
         ways = normal[:, None]
-        if not tangents:
+        if not with_tangents:
             return Directions(gap, self._of_all(q, point, ways)[..., 0], None)
         rows = self._of_all(q, point, jnp.concatenate([ways, self.ways(normal)], axis=1))
         return Directions(gap, rows[..., 0], rows[..., 1:].reshape(len(rows), -1))

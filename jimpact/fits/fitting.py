@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jimpact._checks import as_whole, check_choice, check_kind
+from jimpact._checks import as_whole, check_choice, check_kind, check_values
 from jimpact.files.records import listed
 from jimpact.fits.checks import Judged, fit_warnings, unusable
 from jimpact.fits.data import Experiments
@@ -122,6 +122,8 @@ def fit(
     >>> round(float(result.law.restitution), 4)
     0.4
     """
+    check_kind("search", search, Search)
+    check_values("limit", search.limit, low=0.0)
     method, seed = search.method, search.seed
     steps = step_limit(method, search.max_steps)
     if starts is not None:
@@ -138,7 +140,7 @@ def fit(
         problem = law
     else:
         problem = of_shots(law, scene, experiments, free, bounds, priors, ties)  # type: ignore[arg-type]
-    deadline = np.inf if search.limit is None else time.monotonic() + search.limit
+    deadline = np.inf if search.limit is None else time.monotonic() + float(search.limit)
     with progress_bar(search.progress) as show:
         solver = Solver(method, steps, show, deadline)
         found = find_minima(problem, starts, seed, solver)

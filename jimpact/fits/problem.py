@@ -15,7 +15,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_concrete, check_kind, check_values
+from jimpact._checks import (
+    as_float_array,
+    check_concrete,
+    check_function,
+    check_kind,
+    check_shape,
+    check_values,
+)
 from jimpact.compiling import full_precision
 from jimpact.fits.data import Experiments, kept_by_corrections
 from jimpact.fits.matrices import AdmissibleMatrices, matrix_region
@@ -219,12 +226,16 @@ class FitProblem:
         check_kind("law", law, Law)
         check_concrete("law", law)
         check_concrete("measured", measured)
+        check_function("observe", observe)
         post = np.asarray(as_float_array("measured", measured))
         check_values("measured", post, nan_allowed=True)
         if not np.isfinite(post).any():
             raise ValueError("Argument `measured` must have at least one value that is not NaN.")
         if sigma is not None:
-            sigma = np.where(np.isnan(post), 1.0, np.asarray(as_float_array("sigma", sigma)))
+            sigma = np.asarray(as_float_array("sigma", sigma))
+            if sigma.ndim:
+                check_shape("sigma", sigma, post.shape, "like `measured`, or a number")
+            sigma = np.where(np.isnan(post), 1.0, sigma)
             check_values("sigma", sigma, low=0.0, open_low=True)
         # a stiffness that the user names is one that the function sees
         own = isinstance(observe, eqx.Module)

@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jimpact._checks import as_float_array
+from jimpact._checks import as_float_array, check_function
 from jimpact.law import LARGEST_EXPONENT, Declared, StaticOrValues, Values, parameter
 from jimpact.loops import fori_loop
 
@@ -368,8 +368,7 @@ class UserForce(Force):
     parameters: Any
 
     def __init__(self, function: Callable[..., jax.Array], parameters: Any = None):
-        if not callable(function):
-            raise TypeError(f"Argument `function` must be callable, but has value {function!r}.")
+        check_function("function", function)
         self.function = function
         self.parameters = jax.tree.map(lambda leaf: as_float_array("parameters", leaf), parameters)
 

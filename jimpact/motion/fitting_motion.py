@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array
+from jimpact._checks import as_float_array, check_function
 from jimpact.fits.fitting import Fit, fit
 from jimpact.fits.observables import Prediction
 from jimpact.fits.problem import FitProblem
@@ -114,6 +114,8 @@ def fit_motion(
     >>> round(float(result.value[0]), 8)
     0.8
     """
+    if observe is not None:
+        check_function("observe", observe)
     record = np.asarray(measured, float)
     q0, v0 = as_float_array("q0", q0), as_float_array("v0", v0)
     for name, begin in (("q0", q0), ("v0", v0)):

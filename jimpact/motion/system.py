@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jimpact._checks import as_float_array, check_values, in_numbers
+from jimpact._checks import as_float_array, check_function, check_values, in_numbers
 from jimpact.bodies.base import STANDARD_GRAVITY, Body, LinearPotential, Potential
 from jimpact.bodies.functions import FunctionBody
 
@@ -88,8 +88,8 @@ class System(eqx.Module):
         friction: Any = None,
     ):
         for name, function in {"force": force, "potential": potential, "base": base}.items():
-            if not (callable(function) or function is None):
-                raise TypeError(f"Argument `{name}` must be a function, but is {function!r}.")
+            if function is not None:
+                check_function(name, function)
         if not isinstance(gap_function, Body):
             self.body = FunctionBody(gap_function, mass, tangent_function)
         elif mass is None and tangent_function is None:

@@ -12,6 +12,14 @@ V = [1.0, 0.0, 0.0]
 PAIR = ji.chain([1.0, 1.0])
 TRIANGLE = [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]
 PENTAGRAM = [[np.cos(a), np.sin(a)] for a in 0.8 * np.pi * np.arange(5)]
+
+
+def fit_of_a_ball(**options):
+    """A fit of three positions of a ball that bounces."""
+    ball = ji.System(ji.Column([1.0]), gravity=True)
+    return ji.fit_motion(ball, ji.Newton(0.8), np.ones((3, 1)), [1.0], [0.0], 0.3, **options)
+
+
 LAWS = [
     (lambda: ji.LZB(1.3), r"`restitution` must lie in \[0, 1\], but has value 1\.3"),
     (lambda: ji.LZB([0.5, -0.1]), r"`restitution`.*-0\.1 at index 1"),
@@ -337,6 +345,11 @@ SYSTEMS = [
         ),
         "must name parameters of Newton",
     ),
+    (lambda: fit_of_a_ball(sigma=np.full(3, 0.01)), r"`sigma` must have shape \(3, 1\)"),
+    (lambda: fit_of_a_ball(observe="q"), "`observe` must be a function, but is 'q'"),
+    (lambda: fit_of_a_ball(search="adam"), "`search` must be of type Search, but is 'adam'"),
+    (lambda: fit_of_a_ball(search=ji.Search(limit=-1)), r"`limit` must lie in \[0, inf\)"),
+    (lambda: fit_of_a_ball(search=ji.Search(limit=np.nan)), "`limit`.*nan"),
 ]
 
 
