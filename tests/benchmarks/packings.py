@@ -117,7 +117,7 @@ def impact_of(name, count):
         "compliant": ji.Compliant(force, method="implicit", rtol=COARSE),
     }[name]
     at, radii = packing(count)
-    spheres = ji.Bodies([ji.Sphere(r) for r in radii], (), room=7)  # what many have by themselves
+    spheres = ji.Bodies([ji.Sphere(r) for r in radii], (), room=7 * count)  # as many have
     scene = spheres.closed_scene(spheres.at(at))
     v = np.zeros(6 * count)
     v[-4] = -1.0
