@@ -177,12 +177,13 @@ def solve(
         complementary,
     )
     fixed = _FrictionProblem(*jax.lax.stop_gradient(problem[:4]), complementary)
-    modes, x, status = (_enumerate if m <= ENUMERATED else _search)(fixed)
-    modes, inverted = _most_at_rest(fixed, modes, x)
+    modes, decided, status = (_enumerate if m <= ENUMERATED else _search)(fixed)
+    modes, inverted = _most_at_rest(fixed, modes, decided)
     free, code = _freedom(fixed, inverted)
     status = jnp.maximum(status, code)
-    x = _on_modes(problem, modes, inverted, x)
-    wrong = ~(_misfit(fixed, jax.lax.stop_gradient(x)[..., None])[0] <= fixed.tolerance)
+    x = _on_modes(problem, modes, inverted, decided)
+    missed = _misfit(fixed, jax.lax.stop_gradient(x)[..., None], _size(decided[..., None]))[0]
+    wrong = ~(missed <= fixed.tolerance)
     status = jnp.where(wrong & (status < CODE["infeasible"]), CODE["max_steps"], status)
     x = x.at[:, 1:].add(drag * x[:, :1]) * scale * size
     p = jnp.where(x[:, 0] < 0, 0.0, x[:, 0]) if complementary else x[:, 0]  # rounding
@@ -234,13 +235,17 @@ def _size(x: jax.Array) -> jax.Array:
     return 1 + jnp.abs(x).max(axis=(0, 1))
 
 
-def _misfit(problem: _FrictionProblem, x: jax.Array) -> jax.Array:
-    """How far x (m, b, N) is from what the law makes of it (N,), in parts of its size."""
+def _misfit(problem: _FrictionProblem, x: jax.Array, size: jax.Array | None = None) -> jax.Array:
+    """How far x (m, b, N) is from what the law makes of it (N,), in parts of its size.
+
+    Or of another size (N,): impulses that follow from x must not hide their errors by growing.
+    """
     rate = _rates(problem, x)
     p, r, side = x[:, 0], rate[:, 0], x[:, 1:]
     normal = jnp.minimum(p, r) if problem.complementary else r
     wrong = side - in_disc(side - rate[:, 1:], _bound(problem, x))
-    return jnp.maximum(jnp.abs(normal).max(axis=0), jnp.abs(wrong).max(axis=(0, 1))) / _size(x)
+    most = jnp.maximum(jnp.abs(normal).max(axis=0), jnp.abs(wrong).max(axis=(0, 1)))
+    return most / (_size(x) if size is None else size)
 
 
 def _equations(problem: _FrictionProblem, modes: _Modes) -> tuple[jax.Array, jax.Array]:
@@ -440,7 +445,8 @@ def _most_at_rest(
     inverted = inverted._replace(held=jnp.array([False, True]))
     first = jax.tree.map(lambda leaf: leaf[0], inverted)
     shared = _on_modes(problem, rest, first, x)
-    allowed = _misfit(problem, shared[..., None])[0] <= problem.tolerance
+    missed = _misfit(problem, shared[..., None], _size(x[..., None]))[0]
+    allowed = missed <= problem.tolerance
     return jax.tree.map(lambda leaf: jnp.where(allowed, *leaf), (both, inverted))
 
 

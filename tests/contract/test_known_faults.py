@@ -310,3 +310,27 @@ def test_a_fit_of_four_balls_and_a_wall_reaches_its_minimum():
     # MINPACK with this stiffness fixed at 3.84 is 3.6226 above the least: 3.8415 lies beyond
     ((_, high),) = ji.profile(fit, "stiffness[4]")[0].intervals
     assert high == pytest.approx(3.867, abs=5e-3)
+
+
+def test_impulses_that_wedge_do_not_hide_their_errors():
+    """Three bodies in the plane, five contacts, mu = 5: least impulses once grew to 1e11 N s."""
+    mass = [1.94, 1.94, 0.4, 0.76, 0.76, 0.27, 1.9, 1.9, 0.52]
+    normals = [
+        [-0.62, 0, -1, 1, -0.59], [-0.78, 0, -0.01, 0.06, 0.81], [0.26, 0, 0.15, -0.49, -0.27],
+        [0, 0.4, 0, 0, 0.59], [0, -0.92, 0, 0, -0.81], [0, 0.15, 0, 0, -0.27],
+        [0.62, -0.4, 1, -1, 0], [0.78, 0.92, 0.01, -0.06, 0], [0.2, 0.06, -0.11, -0.39, 0],
+    ]  # fmt: skip
+    tangents = [
+        [-0.78, 0, -0.01, 0.06, 0.81], [0.62, 0, 1, -1, 0.59], [0.13, 0, 0.09, 0.14, 0.09],
+        [0, -0.92, 0, 0, -0.81], [0, -0.4, 0, 0, -0.59], [0, -0.38, 0, 0, -0.35],
+        [0.78, 0.92, 0.01, -0.06, 0], [-0.62, 0.4, -1, 1, 0], [-0.34, 0.2, 0.42, -0.34, 0],
+    ]  # fmt: skip
+    scene = ji.Scene(mass, np.array(normals), tangents=np.array(tangents))
+    v = [-0.94, -0.66, -0.41, 0.77, -0.79, 0.89, -0.26, -0.36, 1.29]
+    out = ji.impact(ji.Moreau(0.0, friction=5.0), scene, v)
+    assert ji.STATUS[int(out.status)].name == "impulse_not_unique"
+    assert float(out.impulse.max()) < 10
+    stick, rates = np.array([0, 2, 3]), np.array(normals).T @ out.velocity
+    np.testing.assert_allclose(rates[stick], 0, atol=1e-12)
+    np.testing.assert_allclose((np.array(tangents).T @ out.velocity)[stick], 0, atol=1e-12)
+    assert (rates[[1, 4]] > 0.5).all()
