@@ -333,4 +333,4 @@ def test_impulses_that_wedge_do_not_hide_their_errors():
     stick, rates = np.array([0, 2, 3]), np.array(normals).T @ out.velocity
     np.testing.assert_allclose(rates[stick], 0, atol=1e-12)
     np.testing.assert_allclose((np.array(tangents).T @ out.velocity)[stick], 0, atol=1e-12)
-    assert (rates[[1, 4]] > 0.5).all()
+    assert (rates[np.array([1, 4])] > 0.5).all()
