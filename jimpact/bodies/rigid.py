@@ -311,9 +311,10 @@ class RigidBodies(Body):
 
     def _of_all(self, q: jax.Array, point: jax.Array, ways: jax.Array) -> jax.Array:
         """(n, m, k): velocities along ways (m, k, d) of all bodies."""
-        i, j = self.pairs_in_contact().T[:, :, None]
-        moving = np.arange(self.count)
-        sign = ((i == moving).astype(q.dtype) - (j == moving))[:, :, None, None]
+        # by JAX: of thousands of bodies only the shapes are asked for
+        body = jnp.asarray(self.pairs_in_contact())[:, :, None]
+        own = (body == jnp.arange(self.count)[None, None]).astype(q.dtype)
+        sign = (own[:, 0] - own[:, 1])[:, :, None, None]
         speeds = self.speeds(self.of_bodies(q)[None], point[:, None], ways[:, None])
         rows = jnp.where(sign != 0, sign * speeds, 0.0)  # (m, bodies, k, velocities)
         velocities = self.count * (self.dimension + self.angular)
