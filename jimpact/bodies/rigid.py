@@ -313,7 +313,8 @@ class RigidBodies(Body):
         """(n, m, k): velocities along ways (m, k, d) of all bodies."""
         # by JAX: of thousands of bodies only the shapes are asked for
         body = jnp.asarray(self.pairs_in_contact())[:, :, None]
-        own = (body == jnp.arange(self.count)[None, None]).astype(q.dtype)
+        moving = jnp.arange(self.count, dtype=body.dtype)[None, None]
+        own = (body == moving).astype(q.dtype)
         sign = (own[:, 0] - own[:, 1])[:, :, None, None]
         speeds = self.speeds(self.of_bodies(q)[None], point[:, None], ways[:, None])
         rows = jnp.where(sign != 0, sign * speeds, 0.0)  # (m, bodies, k, velocities)
