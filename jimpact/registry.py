@@ -4,7 +4,7 @@ import inspect
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
-from jimpact._checks import check_choice, check_kind
+from jimpact._checks import check_choice, check_kind, check_word
 from jimpact.law import Law, options_of
 
 EVERY_PROPERTY = frozenset(
@@ -166,7 +166,7 @@ def registered_laws(
 ) -> tuple[dict[str, Law], dict[str, str]]:
     """Laws of these names, from parameters by name; and why others are left out.
 
-    `names`: in the registry, in their order; None: all.
+    `names`: in the registry, in their order; None: all. A parameter that no law has is refused.
 
     >>> import jimpact as ji
     >>> from jimpact.registry import registered_laws
@@ -175,6 +175,9 @@ def registered_laws(
     >>> laws["newton"], left_out["restitution_matrix"]
     (Newton(restitution=0.9, friction=None, tangential_restitution=None), 'needs `matrix`')
     """
+    taken = sorted({key for row in REGISTRY.values() for key in row.arguments})
+    for key in values:
+        check_word("A parameter of laws", key, taken)
     laws, left_out = {}, {}
     for name in REGISTRY if names is None else names:
         row = REGISTRY[name]

@@ -25,6 +25,7 @@ import numpy as np
 from jimpact._checks import (
     as_float_array,
     check_choice,
+    check_kind,
     check_shape,
     check_values,
     in_numbers,
@@ -356,6 +357,7 @@ def pad_scene(scene: Scene, contacts: int) -> PaddedScene:
 
 def as_velocity(scene: Scene, velocity: Any, finite: bool = False) -> jax.Array:
     """`velocity` as an array; raise a ValueError unless it has one (finite) entry a coordinate."""
+    check_kind("scene", scene, Scene)
     v = as_float_array("velocity", velocity)
     check_shape("velocity", v, (scene.size,), "one per coordinate of the scene")
     if finite:

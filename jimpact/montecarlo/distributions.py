@@ -157,6 +157,11 @@ class RandomLaw(eqx.Module):
     def __init__(self, law: Law, **parameters: Distribution):
         """Check that the law has such parameters, and that they stay in their domains."""
         known = free_parameters_of(law)
+        if not parameters:
+            raise ValueError(
+                "Argument `parameters` must name one that is random or more, of "
+                f"{', '.join(known)}."
+            )
         for name, distribution in parameters.items():
             if name not in known:
                 raise ValueError(
@@ -193,6 +198,8 @@ def as_source(name: str, value: Any, size: int, non_negative: bool) -> Any:
         return value
     if callable(value):
         drawn = value(jax.random.key(0, impl="threefry2x32"))
+        if not eqx.is_array(drawn):
+            raise TypeError(f"Argument `{name}` must give an array for a key, but gives {drawn!r}.")
         check_shape(f"{name}(key)", drawn, (size,), "one draw")
         return value
     array = as_float_array(name, value)

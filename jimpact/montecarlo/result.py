@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jimpact._checks import check_values
+from jimpact._checks import as_float_array, check_values
 from jimpact.files.records import Column, Table, Tabular, as_data, fields_as_data
 from jimpact.law import Law
 from jimpact.montecarlo.samples import Run
@@ -104,6 +104,7 @@ class MonteCarlo(Tabular):
 
     def quantile(self, q: Any) -> np.ndarray:
         """Quantiles (..., n) [m/s] of the velocities after, from the histograms; q in [0, 1]."""
+        q = np.asarray(as_float_array("q", q))
         check_values("q", q, low=0.0, high=1.0)
         ends = self.edges[:, [0, -1]]
         return binned_quantiles(q, ends, self.counts, self.minimum, self.maximum)

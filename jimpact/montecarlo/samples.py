@@ -251,7 +251,7 @@ def planned_run(
 def _checked_sources(sources: Sources, scene: Scene) -> Sources:
     """Checked sources, all floating-point values in the widest type among them."""
     law, gaps = sources.law, sources.gaps
-    if not isinstance(law, Law) and not callable(law):
+    if isinstance(law, type) or not (isinstance(law, Law) or callable(law)):
         raise TypeError(f"Argument `law` must be a Law or a function key -> Law, but is {law!r}.")
     velocity = as_source("velocity", sources.velocity, scene.size, non_negative=False)
     if gaps is not None:
@@ -283,6 +283,8 @@ def _named(source: Any) -> str:
 def _key(key: Any) -> tuple[np.ndarray, str]:
     """Raw data and kind of a key; an integer is a seed."""
     if not isinstance(key, bool) and isinstance(key, int | np.integer):
+        if not -(2**63) <= key < 2**63:
+            raise ValueError(f"Argument `key` must have at most 64 bits, but is {key}.")
         key = jax.random.key(int(key), impl="threefry2x32")
     elif isinstance(key, np.ndarray | jax.Array) and key.dtype == np.uint32 and key.shape == (2,):
         key = jax.random.wrap_key_data(jnp.asarray(key), impl="threefry2x32")

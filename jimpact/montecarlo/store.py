@@ -97,6 +97,8 @@ class Store:
 
     def __init__(self, folder: str | Path, identity: dict[str, str]):
         """Open the folder of the run that has this identity, or begin it."""
+        if not isinstance(folder, str | Path):
+            raise TypeError(f"Argument `folder` must be a path, but is {folder!r}.")
         self.folder, self.run = Path(folder), _run(identity)
         self.folder.mkdir(parents=True, exist_ok=True)
         manifest = self.folder / MANIFEST

@@ -271,7 +271,9 @@ def _equations(problem: _FrictionProblem, modes: _Modes) -> tuple[jax.Array, jax
         modes.direction * problem.friction[:, None, None], ((0, 0), (1, 0), (0, 0))
     )
     pressed = friction_direction[:, :, None, None] * own * first
-    moved = jnp.sum(q[:, :, :, None, None] * (problem.matrix - unit)[:, None, ..., None], axis=2)
+    # term by term: in single precision XLA may crash on sums within batches of so many axes
+    apart = (problem.matrix - unit)[..., None]
+    moved = sum(q[:, :, k, None, None] * apart[:, None, k] for k in range(1 + rows))
     right = -jnp.sum(q * problem.rate[:, None, :, None], axis=2)
     if problem.load is not None:
         right = right - friction_direction * problem.load[:, None, None]

@@ -14,6 +14,13 @@ TRIANGLE = [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]
 PENTAGRAM = [[np.cos(a), np.sin(a)] for a in 0.8 * np.pi * np.arange(5)]
 
 
+def samples(**options):
+    """A Monte Carlo run of few samples."""
+    given = {"law": ji.Binary(0.9, "earliest"), "scene": BALLS, "velocity": V}
+    gaps = ji.Uniform(0.0, 1e-5)
+    return ji.monte_carlo(**(given | {"gaps": gaps, "samples": 4, "progress": False} | options))
+
+
 def fit_of_a_ball(**options):
     """A fit of three positions of a ball that bounces."""
     ball = ji.System(ji.Column([1.0]), gravity=True)
@@ -345,6 +352,14 @@ SYSTEMS = [
         ),
         "must name parameters of Newton",
     ),
+    (lambda: ji.compare(BALLS, V, restitutoin=0.5), "'restitutoin'. Did you mean restitution"),
+    (lambda: ji.compare([1.0, 1.0], V), "`scene` must be of type Scene, but is"),
+    (lambda: samples(velocity=lambda key: [1.0, 0.0, 0.0]), "`velocity` must give an array"),
+    (lambda: samples(law=ji.Binary), "`law` must be a Law or a function"),
+    (lambda: samples(key=2**70), "`key` must have at most 64 bits"),
+    (lambda: samples(folder=3), "`folder` must be a path, but is 3"),
+    (lambda: samples().quantile(None), "`q` must be numeric"),
+    (lambda: ji.RandomLaw(ji.Binary(0.9)), "`parameters` must name one that is random"),
     (lambda: fit_of_a_ball(sigma=np.full(3, 0.01)), r"`sigma` must have shape \(3, 1\)"),
     (lambda: fit_of_a_ball(observe="q"), "`observe` must be a function, but is 'q'"),
     (lambda: fit_of_a_ball(search="adam"), "`search` must be of type Search, but is 'adam'"),

@@ -1,5 +1,7 @@
 """Inputs that gave a wrong answer, with the right one. Each stands for its kind."""
 
+import subprocess
+import sys
 import warnings
 
 import equinox as eqx
@@ -334,3 +336,22 @@ def test_impulses_that_wedge_do_not_hide_their_errors():
     np.testing.assert_allclose(rates[stick], 0, atol=1e-12)
     np.testing.assert_allclose((np.array(tangents).T @ out.velocity)[stick], 0, atol=1e-12)
     assert (rates[np.array([1, 4])] > 0.5).all()
+
+
+def test_friction_of_many_contacts_in_single_precision_batches():
+    """Sums over batches of six axes and more crashed the process, in single precision only."""
+    script = """
+import jax, numpy as np, jimpact as ji
+bodies = ji.Bodies([ji.Block(1.0, 1.0), ji.Block(1.0, 1.0)])
+scene = bodies.scene([0.0, 0.5, 0.0, 0.1, 1.5, 0.0])
+v = np.random.default_rng(0).normal(size=(64, 6)).astype(np.float32)
+law = ji.Moreau(0.3, friction=0.4)
+one = lambda v: ji.impact(law, scene, v).velocity
+after = jax.vmap(one)(v)
+print(after.dtype, float(abs(after[:8] - np.stack([one(x) for x in v[:8]])).max()))
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-500:]
+    dtype, apart = done.stdout.split()
+    assert dtype == "float32"
+    assert float(apart) < 1e-4
