@@ -338,6 +338,7 @@ def test_impulses_that_wedge_do_not_hide_their_errors():
     assert (rates[np.array([1, 4])] > 0.5).all()
 
 
+@pytest.mark.slow
 def test_friction_of_many_contacts_in_single_precision_batches():
     """Sums over batches of six axes and more crashed the process, in single precision only."""
     script = """
