@@ -101,7 +101,9 @@ class Scales(NamedTuple):
     """Largest values of the motion so far."""
 
     gap_velocity: jax.Array
-    speed: jax.Array  # gap velocity that all kinetic energy could give a contact
+    # gap velocity that all kinetic energy could give a contact; at least what bodies at rest gain
+    # while a closed gap opens
+    speed: jax.Array
     acceleration: jax.Array
 
 
@@ -265,7 +267,6 @@ class MechanicalFlow(MotionFlow):
 
     scales: Scales
     below: jax.Array  # (m,) gaps that the step begins with, 0 where they are positive
-    slowest: jax.Array  # () [m/s] what bodies at rest gain while a closed gap opens
 
     near = 0.01  # steps in time are exact for parabolas: only the last of a landing is not in time
 
@@ -327,10 +328,10 @@ class MechanicalFlow(MotionFlow):
         contacts = self.contacts(at)
         value, rate = contacts.normal.value, contacts.normal.rate
         most = max(not_rounding(JUMP, rate.dtype), MORE_THAN_STEPS * self.rtol)
-        # a motion that began at rest has no speed before this step, one that rests none after it
+        # a motion that began at rest had no speed before this step
         energy, w = kinetic(self.system, at.q, at.v), jnp.diagonal(contacts.delassus)
         speed = jnp.maximum(self.scales.speed, speed_of(energy, w[: len(rate)]))
-        jumps = const.active & (jnp.abs(rate) > most * jnp.maximum(speed, self.slowest))
+        jumps = const.active & (jnp.abs(rate) > most * speed)
         if contacts.tangent is not None:  # tangentially only velocities drift
             value = jnp.concatenate([value, jnp.zeros_like(contacts.tangent.rate)])
             rate = jnp.concatenate([rate, contacts.tangent.rate])
@@ -586,8 +587,7 @@ def flow_of(
     if mu is not None and settings.spatial:
         contacts = contacts_at(system, state.q, state.v, state.t, True)
         axes = slip_axes(contacts, mu, modes, scales.speed)
-    slowest = jax.lax.stop_gradient(jnp.sqrt(scales.acceleration * settings.closed_below))
     return MechanicalFlow(
         *(system, rounded, state.t, settings.rtol, blank, state, longest, mu, axes),
-        *(scales, below, slowest),
+        *(scales, below),
     )

@@ -467,11 +467,10 @@ def _grown(
     # so is what does not change the speed within the motion
     terms = jnp.abs(contacts.directions[:, :m]).T @ jnp.abs(contacts.free)
     acceleration = jnp.maximum(jnp.abs(contacts.approach[:m]), terms).max()
-    now = Scales(
-        jnp.abs(contacts.normal.rate).max(),
-        speed,
-        jnp.maximum(acceleration, speed / settings.duration),
-    )
+    acceleration = jnp.maximum(acceleration, speed / settings.duration)
+    at_rest = jnp.sqrt(acceleration * settings.closed_below)
+    fastest = jnp.abs(contacts.normal.rate).max()
+    now = Scales(fastest, jnp.maximum(speed, at_rest), acceleration)
     return jax.lax.stop_gradient(jax.tree.map(jnp.maximum, scales, now))
 
 
