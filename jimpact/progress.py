@@ -9,6 +9,8 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 
+from jimpact._checks import check_values
+
 LONG = 2.0  # seconds after which work counts as long: sooner, messages would only flicker
 LINE_EVERY = 10.0  # seconds between two lines about one step, a few for each minute
 
@@ -35,6 +37,7 @@ def progress_bar(progress: float | None) -> Iterator[Show]:
     if progress is False or (progress is None and not terminal):
         yield lambda step, done, total: None
         return
+    check_values("progress", progress, low=0.0)
     after = LONG if progress is None else 0.0 if progress is True else progress
     with (_bar if terminal else _lines)(after) as show:
         yield show

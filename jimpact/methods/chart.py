@@ -11,7 +11,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_whole, check_choice, check_values, in_common_dtype
+from jimpact._checks import (
+    as_axis,
+    as_whole,
+    check_choice,
+    check_kind,
+    check_values,
+    in_common_dtype,
+)
 from jimpact.compiling import full_precision
 from jimpact.files.records import Column, Table, Tabular, fields_as_data, microseconds
 from jimpact.fits.parameters import with_entries
@@ -217,9 +224,12 @@ def work_precision(
     exact, second = _reference(reference, case), CONTENDERS["time"]
     if laws is None:
         laws, _ = registered_laws(shared_parameters(law), ALGEBRAIC)
+    check_kind("laws", laws, Mapping)
 
     # of one name one program, which the reference shares with its own row
     different = {m.name: m for m in (exact, second, *chosen)}
+    for name in set(laws) & set(different):
+        raise ValueError(f"Argument `laws` must have names that no method has, but has {name!r}.")
     programs = {n: _method_programs(m, case, gradients, durations) for n, m in different.items()}
     programs |= {name: _law_programs(other, case) for name, other in laws.items()}
     ladders: dict[str, Any] = {m.name: m.ladder for m in chosen} | dict.fromkeys(laws, (None,))
@@ -309,10 +319,15 @@ def _chosen(
         left_out = {name: why for name, why in reasons.items() if why is not None}
         methods = [name for name in CONTENDERS if name not in left_out]
     chosen = _supporting("methods", methods, case)
+    check_kind("settings", settings, Mapping)
     for name, values in settings.items():
         check_choice("settings", name, [each.name for each in chosen])
-        check_values(f"settings[{name!r}]", values, low=0.0, open_low=True)
-    return [m._replace(ladder=tuple(settings.get(m.name, m.ladder))) for m in chosen], left_out
+        ladder = f"settings[{name!r}]"
+        check_values(ladder, as_axis(ladder, values), low=0.0, open_low=True)
+    return [
+        m._replace(ladder=tuple(np.atleast_1d(settings.get(m.name, m.ladder)).tolist()))
+        for m in chosen
+    ], left_out
 
 
 def _supporting(argument: str, methods: Sequence[str | Contender], case: Case) -> list[Contender]:

@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_whole, check_choice, check_values
+from jimpact._checks import as_axis, as_whole, check_choice, check_kind, check_values
 from jimpact.audits import audit
 from jimpact.compiling import full_precision
 from jimpact.files.records import Column, Table, Tabular, as_data, fields_as_data
@@ -349,10 +349,13 @@ def _methods(methods: Sequence[str | Contender] | None, place: Place) -> list[Co
 
 def _checked(argument: str, values: Mapping[str, Any], names: tuple[str, ...]) -> Mapping[str, Any]:
     """Values by axis, checked."""
+    check_kind(argument, values, Mapping)
     for name, value in values.items():
         check_choice(argument, name, names)
-        axis = _AXES[name]
-        check_values(f"{argument}[{name!r}]", value, low=axis.low, high=axis.high)
+        axis, of_axis = _AXES[name], f"{argument}[{name!r}]"
+        check_values(of_axis, as_axis(of_axis, value), low=axis.low, high=axis.high)
+        if name == "balls" and (np.asarray(value) % 1).any():
+            raise ValueError(f"Argument `{of_axis}` must hold whole numbers, but has {value}.")
     return values
 
 
@@ -369,11 +372,7 @@ def _axis_values(
     if axes is None:
         return default_axes(r, names)
     axes = _checked("axes", axes or {"": ()}, names)
-    lines = {name: np.unique(np.asarray(axes[name], float)) for name in AXES if name in axes}
-    balls = lines.get("balls", np.zeros(0))
-    if (balls != np.round(balls)).any():
-        raise ValueError(f"Argument `axes['balls']` must hold whole numbers, but has {balls}.")
-    return lines
+    return {name: np.unique(np.asarray(axes[name], float)) for name in AXES if name in axes}
 
 
 def _slice_points(

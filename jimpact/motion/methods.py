@@ -5,7 +5,14 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from jimpact._checks import as_whole, check_choice, check_values, is_traced, short_repr
+from jimpact._checks import (
+    as_whole,
+    check_choice,
+    check_shape,
+    check_values,
+    is_traced,
+    short_repr,
+)
 from jimpact.law import Law
 from jimpact.motion.flow import check_rtol
 from jimpact.motion.pile_contacts import PileContacts, contacts_of_step
@@ -125,6 +132,7 @@ class TimeStepping:
     def __post_init__(self) -> None:
         if self.step is None or is_traced(self.step):
             raise ValueError("Argument `step` must be a number, for method 'time_stepping'.")
+        check_shape("step", self.step, (), "one number")
         check_values("step", self.step, low=0.0, open_low=True)
         check_values("closed_below", self.closed_below, low=0.0, open_low=True)
 
