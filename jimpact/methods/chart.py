@@ -324,10 +324,8 @@ def _chosen(
         check_choice("settings", name, [each.name for each in chosen])
         ladder = f"settings[{name!r}]"
         check_values(ladder, as_axis(ladder, values), low=0.0, open_low=True)
-    return [
-        m._replace(ladder=tuple(np.atleast_1d(settings.get(m.name, m.ladder)).tolist()))
-        for m in chosen
-    ], left_out
+    ladders = [np.ravel(settings.get(m.name, m.ladder)).tolist() for m in chosen]
+    return [m._replace(ladder=tuple(x)) for m, x in zip(chosen, ladders)], left_out
 
 
 def _supporting(argument: str, methods: Sequence[str | Contender], case: Case) -> list[Contender]:

@@ -359,6 +359,8 @@ SYSTEMS = [
     (lambda: samples(key=2**70), "`key` must have at most 64 bits"),
     (lambda: samples(folder=3), "`folder` must be a path, but is 3"),
     (lambda: samples().quantile(None), "`q` must be numeric"),
+    (lambda: samples(progress="x"), "`progress` must be numeric"),
+    (lambda: ji.TimeStepping([0.1]), r"`step` must have shape \(\)"),
     (lambda: ji.RandomLaw(ji.Binary(0.9)), "`parameters` must name one that is random"),
     (lambda: fit_of_a_ball(sigma=np.full(3, 0.01)), r"`sigma` must have shape \(3, 1\)"),
     (lambda: fit_of_a_ball(observe="q"), "`observe` must be a function, but is 'q'"),
