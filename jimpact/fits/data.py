@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_concrete, check_values, in_numbers
+from jimpact._checks import as_float_array, check_concrete, check_kind, check_values, in_numbers
 from jimpact.bodies.base import CLOSED_BELOW, Body
 from jimpact.files.shots_file import ANGULAR, LINEAR, read_shots
 from jimpact.scene import WALLS, Scene, chain, dense_mass, stackable, with_gaps
@@ -419,6 +419,7 @@ def _as_sigma(name: str, value: Any, measured: np.ndarray, zero: bool = False) -
 
 def _as_scenes(scenes: Sequence[Scene], shape: tuple[int, ...]) -> tuple[Scene, ...]:
     """The scenes, one for each shot, checked."""
+    check_kind("scenes", scenes, Sequence)
     scenes = tuple(scenes)
     if len(scenes) != shape[0]:
         raise ValueError(

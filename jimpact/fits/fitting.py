@@ -406,6 +406,7 @@ def bootstrap(
     True
     """
     as_whole("samples", samples, 1)
+    as_whole("seed", seed, 0)
     check_squares("fit", fit)
     if not np.isfinite(fit.noise):
         raise ValueError("Argument `fit` must have a known noise, but its noise is not finite.")

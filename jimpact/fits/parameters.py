@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import ABBREVIATIONS, suggestion
+from jimpact._checks import ABBREVIATIONS, check_kind, suggestion
 from jimpact.contact import Contact
 from jimpact.law import (
     Domain,
@@ -178,7 +178,7 @@ def free_parameters(
 def _labels(law: Law, free: Any) -> dict[str, np.ndarray]:
     """Of each field that `free` names: 0 where fixed, equal numbers where a value is shared."""
     known, labels = free_parameters_of(law), {}
-    choices = free if isinstance(free, Mapping) else dict.fromkeys(_as_names(free), True)
+    choices = free if isinstance(free, Mapping) else dict.fromkeys(as_names("free", free), True)
     for name, choice in choices.items():
         field, entry = entry_of(name)
         if field not in known:
@@ -203,9 +203,12 @@ def _name(field: str, members: np.ndarray, size: int) -> str:
     return f"{field}[{'='.join(','.join(str(i + 1) for i in index) for index in members)}]"
 
 
-def _as_names(free: Any) -> tuple[str, ...]:
-    """The names of one or several fields."""
-    return (free,) if isinstance(free, str) else tuple(free)
+def as_names(argument: str, names: Any) -> tuple[str, ...]:
+    """One or several names; a TypeError for anything else."""
+    if isinstance(names, str):
+        return (names,)
+    check_kind(argument, names, Iterable)
+    return tuple(names)
 
 
 def default_free(law: Law, absolute: bool = False) -> tuple[str, ...]:
@@ -551,7 +554,7 @@ def with_parts_of_scene(law: Law, scene: Scene | None, own_scenes: bool, free: A
     Raises:
         ValueError: parts that the scene does not have, or that the shots do not share.
     """
-    wanted = {entry_of(name)[0] for name in _as_names(free)} & set(OF_A_SCENE)
+    wanted = {entry_of(name)[0] for name in as_names("free", free)} & set(OF_A_SCENE)
     parts = [name for name in OF_A_SCENE if name in wanted - set(free_parameters_of(law))]
     if not parts or isinstance(law, LawInScene):
         return law

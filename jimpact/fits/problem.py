@@ -602,6 +602,9 @@ def _build(
     leaves = jax.tree.leaves((law, observe, values["measured"]))
     dtype = np.result_type(*(x.dtype for x in leaves if eqx.is_inexact_array(x)))
     free, bounds, prior, tie = (*choice, *[None] * 4)[:4]
+    for name, pairs in (("bounds", bounds), ("priors", prior), ("ties", tie)):
+        if pairs is not None:
+            check_kind(name, pairs, Mapping)
     ties = checked_ties(law, tie)
     law = tied(law, ties)
     parameters, notes = free_parameters(law, free, getattr(observe, "absolute", False), ties)

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jimpact._checks import as_whole, check_choice, check_kind
-from jimpact.fits.parameters import scaled, unscaled
+from jimpact.fits.parameters import as_names, scaled, unscaled
 from jimpact.fits.search import SAME_VALUE, START_SCALES, FitMinimum, find_minima, solution
 from jimpact.fits.solve import RANK_TOLERANCE, Ends, Solver, minimize
 from jimpact.fits.uncertainty import Fit, Profile, check_level
@@ -217,7 +217,7 @@ def profile(
     restitution: at least 0.97321 (95 %)
     """
     _check_profiled(fit, level, points)
-    wanted = fit.names if names is None else (names,) if isinstance(names, str) else tuple(names)
+    wanted = fit.names if names is None else as_names("names", names)
     for name in wanted:
         check_choice("names", name, fit.names)
     return profiles_of(fit, [fit.names.index(name) for name in wanted], level, points, progress)

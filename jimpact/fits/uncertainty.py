@@ -124,8 +124,8 @@ def _in_words(problem: FitProblem, direction: np.ndarray, scale: np.ndarray) -> 
 
 def check_level(level: float) -> None:
     """Raise a ValueError unless this is a confidence level."""
-    if not 0 < level < 1:
-        raise ValueError(f"Argument `level` must lie in (0, 1), but has value {level}.")
+    if not (isinstance(level, float | np.floating) and 0 < level < 1):
+        raise ValueError(f"Argument `level` must lie in (0, 1), but has value {level!r}.")
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,8 @@ def samples(**options):
 def fit_of_a_ball(**options):
     """A fit of three positions of a ball that bounces."""
     ball = ji.System(ji.Column([1.0]), gravity=True)
-    return ji.fit_motion(ball, ji.Newton(0.8), np.ones((3, 1)), [1.0], [0.0], 0.3, **options)
+    given = {"measured": np.ones((3, 1)), "q0": [1.0], "v0": [0.0], "t_end": 0.3}
+    return ji.fit_motion(ball, ji.Newton(0.8), **(given | options))
 
 
 LAWS = [
@@ -359,6 +360,13 @@ SYSTEMS = [
     (lambda: samples(key=2**70), "`key` must have at most 64 bits"),
     (lambda: samples(folder=3), "`folder` must be a path, but is 3"),
     (lambda: samples().quantile(None), "`q` must be numeric"),
+    (lambda: fit_of_a_ball(q0=[-1.0]), r"`q0` must have no penetration"),
+    (lambda: fit_of_a_ball(t_end=-0.5), "`t_end` must be after the start"),
+    (lambda: fit_of_a_ball(measured="a"), "`measured` must be numeric"),
+    (lambda: fit_of_a_ball(observe=lambda m: [m.q[0, 0]]), "`observe` must give an array"),
+    (lambda: fit_of_a_ball(free=None), "`free` must be of type Iterable"),
+    (lambda: fit_of_a_ball(bounds=[(0, 1)]), "`bounds` must be of type Mapping"),
+    (lambda: ji.Experiments([V], [V], scenes=BALLS), "`scenes` must be of type Sequence"),
     (lambda: samples(progress="x"), "`progress` must be numeric"),
     (lambda: ji.TimeStepping([0.1]), r"`step` must have shape \(\)"),
     (lambda: ji.RandomLaw(ji.Binary(0.9)), "`parameters` must name one that is random"),

@@ -355,8 +355,14 @@ def test_stability_map_of_a_scene_with_friction():
         (lambda: ji.stability_map(["rk5"]), "`methods` must be one of"),
         (lambda: ji.stability_map(axes={"mass": [1]}), "`axes` must be one of"),
         (lambda: ji.stability_map(axes={"balls": [2.5]}), "whole numbers"),
-        (lambda: ji.stability_map(base={"balls": 2.5}), r"`base\['balls'\]` must hold whole numbers"),
-        (lambda: ji.stability_map(axes={"setting": []}), r"`axes\['setting'\]` must be a scalar or"),
+        (
+            lambda: ji.stability_map(base={"balls": 2.5}),
+            r"`base\['balls'\]` must hold whole numbers",
+        ),
+        (
+            lambda: ji.stability_map(axes={"setting": []}),
+            r"`axes\['setting'\]` must be a scalar or",
+        ),
         (lambda: ji.stability_map(axes={"restitution": [1.1]}), r"lie in \[0, 1\]"),
         (lambda: ji.stability_map(base={"exponent": 0.5}), r"lie in \[1, 5\]"),
         (lambda: ji.stability_map(base={"speed": 1}), "`base` must be one of"),
