@@ -230,6 +230,11 @@ def _bound(problem: _FrictionProblem, x: jax.Array) -> jax.Array:
     return problem.friction[:, None] * (p if problem.load is None else p + problem.load[:, None])
 
 
+def _rubs(problem: _FrictionProblem) -> jax.Array:
+    """Which contacts (m, 1) have friction: without it none sticks, also where it does not slip."""
+    return problem.friction[:, None] > 0
+
+
 def _size(x: jax.Array) -> jax.Array:
     """(N,) of (m, b, N); the rates without impulses have size 1."""
     return 1 + jnp.abs(x).max(axis=(0, 1))
@@ -391,7 +396,7 @@ def _at_rest(problem: _FrictionProblem, x: jax.Array, margin: jax.Array) -> _Mod
     if problem.load is not None:
         pushes = pushes | (problem.load[:, None] > 0)
     speed = _length(rate[:, 1:])
-    sticks = pushes & (speed <= margin)
+    sticks = pushes & (speed <= margin) & _rubs(problem)
     slides = pushes & ~sticks
     direction = jnp.where(slides[:, None], _over(rate[:, 1:], speed), 0.0)
     modes = _Modes(taking, sticks, direction, jnp.zeros(speed.shape, x.dtype))
@@ -498,7 +503,7 @@ def _modes_at(problem: _FrictionProblem, x: jax.Array) -> _Modes:
     taking = p > rate[:, 0] if problem.complementary else jnp.ones(p.shape, bool)
     pull, bound = rate[:, 1:] - x[:, 1:], _bound(problem, x)
     length = _length(pull)
-    sticks = length <= bound
+    sticks = (length <= bound) & _rubs(problem)
     slides = ~sticks & (bound > 0)
     direction = jnp.where(slides[:, None], _over(pull, length), 0.0)
     return _turned(problem, _Modes(taking, sticks, direction, jnp.zeros_like(p)), x)

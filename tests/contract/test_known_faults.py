@@ -338,6 +338,14 @@ def test_impulses_that_wedge_do_not_hide_their_errors():
     assert (rates[np.array([1, 4])] > 0.5).all()
 
 
+@pytest.mark.parametrize("scene", [ji.Disc(0.1).scene(), ji.Box((1.0, 1.0, 1.0)).scene()])
+def test_contacts_without_friction_do_not_stick(scene):
+    """A friction of 0 holds nothing, also where nothing slips: the slope was that of sticking."""
+    strike = -np.eye(scene.size)[{3: 1, 6: 2}[scene.size]]  # downwards
+    slope = jax.jacfwd(lambda v: ji.impact(ji.Moreau(0.5, 0.0), scene, v).velocity)(strike)
+    np.testing.assert_allclose(slope[0], np.eye(scene.size)[0], atol=1e-12)
+
+
 @pytest.mark.slow
 def test_friction_of_many_contacts_in_single_precision_batches():
     """Sums over batches of six axes and more crashed the process, in single precision only."""
