@@ -359,7 +359,6 @@ SYSTEMS = [
     (lambda: samples(law=ji.Binary), "`law` must be a Law or a function"),
     (lambda: samples(key=2**70), "`key` must have at most 64 bits"),
     (lambda: samples(folder=3), "`folder` must be a path, but is 3"),
-    (lambda: samples().quantile(None), "`q` must be numeric"),
     (lambda: fit_of_a_ball(q0=[-1.0]), r"`q0` must have no penetration"),
     (lambda: fit_of_a_ball(t_end=-0.5), "`t_end` must be after the start"),
     (lambda: fit_of_a_ball(measured="a"), "`measured` must be numeric"),

@@ -267,6 +267,11 @@ def whole():
     return sampled()
 
 
+def test_a_quantile_is_a_number(whole):
+    with pytest.raises(TypeError, match="`q` must be numeric, but has value None"):
+        whole.quantile(None)
+
+
 def test_a_folder_of_another_run_is_refused(tmp_path):
     sampled(folder=tmp_path)
     with pytest.raises(ValueError, match="holds another run, which differs in gaps, key:"):
