@@ -396,8 +396,8 @@ def _at_rest(problem: _FrictionProblem, x: jax.Array, margin: jax.Array) -> _Mod
     if problem.load is not None:
         pushes = pushes | (problem.load[:, None] > 0)
     speed = _length(rate[:, 1:])
-    sticks = pushes & (speed <= margin) & _rubs(problem)
-    slides = pushes & ~sticks
+    slides = pushes & (speed > margin)
+    sticks = pushes & ~slides & _rubs(problem)
     direction = jnp.where(slides[:, None], _over(rate[:, 1:], speed), 0.0)
     modes = _Modes(taking, sticks, direction, jnp.zeros(speed.shape, x.dtype))
     return _turned(problem, modes, x[..., None])
