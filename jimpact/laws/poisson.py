@@ -96,7 +96,11 @@ class Poisson(Law):
         first = solve(a, contact.gap_velocity, contact.slip, mu, complementary=True)
         returned = self.restitution * first.normal
         rate = jnp.concatenate([contact.gap_velocity, (1 + e_t) * contact.slip])
-        rate = rate + a @ jnp.concatenate([first.normal + returned, first.tangential])
+        impulse = jnp.concatenate([first.normal + returned, first.tangential])
+        size, rate = jnp.abs(rate) + jnp.abs(a) @ jnp.abs(impulse), rate + a @ impulse
+        # what compression has brought to rest must not be moved by what is left of rounding
+        noise = jax.lax.stop_gradient(precision(mu.dtype).accumulated * size)
+        rate = rate - jax.lax.stop_gradient(jnp.where(jnp.abs(rate) <= noise, rate, 0.0))
         # also at e = 0, where it begins with e
         load = returned + precision(mu.dtype).eps ** 2 * first.normal
         second = solve(a, rate[:m], rate[m:], mu, complementary=True, load=load)

@@ -447,6 +447,7 @@ def _most_at_rest(
     if x.size > _SHARED:
         return modes, _inverted(problem, modes, x)
     rest = _at_rest(problem, x, jnp.asarray(problem.tolerance, x.dtype))
+    modes = modes._replace(taking=modes.taking & rest.taking)  # loads that begin open contacts
     both = jax.tree.map(lambda *leaf: jnp.stack(leaf), rest, modes)
     inverted = jax.lax.map(lambda modes: _inverted(problem, modes, x), both)
     inverted = inverted._replace(held=jnp.array([False, True]))

@@ -347,6 +347,21 @@ def test_contacts_without_friction_do_not_stick(scene):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("levers", [[0.1], [0.1, -0.2], [0.1, 0.1], [0.0, 0.0]])
+def test_restitution_of_poisson_begins_at_0(levers):
+    """At e = 0 expansion acted on what rounding had left of compression: slopes of sliding."""
+    m = len(levers)
+    normals, tangents = np.array([[0] * m, [1] * m, levers]), np.array([[1], [0], [-0.5]])
+    scene = ji.Scene([1.0, 1.0, 0.2], normals, tangents=np.tile(tangents, (1, m)))
+
+    def after(e):
+        return ji.impact(ji.Poisson(e, friction=0.8), scene, [0.0, -1.0, 0.0]).velocity
+
+    difference = (after(1e-6) - after(0.0)) / 1e-6
+    np.testing.assert_allclose(jax.jacfwd(after)(0.0), difference, atol=1e-8)
+
+
+@pytest.mark.slow
 def test_friction_of_many_contacts_in_single_precision_batches():
     """Sums over batches of six axes and more crashed the process, in single precision only."""
     script = """
