@@ -347,7 +347,7 @@ def test_contacts_without_friction_do_not_stick(scene):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("levers", [[0.1], [0.1, -0.2], [0.1, 0.1], [0.0, 0.0]])
+@pytest.mark.parametrize("levers", [[0.1], [0.1, -0.2]])
 def test_restitution_of_poisson_begins_at_0(levers):
     """At e = 0 expansion acted on what rounding had left of compression: slopes of sliding."""
     m = len(levers)
