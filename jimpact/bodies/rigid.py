@@ -311,13 +311,13 @@ class RigidBodies(Body):
 
     def _of_all(self, q: jax.Array, point: jax.Array, ways: jax.Array) -> jax.Array:
         """(n, m, k): velocities along ways (m, k, d) of all bodies."""
-        # by JAX: of thousands of bodies only the shapes are asked for
-        body = jnp.asarray(self.pairs_in_contact())[:, :, None]
-        moving = jnp.arange(self.count, dtype=body.dtype)[None, None]
-        own = (body == moving).astype(q.dtype)
-        sign = (own[:, 0] - own[:, 1])[:, :, None, None]
-        speeds = self.speeds(self.of_bodies(q)[None], point[:, None], ways[:, None])
-        rows = jnp.where(sign != 0, sign * speeds, 0.0)  # (m, bodies, k, velocities)
+        pairs = self.pairs_in_contact()
+        sides = pairs if (pairs[:, 1] >= 0).any() else pairs[:, :1]  # a plane does not move
+        speeds = self.speeds(self.of_bodies(q)[sides], point[:, None], ways[:, None])
+        speeds = speeds.at[:, 1:].multiply(-1.0)  # (m, sides, k, velocities)
+        # by JAX: of thousands of bodies only the shapes are needed, and this would fill the memory
+        own = jnp.asarray(sides)[:, :, None] == np.arange(self.count, dtype=np.int32)[None, None]
+        rows = jnp.sum(jnp.where(own[..., None, None], speeds[:, :, None], 0.0), axis=1)
         velocities = self.count * (self.dimension + self.angular)
         return rows.transpose(1, 3, 0, 2).reshape(velocities, *ways.shape[:2])
 
