@@ -14,7 +14,7 @@ import numpy as np
 
 from jimpact._checks import as_float_array, is_traced
 from jimpact.compiling import full_precision
-from jimpact.precision import precision
+from jimpact.precision import precision, without_rounding
 from jimpact.scene import Scene, gap_velocity, solve_mass, without_constraints
 from jimpact.solvers.sparse import Sparse
 from jimpact.solvers.tangential import TangentialBlock
@@ -175,12 +175,11 @@ class Contact(eqx.Module):
 
     def within(self, noise: jax.Array) -> "Contact":
         """The contact with gap velocities up to `noise` () [m/s] set to 0, as within rounding."""
-        gamma = self.gap_velocity
-        small = jax.lax.stop_gradient(jnp.where(jnp.abs(gamma) <= noise, gamma, 0.0))
+        gamma = without_rounding(self.gap_velocity, noise)
         return eqx.tree_at(
             lambda contact: (contact.gap_velocity, contact.noise),
             self,
-            (gamma - small, jnp.maximum(self.noise, noise)),
+            (gamma, jnp.maximum(self.noise, noise)),
         )
 
     def approaching(self, speed: jax.Array) -> "Contact":
@@ -293,7 +292,7 @@ def rounded_gap_velocity(scene: Scene, velocity: jax.Array) -> tuple[jax.Array, 
         padded = jnp.pad(speed, (int(left), int(right)))
         size = padded[:-1] + padded[1:]
     noise = jax.lax.stop_gradient(precision(speed.dtype).rounding * size)
-    return gamma - jax.lax.stop_gradient(jnp.where(jnp.abs(gamma) <= noise, gamma, 0.0)), noise
+    return without_rounding(gamma, noise), noise
 
 
 @full_precision

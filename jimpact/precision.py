@@ -9,6 +9,7 @@ less takes rounding for an impact, a coupling, or an independent contact.
 import functools
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 
 
@@ -28,6 +29,12 @@ class Precision(NamedTuple):
     accumulated: float
     singular: float
     root: float
+
+
+def without_rounding(values: jax.Array, noise: jax.Array) -> jax.Array:
+    """The values, 0 where they are within `noise`; derivatives remain those of the values."""
+    within = jnp.abs(values) <= noise
+    return values - jax.lax.stop_gradient(jnp.where(within, values, 0.0))
 
 
 @functools.cache

@@ -44,8 +44,8 @@ class Command:
     """Print JSON instead of text."""
     csv: Flag = False
     """Print the table as CSV instead of text."""
-    # Compile anew. Else compiled programs are stored in the user's cache folder, or in
-    # the folder that the environment variable JIMPACT_CACHE names (empty: nowhere).
+    # Compile anew. Else compiled programs are stored in the user's cache folder, or in the folder
+    # that the environment variable JIMPACT_CACHE names (empty: nowhere).
     no_cache: Flag = False
 
     @classmethod

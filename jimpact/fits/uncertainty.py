@@ -11,7 +11,7 @@ import numpy as np
 from scipy.linalg import qr
 from scipy.special import ndtri, stdtrit
 
-from jimpact._checks import check_choice, check_kind, check_values
+from jimpact._checks import check_choice, check_kind, check_shape, check_values
 from jimpact.files.records import Column, Table, Tabular
 from jimpact.fits.data import Experiments
 from jimpact.fits.parameters import AnyLaw, LawInScene, tied_names, tied_value
@@ -124,7 +124,9 @@ def _in_words(problem: FitProblem, direction: np.ndarray, scale: np.ndarray) -> 
 
 def check_level(level: float) -> None:
     """Raise a ValueError unless this is a confidence level."""
-    if not (isinstance(level, float | np.floating) and 0 < level < 1):
+    check_shape("level", level, (), "one number")
+    check_values("level", level)
+    if not 0 < level < 1:
         raise ValueError(f"Argument `level` must lie in (0, 1), but has value {level!r}.")
 
 

@@ -9,7 +9,7 @@ from jimpact.compiling import full_precision
 from jimpact.contact import Contact
 from jimpact.law import Impulses, Law, OptionalValues, Values, option, parameter
 from jimpact.laws.friction import friction_fields
-from jimpact.precision import precision
+from jimpact.precision import precision, without_rounding
 from jimpact.solvers.dense import null_projector
 from jimpact.solvers.friction import solve
 from jimpact.solvers.lcp import solve_lcp
@@ -99,8 +99,7 @@ class Poisson(Law):
         impulse = jnp.concatenate([first.normal + returned, first.tangential])
         size, rate = jnp.abs(rate) + jnp.abs(a) @ jnp.abs(impulse), rate + a @ impulse
         # what compression has brought to rest must not be moved by what is left of rounding
-        noise = jax.lax.stop_gradient(precision(mu.dtype).accumulated * size)
-        rate = rate - jax.lax.stop_gradient(jnp.where(jnp.abs(rate) <= noise, rate, 0.0))
+        rate = without_rounding(rate, precision(mu.dtype).accumulated * size)
         # also at e = 0, where it begins with e
         load = returned + precision(mu.dtype).eps ** 2 * first.normal
         second = solve(a, rate[:m], rate[m:], mu, complementary=True, load=load)

@@ -217,8 +217,9 @@ def _advice(
     v = situation.velocity
     each = {name: partial(_outcomes, law, v, progress=progress) for name, law in laws.items()}
     outcomes, left_out = at_points(each, k)
-    for name in {"lzb", "compliant"} & set(left_out):
-        raise RuntimeError(f"The reference law {name} {left_out[name]}")
+    for name in ("lzb", "compliant"):
+        if name in left_out:
+            raise RuntimeError(f"The reference law {name} {left_out[name]}")
     laws = {name: laws[name] for name in outcomes}
     apart = _reclosing(situation, outcomes)
     follows_gaps = situation.gapped.any() or apart > tolerance / SMALL_PART

@@ -228,8 +228,11 @@ def work_precision(
 
     # of one name one program, which the reference shares with its own row
     different = {m.name: m for m in (exact, second, *chosen)}
-    for name in set(laws) & set(different):
-        raise ValueError(f"Argument `laws` must have names that no method has, but has {name!r}.")
+    for name in laws:
+        if name in different:
+            raise ValueError(
+                f"Argument `laws` must have names that no method has, but has {name!r}."
+            )
     programs = {n: _method_programs(m, case, gradients, durations) for n, m in different.items()}
     programs |= {name: _law_programs(other, case) for name, other in laws.items()}
     ladders: dict[str, Any] = {m.name: m.ladder for m in chosen} | dict.fromkeys(laws, (None,))

@@ -20,7 +20,7 @@ import diffrax
 import jax
 import numpy as np
 
-from jimpact._checks import check_choice
+from jimpact._checks import check_choice, short_repr
 from jimpact.contact import Contact
 from jimpact.impacts import Impact, impact
 from jimpact.law import Impulses, Law
@@ -163,7 +163,7 @@ def contenders_of(
 ) -> list[Contender]:
     """Contenders of these names among those known, or ones of your own, with names of their own."""
     if isinstance(methods, str | Contender):
-        raise TypeError(f"Argument `{argument}` must be a list, but is {methods!r}.")
+        raise TypeError(f"Argument `{argument}` must be a list, but is {short_repr(methods)}.")
     chosen = [_contender_of(argument, method, known) for method in methods]
     names = [each.name for each in chosen]
     if not names or len(set(names)) < len(names):
@@ -176,7 +176,7 @@ def contenders_of(
 def _contender_of(
     argument: str, method: str | Contender, known: Mapping[str, Contender]
 ) -> Contender:
-    """One of them."""
+    """The contender of this name, or one of your own."""
     if not isinstance(method, Contender):
         check_choice(argument, method, known)
         return known[method]

@@ -120,9 +120,9 @@ def _differentiated(system: System, q: jax.Array, v: jax.Array, t: jax.Array) ->
 def _in_time(
     v: jax.Array, t: jax.Array
 ) -> tuple[tuple[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
-    """No displacement, no time; and how both grow.
+    """Displacement and time at an instant, 0, and their rates.
 
-    Displacements that do not depend on v: at one q, several velocities share all but rates.
+    Only the rates depend on v, so that different velocities at one q share all other operations.
     """
     return (jnp.zeros_like(v), jnp.zeros_like(t)), (v, jnp.ones_like(t))
 

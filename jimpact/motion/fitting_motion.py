@@ -9,16 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_function, check_values, in_common_dtype
-from jimpact.bodies.base import check_penetration
 from jimpact.fits.fitting import Fit, fit
 from jimpact.fits.observables import Prediction
 from jimpact.fits.problem import FitProblem
 from jimpact.fits.search import Search
 from jimpact.law import Law
-from jimpact.motion.arguments import as_times, check_motion, closed_gaps
-from jimpact.motion.methods import ContactForces, as_method
+from jimpact.motion.methods import as_method
 from jimpact.motion.record import Motion
-from jimpact.motion.simulate import simulate
+from jimpact.motion.simulate import checked_start, simulate
 from jimpact.motion.system import System
 from jimpact.status import STATUS
 
@@ -139,27 +137,15 @@ def fit_motion(
                 f"but has shape {record.shape}."
             )
         options = {"samples": record.shape[-2]} | options
-    _check_starts(system, law, q0, v0, t_end, options)
+    method = as_method(options.get("method", "events"), options.get("step"))
+    for q, v in zip(q0.reshape(-1, q0.shape[-1]), v0.reshape(-1, v0.shape[-1])):
+        there, _, q, v = in_common_dtype(system, law, q, v)
+        checked_start(there, q, v, t_end, method)  # in the fit `simulate` cannot raise
     observable = MotionObservable(system, q0, v0, {"t_end": t_end} | options, observe or _positions)
     problem = FitProblem.from_observable(
         law, observable, measured, sigma, free, bounds, priors, ties
     )
     return fit(problem, starts=starts, profiles=profiles, search=search)
-
-
-def _check_starts(
-    system: System, law: Law, q0: jax.Array, v0: jax.Array, t_end: Any, options: dict[str, Any]
-) -> None:
-    """Raise for a start or an end that `simulate` refuses: in the fit it cannot."""
-    times = as_times(t_end)
-    method = as_method(options.get("method", "events"), options.get("step"))
-    for q, v in zip(q0.reshape(-1, q0.shape[-1]), v0.reshape(-1, v0.shape[-1])):
-        here, _, q, v = in_common_dtype(system, law, q, v)
-        start, end = (as_float_array("t_end", t).astype(q.dtype) for t in times)
-        gaps = check_motion(here, q, v, start, end)
-        if not isinstance(method, ContactForces):
-            below, _ = closed_gaps(q, gaps, method.closed_below)
-            check_penetration("q0", gaps, jnp.maximum(below, system.body.overlap))
 
 
 def _positions(motion: Motion) -> jax.Array:

@@ -119,22 +119,16 @@ def simulate(
     q, v = as_float_array("q0", q0), as_float_array("v0", v0)
     system, law, q, v = in_common_dtype(system, law, q, v)
     dtype = q.dtype
-    times = as_times(t_end)
-    start, end = (as_float_array("t_end", t).astype(dtype) for t in times)
-    f = check_motion(system, q, v, start, end)
+    method = as_method(method, step)
+    start, end, below, rounding = checked_start(system, q, v, t_end, method)
     count = as_whole("samples", samples, 2)
     rows = CHUNK if max_events is None else as_whole("max_events", max_events, 1)
-    method = as_method(method, step)
     mu = friction_of(system, law, q)
     check_pile(system, q, mu, name_of(method))
     system = without_closures(system, q, v, start)
-    closed_below = None if isinstance(method, ContactForces) else method.closed_below
-    below, rounding = closed_gaps(q, f, closed_below)
-    if not isinstance(method, ContactForces):
-        check_penetration("q0", f, jnp.maximum(below, system.body.overlap))
     arguments: Any
     if isinstance(method, TimeStepping):
-        substeps = substeps_of(method.step, *times, count)
+        substeps = substeps_of(method.step, *as_times(t_end), count)
         joint = law.joins_step and system.friction is None
         check_stepped_law(system, law, q, joint)
         arguments = system, law, mu, q, v, start, end, below, substeps, count, joint, rows
@@ -154,6 +148,22 @@ def simulate(
         most = MOST_EVENTS if max_events is None else max_events
         return _in_runs(arguments, count, most, method.progress)
     return _events(*(*arguments, None, count, rows))[0]
+
+
+def checked_start(
+    system: System, q: jax.Array, v: jax.Array, t_end: Any, method: Method
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """Start and end [s] of a motion; gaps [m] below which a contact is closed, and is rounding.
+
+    Raises for what cannot move like this; penetration is allowed with contact forces only.
+    """
+    start, end = (as_float_array("t_end", t).astype(q.dtype) for t in as_times(t_end))
+    gaps = check_motion(system, q, v, start, end)
+    if isinstance(method, ContactForces):
+        return start, end, *closed_gaps(q, gaps, None)
+    below, rounding = closed_gaps(q, gaps, method.closed_below)
+    check_penetration("q0", gaps, jnp.maximum(below, system.body.overlap))
+    return start, end, below, rounding
 
 
 def _on_host(arguments: Any) -> bool:
