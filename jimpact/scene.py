@@ -48,6 +48,11 @@ _SQUARE = 1e-3
 # below which they depend on each other. Ten times more reports bodies that turn very easily.
 _DEPENDENT = 1e-13
 
+# Gaps smaller than this [m], of either sign, are the rounding of the positions that they were
+# computed from, and closed: it is a hundredth of an atom, and positions of up to 1 km are rounded
+# by less. Ten times more would still be less than an atom.
+GAP_ROUNDING = 1e-12
+
 _CONSTRAINTS = operator.attrgetter("constraints")
 WALLS = {
     False: (False, False),
@@ -112,7 +117,8 @@ class Scene(eqx.Module):
         mass: `(n, n)` symmetric positive definite, or `(n,)` its diagonal [kg, kg m^2, ...].
         normals: `(n, m)`, column j is the gradient of gap function j.
         tangents: `(n, m)` planar or `(n, 2 m)`, contact-major; None: no friction possible.
-        gaps: `(m,)` >= 0 [m]; a contact with gap > 0 is open. None: all closed.
+        gaps: `(m,)` >= 0 [m]; a contact with gap > 0 is open. Sizes below 1e-12 m, of either sign,
+            are the rounding of positions and become 0. None: all closed.
         constraints: `(n, b)` gradients of bilateral constraints h(q) = 0, or None.
 
     Raises:
@@ -146,7 +152,7 @@ class Scene(eqx.Module):
         self.mass = as_float_array("mass", mass)
         self._normals = as_float_array("normals", normals)
         self.tangents = None if tangents is None else as_float_array("tangents", tangents)
-        self.gaps = None if gaps is None else as_float_array("gaps", gaps)
+        self.gaps = None if gaps is None else rounded_gaps(gaps)
         self.constraints = (
             None if constraints is None else as_float_array("constraints", constraints)
         )
@@ -216,7 +222,8 @@ def chain(masses: Any, wall: bool | str = False, gaps: Any = None) -> Scene:
     Args:
         masses: (n,) > 0 [kg].
         wall: False; True or 'right': last contact; 'left': first contact; 'both'.
-        gaps: (m,) >= 0 [m], None: all closed.
+        gaps: (m,) >= 0 [m]; sizes below 1e-12 m, of either sign, are the rounding of positions and
+            become 0. None: all closed.
 
     Returns:
         `Scene` of n coordinates; m = n - 1 contacts, and one for each wall.
@@ -241,14 +248,31 @@ def chain(masses: Any, wall: bool | str = False, gaps: Any = None) -> Scene:
             f"but {mass.shape[0]} body and wall={wall!r} give none."
         )
     if gaps is not None:
-        gaps = as_float_array("gaps", gaps)
+        gaps = rounded_gaps(gaps)
         check_shape("gaps", gaps, (contacts,), "one gap per contact")
         check_values("gaps", gaps, low=0.0)
     return chain_scene(mass, (left, right), gaps)
 
 
+def rounded_gaps(gaps: Any) -> jax.Array:
+    """Gaps (m,) [m]; those smaller than `GAP_ROUNDING` become 0, and keep the slope 1.
+
+    >>> from jimpact.scene import rounded_gaps
+    >>> rounded_gaps([1e-6, 2.8e-17, -5.6e-17]).tolist() == [1e-6, 0.0, 0.0]
+    True
+    """
+    gaps = as_float_array("gaps", gaps)
+    if not is_traced(gaps):  # also inside jit, where known gaps stay known
+        known = np.asarray(gaps)
+        small = np.abs(known) < GAP_ROUNDING
+        return jnp.asarray(np.where(small, known.dtype.type(0), known)) if small.any() else gaps
+    rounding = jnp.where(jnp.abs(gaps) < GAP_ROUNDING, gaps, 0.0)
+    return gaps - jax.lax.stop_gradient(rounding)
+
+
 def with_gaps(scene: Scene, gaps: jax.Array) -> Scene:
-    """The scene with these gaps (m,)."""
+    """The scene with these gaps (m,) [m], without their rounding."""
+    gaps = rounded_gaps(gaps)
     return eqx.tree_at(lambda tree: tree.gaps, scene, gaps, is_leaf=lambda x: x is None)
 
 

@@ -18,6 +18,11 @@ HOW = "pip install 'jimpact[mujoco]'"
 # leave a hundredth; ten times more would let a sphere sink in to its centre in silence.
 _DEEP = 0.1
 
+# Angle [rad] of a hinge or ball joint, or distance over the model's extent of others, beyond a
+# limit, from which a warning is given. Steps of a simulation leave a tenth of it; ten times more
+# would pass six degrees in silence.
+_BEYOND = 0.01
+
 # Inverse mass in a direction, over the largest one, below which nothing can slide there: rounding
 # leaves 1e-32. Ten times more would still be 3e-9 of the sliding elsewhere.
 _IMMOBILE = 1e-18
@@ -96,8 +101,8 @@ def from_mujoco(model: Any, data: Any, margin: float = 0.0) -> MujocoScene:
         ImportError: mujoco is missing; the extra is named.
         TypeError: not a model and its data.
         ValueError: data of another model, a negative margin, no contact, a deformable body.
-            Warnings name bodies that overlap, unequal, torsional or rolling friction that is left
-            out, and a velocity that breaks constraints.
+            Warnings name bodies that overlap, exceeded limits, unequal, torsional or rolling
+            friction that is left out, and a velocity that breaks constraints.
 
     Limits: contacts of flexible bodies, adhesion.
 
@@ -152,6 +157,7 @@ def from_mujoco(model: Any, data: Any, margin: float = 0.0) -> MujocoScene:
         for c in contacts
     )
     _warn_of_overlap(model, contacts, names)
+    _warn_of_exceeded_limits(mujoco, model, data, limits)
     jacobians = np.concatenate([jacobians, np.pad(ends[:, None], ((0, 0), (0, 2), (0, 0)))])
     constraints = _independent(root, _rows_of(mujoco, model, data, _EQUALITIES)[1].T)
     gaps = np.concatenate([[c.dist for c in contacts], distances])
@@ -322,6 +328,25 @@ def _warn_of_overlap(model: Any, contacts: list[Any], names: tuple[str, ...]) ->
         warnings.warn(
             f"Bodies overlap, where points and normals mean little: {_in_words(deep)}.",
             stacklevel=3,
+        )
+
+
+def _warn_of_exceeded_limits(
+    mujoco: ModuleType, model: Any, data: Any, limits: tuple[str, ...]
+) -> None:
+    """Warn of joints and tendons that are beyond their limits, which count as just reached."""
+    turning = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_BALL)
+    rows = np.concatenate([_rows_of(mujoco, model, data, kind)[0] for kind, _, _ in _LIMITS])
+    beyond = []
+    for row, name in zip(rows.astype(int), limits):
+        is_joint = data.efc_type[row] == mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT
+        is_angle = is_joint and model.jnt_type[data.efc_id[row]] in turning
+        unit, allowed = ("rad", _BEYOND) if is_angle else ("m", _BEYOND * model.stat.extent)
+        if -data.efc_pos[row] > allowed:
+            beyond.append(f"{name!r} by {-data.efc_pos[row]:.3g} {unit}")
+    if beyond:
+        warnings.warn(
+            f"Limits are exceeded, and taken as just reached: {_in_words(beyond)}.", stacklevel=3
         )
 
 

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import ndtri, stdtr
+from scipy.special import ndtri, stdtr, stdtrit
 
 from jimpact.files.records import listed
 from jimpact.fits.data import ROUNDING, Experiments, closed_normals, possible_normals
@@ -18,6 +18,10 @@ DEFECT_TOLERANCE = 1e-3
 DEFECT_SIGMAS = 3.0
 # ... or beyond more, so that all shots together show one by chance at most this often.
 DEFECT_LEVEL = 0.02
+# Without `sigma`, a gain of energy of one shot is reported where the scatter of all shots shows one
+# by chance this often, by Student's t; of 15 shots it is really .015, as the scatter of few is
+# often too small by chance. With ten times more, elastic shots are blamed in one of ten sets.
+OUTLIER_LEVEL = 0.003
 # Beyond this share of the momentum or energy before, in half of the shots or more, a defect needs
 # no test: no noise of a useful measurement is as large, but a wrong unit is. With ten times more, a
 # factor of 3.6 (km/h) in two shots would go unseen.
@@ -26,6 +30,11 @@ GROSS = 0.5
 # median ratio of velocities within UNIT_NEAR of one (or of its inverse) is reported. Ten times
 # nearer, and noise of a percent would hide it.
 UNIT_FACTORS, UNIT_NEAR = {10.0: "a decimal point", 100.0: "cm/s", 1000.0: "mm/s", 3.6: "km/h"}, 0.1
+
+# Standard deviation of a normal distribution over half the length of its shortest half, and the
+# share of the values that would estimate it as well by their mean square (Rousseeuw and Leroy
+# 1988).
+_SIGMA_OVER_HALF, _EFFICIENCY_OF_HALF = 1.4826, 0.37
 
 LISTED = 6  # shots named one by one (with their ratios); of more, how many there are
 
@@ -76,7 +85,8 @@ class DataBalances:
     before: after over before where all bodies move one way. Without `sigma` the shots show their
     noise: a defect is one that they have in common, the same excess or the same share of the
     momentum before, whichever way that points (t tests), or one of half of the momentum in half of
-    the shots; of a single shot any above a tenth of a percent.
+    the shots; of a single shot any above a tenth of a percent. A gain of energy is one of a shot by
+    itself, too, where it is beyond the scatter of all shots.
 
     Args:
         experiments: the shots.
@@ -133,11 +143,31 @@ class DataBalances:
         flagged = {d.k: d.ratio for d, far in zip(defects, beyond) if far}
         if known or len(defects) < 2 or not flagged or np.mean(size > GROSS * scale) >= 0.5:
             return flagged
+        alone = self._beyond_scatter(defects) if gains else set()
+        if alone:
+            return {k: ratio for k, ratio in flagged.items() if k in alone}
         some = error > 0
         weight = 1 / error[some]
         shapes = np.sign(weight), weight * before[some]
         chance = min(_chance(weight * excess[some], shape, gains) for shape in shapes)
         return flagged if chance < level / len(shapes) else {}
+
+    def _beyond_scatter(self, gains: list[_Defect]) -> set[int]:
+        """Shots that gain energy, and do so beyond the noise that the scatter of all shots shows.
+
+        Excesses over their standard errors with a sigma of 1 [m/s] scatter by the noise about what
+        the shots have in common, but for some: the shorter half of them has its length, of energy
+        and momentum. Student's t for each shot.
+        """
+        groups = [gains, *self.momenta.values()]
+        values = [np.array([d.excess / d.error for d in each if d.error > 0]) for each in groups]
+        noise = np.sqrt(np.mean([_shorter_half(each) ** 2 for each in values if len(each)]))
+        freedom = _EFFICIENCY_OF_HALF * sum(len(each) - 1 for each in values if len(each))
+        if freedom == 0:
+            return set()
+        apart = noise * float(stdtrit(freedom, 1 - OUTLIER_LEVEL / len(gains)))
+        least = max(noise * float(ndtri(1 - DEFECT_LEVEL)), np.median(values[0]) + apart)
+        return {d.k for d in gains if d.error > 0 and d.excess / d.error > least}
 
 
 def _units(data: DataBalances) -> Iterator[Finding]:
@@ -229,6 +259,13 @@ def _approaches(normals: np.ndarray, before: np.ndarray) -> bool:
 
 
 DATA_CHECKS = (_units, _momentum, _energy, _resting, _copies)
+
+
+def _shorter_half(values: np.ndarray) -> float:
+    """Standard deviation by the shortest interval that holds more than half of the values."""
+    ordered = np.sort(values)
+    count = len(ordered) // 2 + 1
+    return _SIGMA_OVER_HALF * float(np.min(ordered[count - 1 :] - ordered[: 1 - count or None])) / 2
 
 
 def _chance(excess: np.ndarray, shape: np.ndarray, gains: bool) -> float:

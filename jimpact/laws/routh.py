@@ -26,7 +26,8 @@ class Routh(Law):
     Status: `inadmissible_velocity` where a contact separates before the impact and is pressed in
     it; `impulse_not_unique` for redundant contacts.
 
-    Derivatives are one-sided where a contact is about to take part.
+    Derivatives are one-sided where a contact is about to take part. Where e of the impact is 0,
+    those in each e_j are one-sided, too: `sqrt` of the contact's share of the work.
 
     Source: Brogliato, Nonsmooth Mechanics (2016), 6.4.3, on Bowling and Rodriguez; Routh (1897).
     How the increments are shared is this library's reading of it.
@@ -46,6 +47,10 @@ class Routh(Law):
         compression = solve_lcp(w, gamma)
         if e.ndim:
             work = compression.z * jnp.maximum(-gamma, 0.0)
-            kept = jnp.sum(e**2 * work) / jnp.sum(work)
-            e = jnp.where(kept > 0, jnp.sqrt(jnp.where(kept > 0, kept, 1.0)), 0.0)
+            total = jnp.sum(work)
+            share = work / jnp.where(total > 0, total, 1.0)
+            kept = jnp.sum(e**2 * share)
+            root = jnp.sqrt(jnp.where(share > 0, share, 1.0))
+            at_zero = jnp.sum(jnp.where(share > 0, root * e, 0.0))  # 0, with its slopes
+            e = jnp.where(kept > 0, jnp.sqrt(jnp.where(kept > 0, kept, 1.0)), at_zero)
         return Impulses((1 + e) * compression.z, None, compression.code)

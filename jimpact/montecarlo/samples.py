@@ -26,7 +26,7 @@ from jimpact.law import Law, within_domains
 from jimpact.montecarlo.distributions import Distribution, GivenRows, as_source
 from jimpact.montecarlo.statistics import BAD_GAP, BAD_LAW, BAD_VELOCITY, Chunk, Task, reduced
 from jimpact.montecarlo.store import fingerprint
-from jimpact.scene import Scene, with_gaps
+from jimpact.scene import Scene, rounded_gaps, with_gaps
 
 _WRITTEN = 6  # velocities that the report lists
 SAMPLES = 100_000  # default number of samples; ten times more: quantiles three times finer
@@ -84,7 +84,7 @@ def impacts(
         code = jnp.where(jnp.all(jnp.isfinite(velocity)), code, BAD_VELOCITY)
         place = scene
         if gaps is not None:
-            fine = jnp.isfinite(gaps) & (gaps >= 0)
+            fine = jnp.isfinite(gaps) & (rounded_gaps(gaps) >= 0)
             code = jnp.where(jnp.all(fine), code, BAD_GAP)
             place = with_gaps(scene, jnp.where(fine, gaps, 0))
         out = impact(law, place, jnp.where(code == 0, velocity, 0))  # at rest: over at once

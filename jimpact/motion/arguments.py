@@ -237,16 +237,19 @@ def friction_of(system: System, law: Law, q: jax.Array) -> jax.Array | None:
     """mu (m,), () of a pile: that of the system, or of the law; None without friction."""
     own = system.friction is not None
     mu = system.friction if own else getattr(law, "friction", None)
-    tangents = jax.eval_shape(system.body.tangents, q)
-    if mu is None or (tangents is None and not own):
+    if mu is None:
         return None
-    if tangents is None:
-        raise ValueError("Argument `system` must have a `tangent_function` for its `friction`.")
     mu = jnp.asarray(mu)
+    if not is_traced(mu) and not np.asarray(mu).any():
+        return None  # frictionless systems pay nothing
+    tangents = jax.eval_shape(system.body.tangents, q)
+    if tangents is None:
+        raise ValueError(
+            "Argument `system` must have tangents for the friction of its "
+            f"{'contacts' if own else 'law'}, but its `tangent_function` gives none."
+        )
     if is_traced(mu):
         mu = jnp.where(mu >= 0, mu, jnp.nan)  # the motion is `not_finite` then
-    elif not np.asarray(mu).any():
-        return None  # frictionless systems pay nothing
     m = contacts_of(system, q)
     if tangents.shape[1] not in (m, 2 * m):
         raise ValueError(

@@ -25,7 +25,7 @@ Observe = Callable[[Motion], jax.Array]
 # Steps of one start before it gives up: more only cost time, since each simulates all motions.
 MOTION_SEARCH = Search(max_steps=50)
 # Motions that are simulated side by side. With ten times as many, all wait for the one with the
-# most events, and on two cores the linear algebra of jaxlib 0.10.2 hung.
+# most events.
 LANES = 32
 _FAILS = tuple(row.failure for row in STATUS)
 

@@ -7,7 +7,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jimpact._checks import as_float_array, check_function, check_values, in_numbers
+from jimpact._checks import (
+    as_float_array,
+    check_function,
+    check_shape,
+    check_values,
+    in_numbers,
+    is_traced,
+)
 from jimpact.bodies.base import STANDARD_GRAVITY, Body, LinearPotential, Potential
 from jimpact.bodies.functions import FunctionBody
 
@@ -27,8 +34,8 @@ class System(eqx.Module):
             differentiation of `T = v^T M(q) v / 2`.
         force: (q, v, t) -> generalized forces (n,); None: none.
         potential: q -> V () [J], its forces are `-grad V`; None: 0.
-        gravity: True: the body has a weight; or its acceleration g [m/s^2]. For functions, see
-            `gravity`.
+        gravity: True: the body has a weight; or its acceleration g >= 0 [m/s^2], downwards. For
+            functions, see `gravity`.
         tangent_function: q_r -> tangential displacements h (m,) [m] of the contacts (planar);
             their gradients are the tangents. None: no friction possible.
         base: t -> displacement y_b (d,) [m] of a moving base, written with jax.numpy.
@@ -105,7 +112,13 @@ class System(eqx.Module):
             acceleration = as_float_array(
                 "gravity", STANDARD_GRAVITY if gravity is True else gravity
             )
-            check_values("gravity", acceleration)
+            check_shape("gravity", acceleration, (), "the size of the acceleration")
+            if not is_traced(acceleration) and float(acceleration) < 0:
+                raise ValueError(
+                    "Argument `gravity` must be >= 0, the size of an acceleration that points "
+                    f"downwards, but has value {float(acceleration):g} m/s^2."
+                )
+            check_values("gravity", acceleration, low=0.0)
             potential = self.body.gravity(acceleration)
         self.force, self.potential, self.base = force, potential, base
         self.friction = None if friction is None else as_float_array("friction", friction)

@@ -4,9 +4,8 @@ LAYOUT   Flows keep the batch in the last axis: matrices (n, n, B), vectors (n, 
 `solve_definite`, `solve_mass_matrix`, `solve_by_pivots`, `singular_values`, `eigenvectors`,
 `null_projector`, `solve_symmetric` and `determinants` have no batch.
 
-LAPACK   Its kernels go through a batch one by one, and independent ones can wait for each other for
-ever on few cores (jaxlib 0.10). So they factor single matrices; in batches, loops of our own do, up
-to `_BY_LOOP` rows.
+LAPACK   Its kernels go through a batch one by one. So they factor single matrices; in batches,
+loops of our own do, up to `_BY_LOOP` rows.
 
 COMPILING   Elimination of more than two rows is a loop over the pivots, and products of more than
 `COLUMNS_WRITTEN_OUT` columns are reductions: programs do not grow with the number of contacts.

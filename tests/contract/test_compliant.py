@@ -215,6 +215,23 @@ def test_restitution_of_a_damped_spring():
     assert float(closed[-1]) == pytest.approx(np.exp(-2), rel=1e-13)  # critical
 
 
+@pytest.mark.parametrize("zeta", [0.89, 0.99995, 1.0, 1.12])
+def test_derivatives_of_restitution_about_critical_damping(zeta):
+    """First to third, beside Cauchy's integrals of the formula around a circle."""
+
+    def restitution(damping):
+        return ji.measured_restitution(ji.KelvinVoigt(0.5, damping), 2.0, 1.0)  # zeta = damping / 2
+
+    turn = np.exp(2j * np.pi * (np.arange(64) + 0.5) / 64)
+    z = zeta + 0.25 * turn
+    e = np.exp(-2 * z * np.arccos(z) / np.sqrt(1 - z**2))
+    slope = restitution
+    for order, factor in ((1, 1), (2, 2), (3, 6)):
+        slope = jax.grad(slope)
+        expected = factor * np.mean(e * turn**-order).real / 0.25**order / 2**order
+        np.testing.assert_allclose(slope(2 * zeta), expected, rtol=1e-11)
+
+
 @pytest.mark.slow
 def test_restitution_of_a_pair():
     """`measured_restitution` is what an impact gives; Hunt and Crossley's implicit relation."""

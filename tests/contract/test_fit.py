@@ -311,6 +311,23 @@ def test_derivatives_that_are_no_numbers_are_left_out_or_refused():
         ji.fit(problem, bounds={"restitution": (0.5, 1.0)})
 
 
+def test_one_shot_that_gains_energy_is_named():
+    """Twelve collisions of gliders of mass 1 and 2 with e = .9; the seventh is misread by a fifth of v-."""
+    rng = np.random.default_rng(8)
+    before = rng.uniform(0.4, 0.9, 12)
+    after = (
+        before[:, None] * np.array([1 - 0.9 * 2, 1 + 0.9]) / 3 + rng.normal(size=(12, 2)) * 0.004
+    )
+    pre, scene = np.c_[before, np.zeros(12)], ji.chain([1.0, 2.0])
+    quiet = ji.fit(ji.Newton(0.8), scene, ji.Experiments(pre, after))
+    assert not any("gain energy" in line for line in quiet.warnings)
+    after[6] += before[6] * np.array([-0.2, 0.1])
+    found = ji.fit(ji.Newton(0.8), scene, ji.Experiments(pre, after))
+    (line,) = (line for line in found.warnings if "gain energy" in line)
+    assert "shot 7: " in line
+    assert line.count("shot ") == 1
+
+
 def test_turning_weighs_by_kinetic_energy():
     """A rod that strikes with its end: rad/s and m/s, with no sigma."""
     scene = ji.Scene([1.0, 0.01], [[1.0], [0.2]])

@@ -1,7 +1,5 @@
 """Inputs that gave a wrong answer, with the right one. Each stands for its kind."""
 
-import subprocess
-import sys
 import warnings
 
 import equinox as eqx
@@ -116,7 +114,7 @@ def test_arguments_that_a_law_does_not_take(make, word):
 
 
 def test_programs_of_batches_call_no_lapack():
-    """Batched triangular solves of LAPACK hang on two cores in some versions of jaxlib."""
+    """Their eliminations are written out: a batch runs alike on any number of cores."""
     scene = row_of_points(0, (-0.1, 0.1))
     law = ji.Moreau(0.5, friction=0.3)
     batch = jax.jit(jax.vmap(lambda v: ji.impact(law, scene, v).velocity))
@@ -125,7 +123,7 @@ def test_programs_of_batches_call_no_lapack():
 
 @pytest.mark.slow
 def test_programs_of_batched_motions_solve_no_systems_by_lapack():
-    """Bricks that are thrown hung on two cores, one time in a few, with derivatives or without."""
+    """As above, through all events of a motion."""
     box = ji.Box([0.2, 0.3, 0.1])
     system, law = ji.System(box, gravity=True), ji.Moreau(0.5, friction=0.3)
 
@@ -363,19 +361,17 @@ def test_restitution_of_poisson_begins_at_0(levers):
 
 @pytest.mark.slow
 def test_friction_of_many_contacts_in_single_precision_batches():
-    """Sums over batches of six axes and more crashed the process, in single precision only."""
-    script = """
-import jax, numpy as np, jimpact as ji
-bodies = ji.Bodies([ji.Block(1.0, 1.0), ji.Block(1.0, 1.0)])
-scene = bodies.scene([0.0, 0.5, 0.0, 0.1, 1.5, 0.0])
-v = np.random.default_rng(0).normal(size=(64, 6)).astype(np.float32)
-law = ji.Moreau(0.3, friction=0.4)
-one = lambda v: ji.impact(law, scene, v).velocity
-after = jax.vmap(one)(v)
-print(after.dtype, float(abs(after[:8] - np.stack([one(x) for x in v[:8]])).max()))
-"""
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr[-500:]
-    dtype, apart = done.stdout.split()
-    assert dtype == "float32"
-    assert float(apart) < 1e-4
+    """Each lane is what it is by itself, and what double precision gives."""
+    bodies = ji.Bodies([ji.Block(1.0, 1.0), ji.Block(1.0, 1.0)])
+    double = bodies.scene([0.0, 0.5, 0.0, 0.1, 1.5, 0.0]), ji.Moreau(0.3, friction=0.4)
+    velocities = np.random.default_rng(0).normal(size=(64, 6)).astype(np.float32)
+    scene, law = jax.tree.map(
+        lambda x: jnp.asarray(x, jnp.float32) if eqx.is_inexact_array(x) else x, double
+    )
+    after = jax.vmap(lambda v: ji.impact(law, scene, v).velocity)(velocities)
+    assert after.dtype == jnp.float32
+    for v, lane in zip(velocities[:8], after):
+        np.testing.assert_allclose(lane, ji.impact(law, scene, v).velocity, atol=1e-4)
+        np.testing.assert_allclose(
+            lane, ji.impact(double[1], double[0], v.astype(float)).velocity, atol=1e-4
+        )

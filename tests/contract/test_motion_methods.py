@@ -59,8 +59,20 @@ def test_options_act():
         (lambda: ji.System(ji.Column([1.0]), friction=-0.1), "`friction` must lie in"),
         (
             lambda: drop(system=ji.System(ji.Column([1.0]), friction=0.3)),
-            "`system` must have a `tangent_function` for its `friction`",
+            "`system` must have tangents for the friction of its contacts",
         ),
+        (
+            lambda: drop(law=ji.Moreau(0.5, friction=0.3), system=ji.System(ji.Column([1.0]))),
+            "`system` must have tangents for the friction of its law",
+        ),
+        (
+            lambda: drop(
+                law=ji.Moreau(0.5, friction=0.3),
+                system=ji.System(lambda q: q, [1.0], tangent_function=lambda q: None),
+            ),
+            "`system` must have tangents for the friction of its law",
+        ),
+        (lambda: ji.System(ji.Column([1.0]), gravity=-9.81), "`gravity` must be >= 0, the size"),
     ],
 )
 def test_bad_options_are_named(make, message):

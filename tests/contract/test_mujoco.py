@@ -203,7 +203,8 @@ def test_what_is_left_out_is_named():
     assert "'floor, sunk' by 0.06 m" in said
     assert "'floor, sunk': 0.3 and 0.6" in said
     assert "Torsional or rolling" in said
-    assert len(record) == 3  # one for each kind
+    assert "'limit of joint knee' by 0.175 rad" in said
+    assert len(record) == 4  # one for each kind
     np.testing.assert_array_equal(world.friction, [0.3, 0.0])
 
 

@@ -199,3 +199,18 @@ def test_statement_of_jia(wall, e, before):
     p = jia(w, state.normals.T @ np.asarray(before, float), [1.0, 2.0], e)
     after = np.asarray(before) + state.normals @ p
     np.testing.assert_allclose(lzb.velocity[0, : len(before)], after, atol=1e-3)
+
+
+def test_slopes_of_routh_in_each_restitution_at_zero():
+    """Only contact 2 does work: dv+/de_2 = M^-1 N p_c for every e_2, at 0, too; e_1, e_3 have no part."""
+    masses = np.array([1.0, 2.0, 0.5, 1.5])
+    balls, v = ji.chain(masses), np.array([0.2, 0.2, -0.7, -0.7])
+    normals = np.eye(4)[:, 1:] - np.eye(4)[:, :-1]
+    pressed = np.linalg.solve(normals.T @ (normals / masses[:, None]), [0, 0.9, 0])
+    slopes = jax.jacfwd(lambda e: ji.impact(ji.Routh(e), balls, v).velocity)
+    for e in (0.0, 0.4):
+        expected = np.zeros((4, 3))
+        expected[:, 1] = normals @ pressed / masses
+        np.testing.assert_allclose(slopes(np.array([0.0, e, 0.0])), expected, atol=1e-12)
+    backwards = jax.jacrev(lambda e: ji.impact(ji.Routh(e), balls, v).velocity)(np.zeros(3))
+    np.testing.assert_allclose(backwards, slopes(np.zeros(3)), atol=1e-12)

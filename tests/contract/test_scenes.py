@@ -405,6 +405,30 @@ def test_tangents_that_distort_friction_are_reported(mass, normals, tangents, me
     assert message is None or re.search(message, str(caught[0].message))
 
 
+@pytest.mark.parametrize("rounding", [7e-17, -3e-16, 9e-13, -9e-13])
+def test_gaps_of_rounding_are_closed(rounding):
+    """Four balls in a row by Moreau's law: (1, 0, 0, 0) becomes (-1, 1, 1, 1) / 2."""
+    gaps = np.array([0.0, rounding, -rounding])
+    masses, v = np.ones(4), [1.0, 0, 0, 0]
+    normals = np.eye(4)[:, 1:] - np.eye(4)[:, :-1]
+    for scene in (ji.chain(masses, gaps=gaps), ji.Scene(masses, normals, gaps=gaps)):
+        assert np.asarray(scene.closed).all()
+        after = ji.impact(ji.Moreau(1.0), scene, v).velocity
+        np.testing.assert_allclose(after, [-0.5, 0.5, 0.5, 0.5], atol=1e-12)
+    inside = jax.jit(lambda g: ji.chain(masses, gaps=g).gaps)(gaps)
+    assert not np.asarray(inside).any()
+    slope = jax.jacfwd(lambda g: ji.chain(masses, gaps=g).gaps)(gaps)
+    np.testing.assert_array_equal(slope, np.eye(3))
+
+
+@pytest.mark.parametrize(
+    ("gap", "said"), [(-1e-6, "-1e-06 at index 1"), (np.nan, "nan at index 1")]
+)
+def test_overlap_is_no_gap(gap, said):
+    with pytest.raises(ValueError, match=f"`gaps` must .*{said}"):
+        ji.chain([1.0] * 3, gaps=[0.0, gap])
+
+
 def test_tangents_of_bodies_are_not_reported():
     box, turned = ji.Box([1.0, 1.2, 0.8]), [0.9, 0.1, 0.3, 0.3]
     with warnings.catch_warnings():
