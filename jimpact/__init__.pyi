@@ -1,7 +1,6 @@
 """Public names and where they live: read by type checkers, and on import by `lazy_loader`."""
 
 from . import data as data, plot as plot, theory as theory
-from .audits import audit as audit, summary as summary
 from .bodies.assembly import Bodies as Bodies
 from .bodies.base import Body as Body
 from .bodies.functions import scene_from_gaps as scene_from_gaps
@@ -19,10 +18,27 @@ from .bodies.shapes import (
     Sphere as Sphere,
 )
 from .cli.study import read_study as read_study
-from .contact import (
+from .core.audits import audit as audit, summary as summary
+from .core.contact import (
     Contact as Contact,
     delassus_matrix as delassus_matrix,
     kinetic_angles as kinetic_angles,
+)
+from .core.distributions import Normal as Normal, RandomLaw as RandomLaw, Uniform as Uniform
+from .core.impacts import Impact as Impact, impact as impact, raise_on_failure as raise_on_failure
+from .core.law import (
+    Impulses as Impulses,
+    Law as Law,
+    option as option,
+    parameter as parameter,
+)
+from .core.scene import (
+    Scene as Scene,
+    chain as chain,
+    gap_velocity as gap_velocity,
+    kinetic_energy as kinetic_energy,
+    momentum as momentum,
+    velocity_change as velocity_change,
 )
 from .fits.data import Experiments as Experiments, read_experiments as read_experiments
 from .fits.fitting import (
@@ -31,6 +47,7 @@ from .fits.fitting import (
     fit_many as fit_many,
     leave_one_out as leave_one_out,
 )
+from .fits.fitting_motion import fit_motion as fit_motion
 from .fits.posterior import posterior as posterior
 from .fits.problem import FitProblem as FitProblem
 from .fits.profiles import contour as contour, profile as profile
@@ -39,13 +56,6 @@ from .fits.search import Search as Search
 from .fits.selection import (
     fit_laws as fit_laws,
     nested_test as nested_test,
-)
-from .impacts import Impact as Impact, impact as impact, raise_on_failure as raise_on_failure
-from .law import (
-    Impulses as Impulses,
-    Law as Law,
-    option as option,
-    parameter as parameter,
 )
 from .laws import REGISTRY as REGISTRY, register as register
 from .laws.binary import Binary as Binary
@@ -93,10 +103,8 @@ from .methods.comparison import (
 from .methods.scene_advice import simplest_scene as simplest_scene
 from .methods.stability import stability_map as stability_map
 from .methods.validity import validity_map as validity_map
-from .montecarlo.distributions import Normal as Normal, RandomLaw as RandomLaw, Uniform as Uniform
 from .montecarlo.run import monte_carlo as monte_carlo
 from .montecarlo.store import read_samples as read_samples
-from .motion.fitting_motion import fit_motion as fit_motion
 from .motion.methods import (
     ContactForces as ContactForces,
     EventDriven as EventDriven,
@@ -109,15 +117,7 @@ from .motion.system import (
     gravity as gravity,
 )
 from .saved import load as load
-from .scene import (
-    Scene as Scene,
-    chain as chain,
-    gap_velocity as gap_velocity,
-    kinetic_energy as kinetic_energy,
-    momentum as momentum,
-    velocity_change as velocity_change,
-)
-from .status import STATUS as STATUS
 from .theory.han_gilmore_tree import han_gilmore as han_gilmore
+from .tools.status import STATUS as STATUS
 
 __version__: str

@@ -49,7 +49,7 @@ class Mutation:
 
 # The cheapest tests first: a run ends with the first that fails.
 FLOW = (
-    "test_documents.py::test_docstrings_run[jimpact.impacts]",
+    "test_documents.py::test_docstrings_run[jimpact.core.impacts]",
     "test_values.py::test_lzb_values",
     "test_values.py::test_lzb_edges",
     "test_values.py::test_light_and_stiff_chains",
@@ -83,7 +83,7 @@ MUTATIONS = [
     Mutation("fastest becomes first", "choose", "rivals & (speed + noise >= fastest)", "rivals", ("test_binary.py::test_against_the_plain_reference[fastest]",)),
     Mutation("friction along the slip", "FrictionFlow.constants", "-slip.astype(self.friction.dtype)", "slip.astype(self.friction.dtype)", ("test_friction.py::test_disc_in_closed_form[lzb]",)),
     Mutation("friction of the other contact", "FrictionFlow.constants", "-slip.astype(self.friction.dtype) * self.friction", "-slip.astype(self.friction.dtype) * self.friction[::-1]", ("test_friction.py::test_lzb_in_the_plane",)),
-    Mutation("pulling is not reported", "_signs", "-floor", "-1000000000.0 * floor", ("test_documents.py::test_docstrings_run[jimpact.impacts]",)),
+    Mutation("pulling is not reported", "_signs", "-floor", "-1000000000.0 * floor", ("test_documents.py::test_docstrings_run[jimpact.core.impacts]",)),
     Mutation("open contacts take part", "_resolved", "law.uses_gaps", "True", ("test_own_law.py::test_what_every_law_gets_for_nothing",)),
     Mutation("oblique tangents are not reported", "_is_oblique", "known & (off > _SQUARE * bodies)", "known & False & (off > _SQUARE * bodies)", ("test_scenes.py::test_tangents_that_distort_friction_are_reported",)),
     Mutation("energies that no number holds pass", "Traced.status", "_has_scale(size, arguments[2])", "True", ("test_contract.py::test_energies_that_no_number_holds_are_out_of_range[moreau]",)),

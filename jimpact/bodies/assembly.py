@@ -9,15 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import (
-    as_float_array,
-    as_whole,
-    check_choice,
-    check_concrete,
-    check_shape,
-    check_values,
-    is_traced,
-)
 from jimpact.bodies import grid
 from jimpact.bodies.base import as_planes, lengths, number
 from jimpact.bodies.closed_pairs import ActivePairs, listed_pairs
@@ -38,8 +29,17 @@ from jimpact.bodies.rigid import (
     times,
     unit_quaternion,
 )
-from jimpact.compiling import full_precision, precise_jit
-from jimpact.scene import Scene
+from jimpact.core.scene import Scene
+from jimpact.tools.checks import (
+    as_float_array,
+    as_whole,
+    check_choice,
+    check_concrete,
+    check_shape,
+    check_values,
+    is_traced,
+)
+from jimpact.tools.compiling import full_precision, precise_jit
 
 # Bodies above which a grid finds the closed contacts, unless their `pairs` are named. Ten times
 # more, and time stepping looks at thousands of pairs in each step.

@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, as_numbers, check_shape, check_values, is_traced
 from jimpact.bodies.closed_pairs import ActivePairs
-from jimpact.compiling import full_precision, quick_jit
-from jimpact.precision import precision
-from jimpact.scene import Scene
+from jimpact.core.scene import Scene
+from jimpact.tools.checks import as_float_array, as_numbers, check_shape, check_values, is_traced
+from jimpact.tools.compiling import full_precision, quick_jit
+from jimpact.tools.precision import precision
 
 STANDARD_GRAVITY = 9.80665  # m/s^2
 CLOSED_BELOW = 1e-12  # [m] gaps this small are rounding of f(q) = 0; ten times more are, too

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.scene import Scene, sparse_scene
+from jimpact.core.scene import Scene, sparse_scene
 
 # Contacts of a pile that are computed at once; rows without contacts are left out in such blocks.
 # Ten times more: few contacts among many bodies take as long as all of them.

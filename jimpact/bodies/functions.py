@@ -6,10 +6,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jimpact._checks import as_float_array
 from jimpact.bodies.base import CLOSED_BELOW, Body, Parts, parts_at
-from jimpact.compiling import full_precision
-from jimpact.scene import Scene, check_mass
+from jimpact.core.scene import Scene, check_mass
+from jimpact.tools.checks import as_float_array
+from jimpact.tools.compiling import full_precision
 
 
 class FunctionBody(Body):

@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import is_traced
 from jimpact.bodies.closed_pairs import (
     BLOCK,
     ActivePairs,
@@ -18,7 +17,8 @@ from jimpact.bodies.distances import any_pair, round_on_round
 from jimpact.bodies.neighbours import Candidates, all_pairs, crowd_of, near_pairs
 from jimpact.bodies.rigid import ContactPoints, tangents_of
 from jimpact.bodies.shapes import inner_radii
-from jimpact.compiling import full_precision
+from jimpact.tools.checks import is_traced
+from jimpact.tools.compiling import full_precision
 
 if TYPE_CHECKING:
     from jimpact.bodies.assembly import Bodies

@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_values, needed
-from jimpact.scene import Scene
+from jimpact.core.scene import Scene
+from jimpact.tools.checks import as_float_array, check_values, needed
 
 HOW = "pip install 'jimpact[mujoco]'"
 

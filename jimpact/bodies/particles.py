@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import is_traced
 from jimpact.bodies.base import (
     CIRCLE,
     PLANAR,
@@ -17,6 +16,7 @@ from jimpact.bodies.base import (
     positive,
     positives,
 )
+from jimpact.tools.checks import is_traced
 
 
 class Corner(Body):

@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_shape, check_values
 from jimpact.bodies.base import CIRCLE, PLANAR, Body, numbered, positive, positives
-from jimpact.compiling import full_precision
+from jimpact.tools.checks import as_float_array, check_shape, check_values
+from jimpact.tools.compiling import full_precision
 
 
 class PendulumCradle(Body):

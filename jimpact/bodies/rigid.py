@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, as_numbers, check_shape, is_traced
 from jimpact.bodies.base import (
     CIRCLE,
     PLANAR,
@@ -21,7 +20,8 @@ from jimpact.bodies.base import (
     positive,
     projected,
 )
-from jimpact.compiling import full_precision
+from jimpact.tools.checks import as_float_array, as_numbers, check_shape, is_traced
+from jimpact.tools.compiling import full_precision
 
 # How far a quaternion may be from length 1. Numbers written with six digits are within; ten times
 # more, and a motion could turn a body by a visible angle before it says so.

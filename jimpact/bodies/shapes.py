@@ -7,7 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import (
+from jimpact.bodies.base import CIRCLE, lengths, number, positive, positives
+from jimpact.bodies.rigid import ContactPoints, RigidBody, Shape, rotation
+from jimpact.core.scene import check_mass
+from jimpact.tools.checks import (
     as_float_array,
     as_numbers,
     as_whole,
@@ -15,10 +18,7 @@ from jimpact._checks import (
     check_values,
     is_traced,
 )
-from jimpact.bodies.base import CIRCLE, lengths, number, positive, positives
-from jimpact.bodies.rigid import ContactPoints, RigidBody, Shape, rotation
-from jimpact.compiling import full_precision
-from jimpact.scene import check_mass
+from jimpact.tools.compiling import full_precision
 
 # [rad] of a round coin over its plane: below it the lowest points of its rims turn about the axis
 # within a few steps. Ten times more ends motions of coins that fall flat earlier.

@@ -23,10 +23,10 @@ from jimpact.cli import options
 from jimpact.cli.study import Study, impact_study, motion_study, read_study
 from jimpact.cli.study_file import NO_DATA, without_none
 from jimpact.cli.study_motion import MotionStudy
-from jimpact.files.records import Column, Table, as_data
-from jimpact.law import with_parameter
-from jimpact.progress import Steps, waiting, wrapped
-from jimpact.registry import registered_laws
+from jimpact.core.law import with_parameter
+from jimpact.core.registry import registered_laws
+from jimpact.tools.progress import Steps, waiting, wrapped
+from jimpact.tools.records import Column, Table, as_data
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure  # which takes long to import

@@ -132,7 +132,7 @@ def run_command(call: Call, arguments: list[str]) -> int:
         return command.run()
     keep_programs(command.no_cache)
     from jimpact.cli.commands import run
-    from jimpact.progress import Steps
+    from jimpact.tools.progress import Steps
 
     call.steps = Steps(call.name)
     failure = run(command, call.steps)
@@ -147,8 +147,8 @@ def parse(arguments: list[str]) -> Any:
 
     import tyro
 
-    from jimpact._checks import check_word
     from jimpact.cli.options import COMMANDS
+    from jimpact.tools.checks import check_word
 
     names = [x.name() for x in COMMANDS]
     word = arguments[0]

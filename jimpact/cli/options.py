@@ -12,8 +12,8 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import tyro
 
-from jimpact._checks import check_executor
-from jimpact.files.records import Column, Table
+from jimpact.tools.checks import check_executor
+from jimpact.tools.records import Column, Table
 
 EVERY_LAW = "all"  # in the place of a law's name
 PICTURES = (".png", ".pdf", ".svg")

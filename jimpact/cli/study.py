@@ -21,14 +21,14 @@ from jimpact.cli.study_file import (
     without_none,
 )
 from jimpact.cli.study_motion import MotionStudy, motion_study_of
+from jimpact.core.distributions import Distribution, RandomLaw
+from jimpact.core.law import Law, free_parameters_of
+from jimpact.core.scene import Scene, chain
 from jimpact.fits.data import Experiments, read_experiments
 from jimpact.fits.fitting import Fit, fit
 from jimpact.fits.parameters import OF_SPEED, default_free
 from jimpact.fits.problem import FitProblem, of_shots
 from jimpact.fits.search import Search
-from jimpact.law import Law, free_parameters_of
-from jimpact.montecarlo.distributions import Distribution, RandomLaw
-from jimpact.scene import Scene, chain
 
 # Keys of the tables, and the arguments that they are: of `chain`, of `Body.scene`, of
 # `read_experiments`, of `monte_carlo`.

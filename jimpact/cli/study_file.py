@@ -13,16 +13,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import jimpact as ji
-from jimpact._checks import check_word, suggestion
 from jimpact.bodies import assembly, particles, pendulums, shapes
 from jimpact.bodies.base import Body
+from jimpact.core.law import Law
+from jimpact.core.scene import Scene
 from jimpact.fits.matrices import admissible_start
 from jimpact.fits.parameters import OF_A_SCENE, entry_of, free_parameters
 from jimpact.fits.search import Search
-from jimpact.law import Law
 from jimpact.laws import REGISTRY
 from jimpact.laws.kinematic import RestitutionMatrix
-from jimpact.scene import Scene
+from jimpact.tools.checks import check_word, suggestion
 
 STUDY = "study.toml"  # in a folder that `jimpact new` has made
 NO_DATA = "a study must have a [data] table to be fitted, but has none."

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from jimpact._checks import check_choice
 from jimpact.bodies.base import STANDARD_GRAVITY
 from jimpact.cli.study_file import (
     NO_DATA,
@@ -18,15 +17,16 @@ from jimpact.cli.study_file import (
     law_of,
     without_none,
 )
-from jimpact.files.shots_file import UNEVEN_STEPS, Positions, read_positions
+from jimpact.core.law import Law
 from jimpact.fits.fitting import Fit
+from jimpact.fits.fitting_motion import MOTION_SEARCH, fit_motion
 from jimpact.fits.parameters import default_free
-from jimpact.law import Law
-from jimpact.motion.fitting_motion import MOTION_SEARCH, fit_motion
+from jimpact.fits.shots_file import UNEVEN_STEPS, Positions, read_positions
 from jimpact.motion.methods import METHODS, Method, as_method
 from jimpact.motion.record import Motion
 from jimpact.motion.simulate import simulate
 from jimpact.motion.system import HarmonicBase, System, gravity
+from jimpact.tools.checks import check_choice
 
 GRAVITY = "gravity_m_per_s2"
 # Keys of the tables [motion] and [base], and the arguments that they are: of `simulate`, of a

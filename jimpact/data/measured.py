@@ -7,9 +7,9 @@ from importlib.resources import files
 import numpy as np
 
 from jimpact.bodies.shapes import Block, Box
-from jimpact.files.shots_file import read_shots
+from jimpact.core.scene import Scene
 from jimpact.fits.data import Experiments, read_experiments
-from jimpact.scene import Scene
+from jimpact.fits.shots_file import read_shots
 
 _DATA = files("jimpact") / "data"
 ELLIPSE_AXES = 0.035, 0.025  # m, half of each, of the measured ellipse

@@ -31,10 +31,10 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 
-from jimpact.events.stepper import Flow, any_of, total
-from jimpact.solvers.dense import COLUMNS_WRITTEN_OUT, times, unit
-from jimpact.solvers.sparse import Neighbours, neighbour_sum
-from jimpact.solvers.tridiagonal import tridiagonal_product
+from jimpact.numerics.dense import COLUMNS_WRITTEN_OUT, times, unit
+from jimpact.numerics.sparse import Neighbours, neighbour_sum
+from jimpact.numerics.stepper import Flow, any_of, total
+from jimpact.numerics.tridiagonal import tridiagonal_product
 
 
 class Phase(enum.IntEnum):

@@ -34,11 +34,11 @@ from jimpact.events.contact_flow import (
     plus_one,
     power,
 )
-from jimpact.events.stepper import any_of
-from jimpact.loops import fori_loop
-from jimpact.precision import precision
-from jimpact.solvers.dense import load_shares, regularized_once, times
-from jimpact.solvers.friction import distribute
+from jimpact.numerics.dense import load_shares, regularized_once, times
+from jimpact.numerics.friction import distribute
+from jimpact.numerics.stepper import any_of
+from jimpact.tools.loops import fori_loop
+from jimpact.tools.precision import precision
 
 # part of the unit of time. At the first touch forces are 0 and cannot decide which contacts
 # stick: those of a moment later do. Ten times more would decide by later forces.

@@ -13,8 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jimpact.contact import Contact
-from jimpact.derive import Arrays, in_lanes, without_derivatives
+from jimpact.core.contact import Contact
 from jimpact.events import implicit_steps
 from jimpact.events.contact_flow import (
     Chain,
@@ -30,14 +29,15 @@ from jimpact.events.friction_flow import FrictionFlow
 from jimpact.events.implicit_steps import ImplicitSteps
 from jimpact.events.plastic_limit import final_impulses, to_the_end
 from jimpact.events.slip import SlipFlow
-from jimpact.precision import precision
-from jimpact.solvers.dense import unit
-from jimpact.solvers.sparse import Neighbours
-from jimpact.solvers.step_impulses import descent_lengths
-from jimpact.solvers.tangential import TangentialBlock
-from jimpact.solvers.tridiagonal import Structure, Symmetric, diagonal, off_diagonal, scaled
-from jimpact.status import CODE
-from jimpact.tangents import Dual, is_dual, pushforward, value_of
+from jimpact.numerics.dense import unit
+from jimpact.numerics.derive import Arrays, in_lanes, without_derivatives
+from jimpact.numerics.sparse import Neighbours
+from jimpact.numerics.step_impulses import descent_lengths
+from jimpact.numerics.tangential import TangentialBlock
+from jimpact.numerics.tangents import Dual, is_dual, pushforward, value_of
+from jimpact.numerics.tridiagonal import Structure, Symmetric, diagonal, off_diagonal, scaled
+from jimpact.tools.precision import precision
+from jimpact.tools.status import CODE
 
 # Tolerance of a run with derivatives, as a multiple of that of values: derivatives are one or two
 # digits worse at the same one. At order 8 these two digits cost a third more steps; ten times more

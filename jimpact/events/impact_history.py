@@ -10,10 +10,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jimpact.events import implicit_steps, plastic_limit, stepper
+from jimpact.events import implicit_steps, plastic_limit
 from jimpact.events.contact_flow import ContactStates
 from jimpact.events.impact_dynamics import ImplicitProgram, ImpulseProgram
 from jimpact.events.implicit_steps import ImplicitState
+from jimpact.numerics import stepper
 
 
 def history_program(outcome: ImpulseProgram, samples: int) -> "HistoryProgram":

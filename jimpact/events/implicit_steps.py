@@ -39,11 +39,11 @@ from jimpact.events.contact_flow import (
     per_row,
     power,
 )
-from jimpact.events.driver import until_over
-from jimpact.loops import cond, scan
-from jimpact.precision import precision
-from jimpact.solvers.step_impulses import StepProblem, descent_lengths, solve
-from jimpact.tangents import dual_like, is_dual, pushforward, value_of
+from jimpact.numerics.driver import until_over
+from jimpact.numerics.step_impulses import StepProblem, descent_lengths, solve
+from jimpact.numerics.tangents import dual_like, is_dual, pushforward, value_of
+from jimpact.tools.loops import cond, scan
+from jimpact.tools.precision import precision
 
 # The stages of friction: with 1 - 1/sqrt(2) two implicit stages are of order 2 and L-stable. No
 # other value is both.

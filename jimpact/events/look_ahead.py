@@ -22,7 +22,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jimpact.events.driver import until_over
 from jimpact.events.implicit_steps import (
     FIRST,
     ImplicitState,
@@ -30,7 +29,8 @@ from jimpact.events.implicit_steps import (
     attempt,
     descent_of,
 )
-from jimpact.events.stepper import any_of
+from jimpact.numerics.driver import until_over
+from jimpact.numerics.stepper import any_of
 
 # Error of a step, as a part of the largest velocity (or root of energy) that is left. Ten times
 # more: looks see no margin where there is one; ten times less: twice the passes.

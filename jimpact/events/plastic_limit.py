@@ -21,14 +21,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jimpact.events import stepper
 from jimpact.events.contact_flow import OFTEN, ContactFlow
-from jimpact.events.driver import until_over
 from jimpact.events.look_ahead import comes_to_rest
-from jimpact.events.stepper import Mark, any_of, total
-from jimpact.loops import cond, fori_loop, scan
-from jimpact.status import CODE
-from jimpact.tangents import dual_like, pushforward, value_of
+from jimpact.numerics import stepper
+from jimpact.numerics.driver import until_over
+from jimpact.numerics.stepper import Mark, any_of, total
+from jimpact.numerics.tangents import dual_like, pushforward, value_of
+from jimpact.tools.loops import cond, fori_loop, scan
+from jimpact.tools.status import CODE
 
 # Velocity in tolerances, below which a contact that re-closed often is at rest once the rest of its
 # bounces is neglected. Ten times more: slow contacts of long chains count as plastic ones.

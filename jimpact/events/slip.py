@@ -31,10 +31,10 @@ import numpy as np
 
 from jimpact.events.contact_flow import ContactFlow, ContactStates, Frozen, as_pytree
 from jimpact.events.friction_flow import FrictionFlow
-from jimpact.events.stepper import any_of, total
-from jimpact.loops import cond
-from jimpact.solvers.dense import product, pseudoinverse, solve, times, unit
-from jimpact.solvers.friction import distribute
+from jimpact.numerics.dense import product, pseudoinverse, solve, times, unit
+from jimpact.numerics.friction import distribute
+from jimpact.numerics.stepper import any_of, total
+from jimpact.tools.loops import cond
 
 
 class Slip(enum.IntEnum):

@@ -12,7 +12,6 @@ import numpy as np
 from scipy.sparse import block_diag
 from scipy.special import chdtrc, fdtrc
 
-from jimpact.files.records import listed
 from jimpact.fits.data import ROUNDING, kept_by_corrections
 from jimpact.fits.data_checks import DATA_CHECKS, LISTED, DataBalances, Finding, findings
 from jimpact.fits.matrices import boundary, encloses
@@ -22,7 +21,8 @@ from jimpact.fits.search import MEDIAN, Solution
 from jimpact.fits.solve import RANK_TOLERANCE
 from jimpact.fits.uncertainty import uncertainty
 from jimpact.laws.kinematic import RestitutionMatrix
-from jimpact.status import STATUS
+from jimpact.tools.records import listed
+from jimpact.tools.status import STATUS
 
 # ------------------------------------------------------------------ thresholds of the fit
 LEVEL = 0.01  # of each test: how often it flags data that the law itself made

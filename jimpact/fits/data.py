@@ -10,10 +10,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_concrete, check_kind, check_values, in_numbers
 from jimpact.bodies.base import CLOSED_BELOW, Body
-from jimpact.files.shots_file import ANGULAR, LINEAR, read_shots
-from jimpact.scene import WALLS, Scene, chain, dense_mass, stackable, with_gaps
+from jimpact.core.scene import WALLS, Scene, chain, dense_mass, stackable, with_gaps
+from jimpact.fits.shots_file import ANGULAR, LINEAR, read_shots
+from jimpact.tools.checks import (
+    as_float_array,
+    check_concrete,
+    check_kind,
+    check_values,
+    in_numbers,
+)
 
 # Share of velocities, momenta and readings up to which a difference is rounding, also in files of
 # ten digits. Ten times more would take measured shots for corrected ones no more often.

@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import ndtri, stdtr, stdtrit
 
-from jimpact.files.records import listed
+from jimpact.core.scene import Scene, dense_mass
 from jimpact.fits.data import ROUNDING, Experiments, closed_normals, possible_normals
-from jimpact.scene import Scene, dense_mass
+from jimpact.tools.records import listed
 
 # ------------------------------------------------------------------ thresholds of the data
 # Defects below this share of the momentum or energy before are not reported: a good measurement of

@@ -9,8 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jimpact._checks import as_whole, check_choice, check_kind, check_values
-from jimpact.files.records import listed
+from jimpact.core.scene import Scene
 from jimpact.fits.checks import Judged, fit_warnings, unusable
 from jimpact.fits.data import Experiments
 from jimpact.fits.observables import COARSE_RTOL
@@ -45,8 +44,9 @@ from jimpact.fits.uncertainty import (
     check_squares,
     uncertainty,
 )
-from jimpact.progress import progress_bar
-from jimpact.scene import Scene
+from jimpact.tools.checks import as_whole, check_choice, check_kind, check_values
+from jimpact.tools.progress import progress_bar
+from jimpact.tools.records import listed
 
 
 def fit(

@@ -13,14 +13,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.compiling import full_precision, quick_jit
-from jimpact.contact import decoupled, delassus_matrix, kinetic_norm
-from jimpact.law import Law
+from jimpact.core.contact import decoupled, delassus_matrix, kinetic_norm
+from jimpact.core.law import Law
+from jimpact.core.scene import Scene
 from jimpact.laws.kinematic import RestitutionMatrix
-from jimpact.scene import Scene
-from jimpact.solvers.lcp import solve_lcp
-from jimpact.solvers.tridiagonal import as_matrix, scaled
-from jimpact.status import CODE
+from jimpact.numerics.lcp import solve_lcp
+from jimpact.numerics.tridiagonal import as_matrix, scaled
+from jimpact.tools.compiling import full_precision, quick_jit
+from jimpact.tools.status import CODE
 
 if TYPE_CHECKING:
     from jimpact.fits.problem import FitProblem

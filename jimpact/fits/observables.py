@@ -10,13 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.contact import contact_of
+from jimpact.core.contact import contact_of
+from jimpact.core.impacts import impact
+from jimpact.core.law import AnyLaw, Law
+from jimpact.core.scene import Scene
 from jimpact.fits.data import Experiments
 from jimpact.fits.parameters import placed
-from jimpact.impacts import impact
-from jimpact.law import AnyLaw, Law
-from jimpact.scene import Scene
-from jimpact.status import CODE, sign_tolerance
+from jimpact.tools.status import CODE, sign_tolerance
 
 # Outcomes whose velocities are meaningless.
 UNUSABLE = ("infeasible", "max_steps", "not_finite")

@@ -10,9 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import ABBREVIATIONS, check_kind, suggestion
-from jimpact.contact import Contact
-from jimpact.law import (
+from jimpact.core.contact import Contact
+from jimpact.core.law import (
     Domain,
     Impulses,
     Law,
@@ -24,8 +23,9 @@ from jimpact.law import (
     parameters_of,
     with_parameter,
 )
+from jimpact.core.scene import Scene, with_gaps
 from jimpact.laws.kinematic import RestitutionMatrix
-from jimpact.scene import Scene, with_gaps
+from jimpact.tools.checks import ABBREVIATIONS, check_kind, suggestion
 
 AnyLaw = TypeVar("AnyLaw", bound=Law)  # what goes in as LZB comes out as LZB
 Limits = tuple[np.ndarray, np.ndarray]  # lowest and highest values (P,)

@@ -9,13 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_whole, check_choice, needed
-from jimpact.compiling import known_options
+from jimpact.core.distributions import Normal, Uniform
 from jimpact.fits.fitting import Fit
 from jimpact.fits.parameters import mean_and_std
 from jimpact.fits.problem import FitProblem
 from jimpact.fits.uncertainty import check_squares
-from jimpact.montecarlo.distributions import Normal, Uniform
+from jimpact.tools.checks import as_whole, check_choice, needed
+from jimpact.tools.compiling import known_options
 
 HOW = 'pip install "jimpact[bayes]"'
 # Chains begin inside: at the end of a domain the sampler's own coordinate is infinite.

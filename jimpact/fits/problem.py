@@ -15,15 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import (
-    as_float_array,
-    check_concrete,
-    check_function,
-    check_kind,
-    check_shape,
-    check_values,
-)
-from jimpact.compiling import full_precision
+from jimpact.core.law import Law, forward_only
+from jimpact.core.scene import Scene, dense_mass, stackable
 from jimpact.fits.data import Experiments, kept_by_corrections
 from jimpact.fits.matrices import AdmissibleMatrices, matrix_region
 from jimpact.fits.observables import (
@@ -55,8 +48,15 @@ from jimpact.fits.parameters import (
     with_parts_of_scene,
 )
 from jimpact.fits.solve import EXACT, outcome_at
-from jimpact.law import Law, forward_only
-from jimpact.scene import Scene, dense_mass, stackable
+from jimpact.tools.checks import (
+    as_float_array,
+    check_concrete,
+    check_function,
+    check_kind,
+    check_shape,
+    check_values,
+)
+from jimpact.tools.compiling import full_precision
 
 # A trial whose outcome is meaningless gets a residual far above any honest one, so that a solver
 # turns back; inadmissible or energetic outcomes are only reported.

@@ -13,12 +13,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jimpact._checks import as_whole, check_choice, check_kind
 from jimpact.fits.parameters import as_names, scaled, unscaled
 from jimpact.fits.search import SAME_VALUE, START_SCALES, FitMinimum, find_minima, solution
 from jimpact.fits.solve import RANK_TOLERANCE, Ends, Solver, minimize
 from jimpact.fits.uncertainty import Fit, Profile, check_level
-from jimpact.progress import Show, progress_bar
+from jimpact.tools.checks import as_whole, check_choice, check_kind
+from jimpact.tools.progress import Show, progress_bar
 
 # Deviances are right to this (see `solve.FINE`): the ends of an interval move by less than END. A
 # search that goes on after so many passes creeps along a kink. It begins near its end.

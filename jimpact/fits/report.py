@@ -14,10 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import jimpact
-from jimpact.files.records import as_data, with_error
+from jimpact.core.law import StaticNumber, StaticNumbers
 from jimpact.fits.parameters import Prior, value_of
-from jimpact.law import StaticNumber, StaticNumbers
-from jimpact.status import STATUS
+from jimpact.tools.records import as_data, with_error
+from jimpact.tools.status import STATUS
 
 if TYPE_CHECKING:
     from jimpact.fits.uncertainty import Fit  # which imports this module

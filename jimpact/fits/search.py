@@ -9,7 +9,6 @@ import jax
 import numpy as np
 from scipy.special import chdtrc
 
-from jimpact.compiling import quick_jit
 from jimpact.fits.observables import Shots
 from jimpact.fits.solve import (
     COARSE,
@@ -24,6 +23,7 @@ from jimpact.fits.solve import (
     outcome_at,
     stacked,
 )
+from jimpact.tools.compiling import quick_jit
 
 if TYPE_CHECKING:
     from jimpact.fits.problem import FitProblem

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.special import chdtrc, fdtrc, stdtr
 
-from jimpact._checks import check_choice, check_kind
-from jimpact.files.records import Column, Table, Tabular, as_data
+from jimpact.core.law import Law, free_parameters_of, with_parameter
+from jimpact.core.registry import REGISTRY, registered_laws, simplest_first
+from jimpact.core.scene import Scene
 from jimpact.fits.data import Experiments
 from jimpact.fits.fitting import Fit, fit, leave_one_out, rms
 from jimpact.fits.matrices import admissible_start
@@ -19,12 +20,11 @@ from jimpact.fits.profiles import needs_profiles, profile
 from jimpact.fits.report import named_values
 from jimpact.fits.search import Search
 from jimpact.fits.uncertainty import check_squares
-from jimpact.law import Law, free_parameters_of, with_parameter
 from jimpact.laws.velocity_dependent import VelocityDependent
-from jimpact.progress import progress_bar
-from jimpact.registry import REGISTRY, registered_laws, simplest_first
-from jimpact.scene import Scene
-from jimpact.status import STATUS
+from jimpact.tools.checks import check_choice, check_kind
+from jimpact.tools.progress import progress_bar
+from jimpact.tools.records import Column, Table, Tabular, as_data
+from jimpact.tools.status import STATUS
 
 RESTITUTION = 0.8  # start value by default
 SPEED_EXPONENT = 0.1  # start of a dependence on the speed

@@ -17,9 +17,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import suggestion
-from jimpact.compiling import quick_jit
-from jimpact.progress import Show
+from jimpact.tools.checks import suggestion
+from jimpact.tools.compiling import quick_jit
+from jimpact.tools.progress import Show
 
 if TYPE_CHECKING:
     import optax  # which takes long to import

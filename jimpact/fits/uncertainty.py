@@ -11,16 +11,16 @@ import numpy as np
 from scipy.linalg import qr
 from scipy.special import ndtri, stdtrit
 
-from jimpact._checks import check_choice, check_kind, check_shape, check_values
-from jimpact.files.records import Column, Table, Tabular
+from jimpact.core.law import parameters_of
+from jimpact.core.scene import Scene
 from jimpact.fits.data import Experiments
 from jimpact.fits.parameters import AnyLaw, LawInScene, tied_names, tied_value
 from jimpact.fits.problem import FitProblem
 from jimpact.fits.report import as_record, pieces_in_words, report, save_fit, verdict
 from jimpact.fits.search import FitMinimum, Solution, solution
 from jimpact.fits.solve import RANK_TOLERANCE, outcome_at
-from jimpact.law import parameters_of
-from jimpact.scene import Scene
+from jimpact.tools.checks import check_choice, check_kind, check_shape, check_values
+from jimpact.tools.records import Column, Table, Tabular
 
 # A parameter takes part in an undetermined combination if its share of that direction exceeds this;
 # shares of parameters that take no part are errors of the derivatives, about 1e-6.

@@ -2,6 +2,7 @@
 
 from importlib.resources import files
 
+from jimpact.core.registry import EVERY_PROPERTY, REGISTRY, Row, register
 from jimpact.laws.binary import Binary
 from jimpact.laws.compliant import Compliant, make_compliant
 from jimpact.laws.impulse_correlation import ImpulseCorrelation
@@ -10,7 +11,6 @@ from jimpact.laws.lzb import LZB
 from jimpact.laws.poisson import Poisson
 from jimpact.laws.routh import Routh
 from jimpact.laws.velocity_dependent import VelocityDependent, make_velocity_dependent
-from jimpact.registry import EVERY_PROPERTY, REGISTRY, Row, register
 
 __all__ = ["REGISTRY", "Row", "register"]
 

@@ -7,14 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_whole, check_values, in_common_dtype
-from jimpact.compiling import full_precision, precise_jit
-from jimpact.contact import Contact
-from jimpact.law import Impulses, Law, OptionalValues, Values, check_law, option, parameter
+from jimpact.core.contact import Contact
+from jimpact.core.law import Impulses, Law, OptionalValues, Values, check_law, option, parameter
+from jimpact.core.scene import Scene, as_velocity, velocity_change
+from jimpact.laws import collisions
 from jimpact.laws.friction import friction_fields
-from jimpact.scene import Scene, as_velocity, velocity_change
-from jimpact.solvers import collisions
-from jimpact.solvers.tridiagonal import Tridiagonal
+from jimpact.numerics.tridiagonal import Tridiagonal
+from jimpact.tools.checks import as_whole, check_values, in_common_dtype
+from jimpact.tools.compiling import full_precision, precise_jit
 
 ORDERS = ("fastest", "earliest", "left_to_right")
 

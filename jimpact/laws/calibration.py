@@ -10,13 +10,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jimpact._checks import as_float_array, check_values
-from jimpact.compiling import precise_jit
-from jimpact.impacts import impact
-from jimpact.law import with_parameter
+from jimpact.core.impacts import impact
+from jimpact.core.law import with_parameter
+from jimpact.core.scene import chain
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Force, UserForce
-from jimpact.scene import chain
+from jimpact.tools.checks import as_float_array, check_values
+from jimpact.tools.compiling import precise_jit
 
 # Tolerance of the pair's impact (else the law's default): the calibrated e is right to as many
 # digits. Ten times more loses one of them.

@@ -7,10 +7,9 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 
-from jimpact._checks import check_choice, check_values
-from jimpact.compiling import full_precision
-from jimpact.contact import Contact
-from jimpact.derive import ADJOINTS
+from jimpact.core.contact import Contact
+from jimpact.core.law import Impulses, Law, OptionalValues, Values, option, parameter
+from jimpact.core.scene import Scene
 from jimpact.events.contact_flow import Viscous
 from jimpact.events.impact_dynamics import (
     METHODS,
@@ -19,11 +18,12 @@ from jimpact.events.impact_dynamics import (
     sides_of,
     solve,
 )
-from jimpact.law import Impulses, Law, OptionalValues, Values, option, parameter
 from jimpact.laws.forces import Bistiffness, Force, HuntCrossley, KelvinVoigt, KuwabaraKono
 from jimpact.laws.lzb import check_friction, check_rtol, solver_of
-from jimpact.scene import Scene
-from jimpact.solvers.tridiagonal import diagonal
+from jimpact.numerics.derive import ADJOINTS
+from jimpact.numerics.tridiagonal import diagonal
+from jimpact.tools.checks import check_choice, check_values
+from jimpact.tools.compiling import full_precision
 
 
 class Compliant(Law):

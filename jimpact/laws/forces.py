@@ -12,9 +12,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jimpact._checks import as_float_array, check_function
-from jimpact.law import LARGEST_EXPONENT, Declared, StaticOrValues, Values, parameter
-from jimpact.loops import fori_loop
+from jimpact.core.law import LARGEST_EXPONENT, Declared, StaticOrValues, Values, parameter
+from jimpact.tools.checks import as_float_array, check_function
+from jimpact.tools.loops import fori_loop
 
 _SEARCH = (-60.0, 60.0)  # decades [m] in which the indentation scale of a force is searched
 _BISECTIONS = 50  # halvings of these decades, to about 1e-13 of one

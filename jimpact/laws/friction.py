@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import is_traced
-from jimpact.contact import Contact
-from jimpact.law import Impulses
-from jimpact.solvers.friction import solve
+from jimpact.core.contact import Contact
+from jimpact.core.law import Impulses
+from jimpact.numerics.friction import solve
+from jimpact.tools.checks import is_traced
 
 
 def friction_fields(friction: Any, tangential_restitution: Any) -> tuple[Any, Any]:

@@ -7,14 +7,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jimpact._checks import as_whole, check_values, in_common_dtype
-from jimpact.compiling import full_precision, quick_jit
-from jimpact.derive import in_lanes, naming_the_adjoint
+from jimpact.core.impacts import NO_OFFSETS, Traced, check_constrained
+from jimpact.core.law import Law, check_law
+from jimpact.core.scene import Scene, as_velocity, gap_velocity, velocity_change
 from jimpact.events.contact_flow import ContactStates
 from jimpact.events.impact_history import history_program
-from jimpact.impacts import NO_OFFSETS, Traced, check_constrained
-from jimpact.law import Law, check_law
-from jimpact.scene import Scene, as_velocity, gap_velocity, velocity_change
+from jimpact.numerics.derive import in_lanes, naming_the_adjoint
+from jimpact.tools.checks import as_whole, check_values, in_common_dtype
+from jimpact.tools.compiling import full_precision, quick_jit
 
 
 class History(eqx.Module):

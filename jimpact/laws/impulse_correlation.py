@@ -6,14 +6,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import is_traced
-from jimpact.compiling import full_precision
-from jimpact.contact import Contact, delassus_matrix
-from jimpact.law import Impulses, Law, Values, option, parameter
-from jimpact.precision import precision
-from jimpact.scene import Scene
-from jimpact.solvers import collisions
-from jimpact.solvers.tridiagonal import as_matrix
+from jimpact.core.contact import Contact, delassus_matrix
+from jimpact.core.law import Impulses, Law, Values, option, parameter
+from jimpact.core.scene import Scene
+from jimpact.laws import collisions
+from jimpact.numerics.tridiagonal import as_matrix
+from jimpact.tools.checks import is_traced
+from jimpact.tools.compiling import full_precision
+from jimpact.tools.precision import precision
 
 # Relative excess of a ratio over an end of its interval that is rounding. Ten times more would
 # still be far below what a measurement resolves.

@@ -7,18 +7,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import check_shape, is_traced
-from jimpact.compiling import full_precision
-from jimpact.contact import Contact
-from jimpact.law import Impulses, Law, OptionalValues, Values, option, parameter
+from jimpact.core.contact import Contact
+from jimpact.core.law import Impulses, Law, OptionalValues, Values, option, parameter
+from jimpact.core.quasi_space import check_independent, quasi_basis
+from jimpact.core.scene import Scene, momentum
 from jimpact.laws.friction import friction_fields, frictional_impulses
-from jimpact.precision import precision
-from jimpact.quasi_space import check_independent, quasi_basis
-from jimpact.scene import Scene, momentum
-from jimpact.solvers.dense import solve_symmetric
-from jimpact.solvers.lcp import solve_lcp
-from jimpact.solvers.tridiagonal import as_matrix, diagonal, is_regular
-from jimpact.status import CODE
+from jimpact.numerics.dense import solve_symmetric
+from jimpact.numerics.lcp import solve_lcp
+from jimpact.numerics.tridiagonal import as_matrix, diagonal, is_regular
+from jimpact.tools.checks import check_shape, is_traced
+from jimpact.tools.compiling import full_precision
+from jimpact.tools.precision import precision
+from jimpact.tools.status import CODE
 
 
 class Kinematic(Law):

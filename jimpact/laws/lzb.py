@@ -5,18 +5,8 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.compiling import full_precision
-from jimpact.contact import Contact
-from jimpact.derive import ADJOINTS
-from jimpact.events.impact_dynamics import (
-    METHODS,
-    Dynamics,
-    dimensionless,
-    method_for,
-    sides_of,
-    solve,
-)
-from jimpact.law import (
+from jimpact.core.contact import Contact
+from jimpact.core.law import (
     LARGEST_EXPONENT,
     Impulses,
     Law,
@@ -26,9 +16,19 @@ from jimpact.law import (
     option,
     parameter,
 )
+from jimpact.core.scene import Scene
+from jimpact.events.impact_dynamics import (
+    METHODS,
+    Dynamics,
+    dimensionless,
+    method_for,
+    sides_of,
+    solve,
+)
 from jimpact.laws.forces import Bistiffness
-from jimpact.precision import precision
-from jimpact.scene import Scene
+from jimpact.numerics.derive import ADJOINTS
+from jimpact.tools.compiling import full_precision
+from jimpact.tools.precision import precision
 
 # Tolerances of v+ if the law has no `rtol`, relative to max |v-|. Ten times more would make every
 # outcome right to one digit less.

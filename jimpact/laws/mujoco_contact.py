@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import brentq
 
-from jimpact._checks import check_shape, check_values
+from jimpact.tools.checks import check_shape, check_values
 
 # MuJoCo keeps impedances, and the middle of their rise, at least this far from 0 and from 1.
 _LEAST_IMPEDANCE = 1e-4

@@ -5,16 +5,16 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 
-from jimpact.compiling import full_precision
-from jimpact.contact import Contact
-from jimpact.law import Impulses, Law, OptionalValues, Values, option, parameter
+from jimpact.core.contact import Contact
+from jimpact.core.law import Impulses, Law, OptionalValues, Values, option, parameter
 from jimpact.laws.friction import friction_fields
-from jimpact.precision import precision, without_rounding
-from jimpact.solvers.dense import null_projector
-from jimpact.solvers.friction import solve
-from jimpact.solvers.lcp import solve_lcp
-from jimpact.solvers.tridiagonal import as_matrix, is_regular
-from jimpact.status import CODE
+from jimpact.numerics.dense import null_projector
+from jimpact.numerics.friction import solve
+from jimpact.numerics.lcp import solve_lcp
+from jimpact.numerics.tridiagonal import as_matrix, is_regular
+from jimpact.tools.compiling import full_precision
+from jimpact.tools.precision import precision, without_rounding
+from jimpact.tools.status import CODE
 
 
 class Poisson(Law):

@@ -2,10 +2,10 @@
 
 import jax.numpy as jnp
 
-from jimpact.compiling import full_precision
-from jimpact.contact import Contact
-from jimpact.law import Impulses, Law, Values, parameter
-from jimpact.solvers.lcp import solve_lcp
+from jimpact.core.contact import Contact
+from jimpact.core.law import Impulses, Law, Values, parameter
+from jimpact.numerics.lcp import solve_lcp
+from jimpact.tools.compiling import full_precision
 
 
 class Routh(Law):

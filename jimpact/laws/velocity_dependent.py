@@ -6,11 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_kind
-from jimpact.compiling import full_precision
-from jimpact.contact import Contact
-from jimpact.events.impact_dynamics import Dynamics
-from jimpact.law import (
+from jimpact.core.contact import Contact
+from jimpact.core.law import (
     Impulses,
     Law,
     OptionalValues,
@@ -20,10 +17,13 @@ from jimpact.law import (
     parameter,
     with_parameter,
 )
-from jimpact.loops import while_loop
-from jimpact.precision import precision
-from jimpact.registry import REGISTRY
-from jimpact.solvers.tridiagonal import as_matrix, diagonal
+from jimpact.core.registry import REGISTRY
+from jimpact.events.impact_dynamics import Dynamics
+from jimpact.numerics.tridiagonal import as_matrix, diagonal
+from jimpact.tools.checks import as_float_array, check_kind
+from jimpact.tools.compiling import full_precision
+from jimpact.tools.loops import while_loop
+from jimpact.tools.precision import precision
 
 
 @forwards_to_law

@@ -10,14 +10,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_whole, check_per_contact, check_shape, check_values
-from jimpact.compiling import full_precision
-from jimpact.contact import components, kinetic_angles
-from jimpact.impacts import impact
-from jimpact.law import Law, check_law, free_parameters_of, options_of
+from jimpact.core.contact import components, kinetic_angles
+from jimpact.core.impacts import impact
+from jimpact.core.law import Law, check_law, free_parameters_of, options_of
+from jimpact.core.registry import ADVISED, registered_laws, simplest_first
+from jimpact.core.scene import (
+    Scene,
+    as_velocity,
+    dense_mass,
+    gap_velocity,
+    solve_mass,
+    velocity_change,
+    with_gaps,
+)
 from jimpact.laws.binary import Binary
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Bistiffness
+from jimpact.laws.gap_scale import gap_scale
 from jimpact.laws.lzb import LZB, default_rtol
 from jimpact.methods.advice_report import Advice, Candidate, ContactBlock, Unknown
 from jimpact.methods.points import (
@@ -28,20 +37,11 @@ from jimpact.methods.points import (
     in_turns,
     varied_impacts,
 )
-from jimpact.montecarlo.gaps import gap_scale
-from jimpact.precision import precision
-from jimpact.progress import counting_bar
-from jimpact.registry import ADVISED, registered_laws, simplest_first
-from jimpact.scene import (
-    Scene,
-    as_velocity,
-    dense_mass,
-    gap_velocity,
-    solve_mass,
-    velocity_change,
-    with_gaps,
-)
-from jimpact.status import STATUS
+from jimpact.tools.checks import as_whole, check_per_contact, check_shape, check_values
+from jimpact.tools.compiling import full_precision
+from jimpact.tools.precision import precision
+from jimpact.tools.progress import counting_bar
+from jimpact.tools.status import STATUS
 
 # Smallest tolerance over the reference's rtol. Ten times more would refuse 1e-6; ten times
 # less would let the reference's error enter.

@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jimpact.files.records import Column, Table, Tabular, as_data, fields_as_data, listed
-from jimpact.law import Declared, Law, parameters_of
+from jimpact.core.law import Declared, Law, parameters_of
+from jimpact.core.scene import Scene
 from jimpact.methods.points import left_out_notes
-from jimpact.scene import Scene
-from jimpact.status import CODE, STATUS
+from jimpact.tools.records import Column, Table, Tabular, as_data, fields_as_data, listed
+from jimpact.tools.status import CODE, STATUS
 
 _WIDTH = 80  # characters of the printed lines
 _NAMED = 4  # unknown stiffnesses named one by one; the others are "..."

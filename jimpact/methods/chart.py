@@ -11,19 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import (
-    as_axis,
-    as_whole,
-    check_choice,
-    check_kind,
-    check_values,
-    in_common_dtype,
-)
-from jimpact.compiling import full_precision
-from jimpact.files.records import Column, Table, Tabular, fields_as_data, microseconds
+from jimpact.core.impacts import impact
+from jimpact.core.law import Law, check_law
+from jimpact.core.registry import registered_laws
+from jimpact.core.scene import Scene, as_velocity, kinetic_energy
 from jimpact.fits.parameters import with_entries
-from jimpact.impacts import impact
-from jimpact.law import Law, check_law
 from jimpact.laws.lzb import LZB
 from jimpact.methods.contenders import CONTENDERS, Contender, contenders_of, solved
 from jimpact.methods.points import (
@@ -34,10 +26,18 @@ from jimpact.methods.points import (
     left_out_notes,
     relative_error,
 )
-from jimpact.progress import counting_bar
-from jimpact.registry import registered_laws
-from jimpact.scene import Scene, as_velocity, kinetic_energy
-from jimpact.status import STATUS
+from jimpact.tools.checks import (
+    as_axis,
+    as_whole,
+    check_choice,
+    check_kind,
+    check_values,
+    in_common_dtype,
+)
+from jimpact.tools.compiling import full_precision
+from jimpact.tools.progress import counting_bar
+from jimpact.tools.records import Column, Table, Tabular, fields_as_data, microseconds
+from jimpact.tools.status import STATUS
 
 QUANTITIES = ("velocity", "impulse", "energy", "duration", "gradient")
 ALGEBRAIC = ("newton", "moreau", "poisson", "binary")

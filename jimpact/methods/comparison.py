@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from jimpact._checks import check_kind
-from jimpact.audits import Audit, audit, nothing_approaches
-from jimpact.files.records import Column, Table, Tabular, as_data, fields_as_data, microseconds
-from jimpact.impacts import Impact, impact
-from jimpact.law import Law
+from jimpact.core.audits import Audit, audit, nothing_approaches
+from jimpact.core.impacts import Impact, impact
+from jimpact.core.law import Law
+from jimpact.core.registry import registered_laws
+from jimpact.core.scene import Scene, as_velocity, dense_mass
 from jimpact.methods.points import at_points, in_turns, left_out_notes, seconds
-from jimpact.registry import registered_laws
-from jimpact.scene import Scene, as_velocity, dense_mass
-from jimpact.status import STATUS
 from jimpact.theory.dispersion import dispersion_index, energy_ratio
+from jimpact.tools.checks import check_kind
+from jimpact.tools.records import Column, Table, Tabular, as_data, fields_as_data, microseconds
+from jimpact.tools.status import STATUS
 
 _REPEATS = 20  # of the timing, whose median is reported
 AS_CLOSE = 1.01  # distances from the measured velocities up to this ratio count as equal

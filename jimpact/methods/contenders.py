@@ -20,15 +20,15 @@ import diffrax
 import jax
 import numpy as np
 
-from jimpact._checks import check_choice, short_repr
-from jimpact.contact import Contact
-from jimpact.impacts import Impact, impact
-from jimpact.law import Impulses, Law
+from jimpact.core.contact import Contact
+from jimpact.core.impacts import Impact, impact
+from jimpact.core.law import Impulses, Law
+from jimpact.core.scene import Scene
 from jimpact.laws.lzb import LZB
 from jimpact.methods import schemes
 from jimpact.methods.points import Outcomes, Solution as Solution
 from jimpact.methods.schemes import Solve
-from jimpact.scene import Scene
+from jimpact.tools.checks import check_choice, short_repr
 
 SETTING_KINDS = ("rtol", "step", "impulse step")  # what `Contender.setting` may be
 

@@ -9,12 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.compiling import precise_jit
+from jimpact.core.impacts import Impact, impact
+from jimpact.core.law import Law
+from jimpact.core.scene import Scene, dense_mass, with_gaps
 from jimpact.fits.parameters import with_entries
-from jimpact.impacts import Impact, impact
-from jimpact.law import Law
-from jimpact.scene import Scene, dense_mass, with_gaps
-from jimpact.status import CODE, STATUS
+from jimpact.tools.compiling import precise_jit
+from jimpact.tools.status import CODE, STATUS
 
 Result = TypeVar("Result")
 

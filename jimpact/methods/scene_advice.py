@@ -10,15 +10,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_whole, check_kind, check_shape, check_values
-from jimpact.contact import delassus_matrix
-from jimpact.files.records import Column, Table, Tabular, fields_as_data, listed
-from jimpact.law import Law, check_law
+from jimpact.core.contact import delassus_matrix
+from jimpact.core.law import Law, check_law
+from jimpact.core.scene import Scene, as_velocity, gap_velocity, with_gaps
 from jimpact.methods.advice import blocks_of
 from jimpact.methods.advice_report import ContactBlock, share
 from jimpact.methods.points import EnergyNorm, Outcomes, in_batches, varied_impacts
-from jimpact.scene import Scene, as_velocity, gap_velocity, with_gaps
-from jimpact.solvers.tridiagonal import diagonal
+from jimpact.numerics.tridiagonal import diagonal
+from jimpact.tools.checks import as_whole, check_kind, check_shape, check_values
+from jimpact.tools.records import Column, Table, Tabular, fields_as_data, listed
 
 # Impacts computed together, and the entries of their Delassus matrices. Ten times more take ten
 # times the memory, a gigabyte, and are not faster.

@@ -31,20 +31,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, in_common_dtype
-from jimpact.compiling import precise_jit
+from jimpact.core.scene import Scene
 from jimpact.events.contact_flow import power
 from jimpact.events.impact_dynamics import Dynamics, evaluate, first_indentation
 from jimpact.events.implicit_steps import FORCES_A_STEP
-from jimpact.events.stepper import STAGES
 from jimpact.laws.lzb import LZB
 from jimpact.methods.points import UNCOUNTED, Solution
-from jimpact.scene import Scene
-from jimpact.solvers.dense import unit
-from jimpact.solvers.sparse import Neighbours, Sparse
-from jimpact.solvers.tangential import per_tangent
-from jimpact.solvers.tridiagonal import Tridiagonal, as_matrix
-from jimpact.status import CODE
+from jimpact.numerics.dense import unit
+from jimpact.numerics.sparse import Neighbours, Sparse
+from jimpact.numerics.stepper import STAGES
+from jimpact.numerics.tangential import per_tangent
+from jimpact.numerics.tridiagonal import Tridiagonal, as_matrix
+from jimpact.tools.checks import as_float_array, in_common_dtype
+from jimpact.tools.compiling import precise_jit
+from jimpact.tools.status import CODE
 
 # Part of the largest energy below which that of a contact is rounding, and the contact unloaded.
 # Ten times more would unload contacts that still push.

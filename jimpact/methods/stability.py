@@ -23,16 +23,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_axis, as_whole, check_choice, check_kind, check_values
-from jimpact.audits import audit
-from jimpact.compiling import full_precision
-from jimpact.files.records import Column, Table, Tabular, as_data, fields_as_data
+from jimpact.core.audits import audit
+from jimpact.core.scene import Scene, as_velocity, chain
 from jimpact.laws.lzb import LZB
 from jimpact.methods.contenders import CONTENDERS, Contender, contenders_of, solved
 from jimpact.methods.points import Outcomes, at_points, in_batches, left_out_notes, relative_error
-from jimpact.progress import counting_bar
-from jimpact.scene import Scene, as_velocity, chain
-from jimpact.status import CODE
+from jimpact.tools.checks import as_axis, as_whole, check_choice, check_kind, check_values
+from jimpact.tools.compiling import full_precision
+from jimpact.tools.progress import counting_bar
+from jimpact.tools.records import Column, Table, Tabular, as_data, fields_as_data
+from jimpact.tools.status import CODE
 
 BALLS = (2, 3, 5, 10, 30, 100)  # numbers of balls, of the axis N of the maps
 # Each number of balls is compiled by itself: below this resolution only a few.

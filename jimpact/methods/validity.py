@@ -9,16 +9,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_axis, as_numbers, check_choice, check_values
-from jimpact.files.records import Column, Table, Tabular, fields_as_data
-from jimpact.impacts import impact
+from jimpact.core.impacts import impact
+from jimpact.core.scene import Scene, as_velocity
 from jimpact.laws.binary import Binary
 from jimpact.laws.kinematic import Moreau
 from jimpact.laws.lzb import LZB
 from jimpact.methods.points import relative_error, varied_impacts
-from jimpact.scene import Scene, as_velocity
-from jimpact.status import STATUS
 from jimpact.theory.dispersion import dispersion_index
+from jimpact.tools.checks import as_axis, as_numbers, check_choice, check_values
+from jimpact.tools.records import Column, Table, Tabular, fields_as_data
+from jimpact.tools.status import STATUS
 
 RATIOS = (1e-3, 1e3, 121)  # default ratios: from, to, how many
 

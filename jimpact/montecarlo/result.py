@@ -6,9 +6,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from jimpact._checks import as_float_array, check_values
-from jimpact.files.records import Column, Table, Tabular, as_data, fields_as_data
-from jimpact.law import Law
+from jimpact.core.law import Law
+from jimpact.core.scene import Scene
 from jimpact.montecarlo.samples import Run
 from jimpact.montecarlo.statistics import (
     IN_MEMORY,
@@ -19,7 +18,8 @@ from jimpact.montecarlo.statistics import (
     named,
     part,
 )
-from jimpact.scene import Scene
+from jimpact.tools.checks import as_float_array, check_values
+from jimpact.tools.records import Column, Table, Tabular, as_data, fields_as_data
 
 DELTA_C = "delta_c: indentation of a contact at the largest approach speed of the scene"
 REPORTED = (0.05, 0.5, 0.95)  # quantiles in the report

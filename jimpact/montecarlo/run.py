@@ -15,15 +15,15 @@ from typing import Any
 import jax
 import numpy as np
 
-from jimpact._checks import check_executor, in_common_dtype, needed
-from jimpact.law import Law
-from jimpact.montecarlo.gaps import gap_scale
+from jimpact.core.law import Law
+from jimpact.core.scene import Scene
+from jimpact.laws.gap_scale import gap_scale
 from jimpact.montecarlo.result import MonteCarlo, result_of
 from jimpact.montecarlo.samples import Run, Sources, planned_run
 from jimpact.montecarlo.statistics import Chunk, Task, joined
 from jimpact.montecarlo.store import Store
-from jimpact.progress import counting_bar
-from jimpact.scene import Scene
+from jimpact.tools.checks import check_executor, in_common_dtype, needed
+from jimpact.tools.progress import counting_bar
 
 CHUNK = 4096  # samples: fast on a CPU for cheap and costly laws alike; a GPU wants more
 BINS = 1000  # of a histogram; ten times more: quantiles finer than 100 000 samples determine them

@@ -19,14 +19,14 @@ import jax.numpy as jnp
 import numpy as np
 
 import jimpact
-from jimpact._checks import as_whole, check_kind, in_common_dtype
-from jimpact.compiling import precise_jit
-from jimpact.impacts import impact
-from jimpact.law import Law, within_domains
-from jimpact.montecarlo.distributions import Distribution, GivenRows, as_source
+from jimpact.core.distributions import Distribution, GivenRows, as_source
+from jimpact.core.impacts import impact
+from jimpact.core.law import Law, within_domains
+from jimpact.core.scene import Scene, rounded_gaps, with_gaps
 from jimpact.montecarlo.statistics import BAD_GAP, BAD_LAW, BAD_VELOCITY, Chunk, Task, reduced
 from jimpact.montecarlo.store import fingerprint
-from jimpact.scene import Scene, rounded_gaps, with_gaps
+from jimpact.tools.checks import as_whole, check_kind, in_common_dtype
+from jimpact.tools.compiling import precise_jit
 
 _WRITTEN = 6  # velocities that the report lists
 SAMPLES = 100_000  # default number of samples; ten times more: quantiles three times finer

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from jimpact.status import STATUS, Status
+from jimpact.tools.status import STATUS, Status
 
 MARGIN = 0.1  # of the first chunk's range, added on both sides: later chunks reach further
 FLAT = 1e-6  # relative half width of the range of a quantity that does not vary

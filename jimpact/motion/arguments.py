@@ -8,20 +8,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import (
+from jimpact.bodies.base import check_range
+from jimpact.core.law import Law
+from jimpact.core.scene import check_mass
+from jimpact.laws.forces import Force
+from jimpact.motion.dynamics import is_pile, mass_at, recorded_gaps, seen_from_base
+from jimpact.motion.system import System
+from jimpact.tools.checks import (
     check_per_contact,
     check_shape,
     check_values,
     is_traced,
 )
-from jimpact.bodies.base import check_range
-from jimpact.compiling import precise_jit
-from jimpact.law import Law
-from jimpact.laws.forces import Force
-from jimpact.motion.dynamics import is_pile, mass_at, recorded_gaps, seen_from_base
-from jimpact.motion.system import System
-from jimpact.precision import precision
-from jimpact.scene import check_mass
+from jimpact.tools.compiling import precise_jit
+from jimpact.tools.precision import precision
 
 MOST_STEPS = np.iinfo(np.int32).max  # they are counted in 32 bits
 # Instants at which the base must be finite before a motion starts; what is not finite in between

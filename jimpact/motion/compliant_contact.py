@@ -7,8 +7,6 @@ import jax
 import jax.numpy as jnp
 
 from jimpact.events.contact_flow import Phase
-from jimpact.events.driver import until_over
-from jimpact.loops import any_lane
 from jimpact.motion.compliant_flow import (
     Phases,
     compliant_flow,
@@ -66,7 +64,9 @@ from jimpact.motion.transitions import (
     slip_stops,
     velocity_noise,
 )
-from jimpact.status import CODE
+from jimpact.numerics.driver import until_over
+from jimpact.tools.loops import any_lane
+from jimpact.tools.status import CODE
 
 # Of the cone: contacts that have reached its rim stick only if others take over more than this.
 # Ten times more: contacts that share what they hold slide one after the other.

@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 
 from jimpact.events.contact_flow import Phase
-from jimpact.events.stepper import any_of
 from jimpact.laws.forces import Force
 from jimpact.motion.dynamics import kinematics, user_force
 from jimpact.motion.flow import (
@@ -37,6 +36,7 @@ from jimpact.motion.persistent_contact import (
 from jimpact.motion.slip_in_space import slip_axes, straightened
 from jimpact.motion.tables import MotionProblem
 from jimpact.motion.transitions import velocity_noise
+from jimpact.numerics.stepper import any_of
 
 # Of the errors allowed: margins closer to 0 are 0. Ten times more, and events are off by a tenth
 # of the tolerance.

@@ -6,10 +6,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jimpact.compiling import full_precision
 from jimpact.motion.system import System
-from jimpact.precision import precision
-from jimpact.solvers.dense import solve_mass_matrix
+from jimpact.numerics.dense import solve_mass_matrix
+from jimpact.tools.compiling import full_precision
+from jimpact.tools.precision import precision
 
 
 def not_rounding(share: float, dtype: jnp.dtype) -> float:

@@ -10,9 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.events.driver import until_over
-from jimpact.law import forward_only
-from jimpact.loops import any_lane, over_lanes
+from jimpact.core.law import forward_only
 from jimpact.motion.dynamics import free_acceleration, gaps, mass_at, user_force
 from jimpact.motion.flow import (
     Flight,
@@ -45,7 +43,9 @@ from jimpact.motion.tables import (
     sampled_states,
 )
 from jimpact.motion.transitions import resolve
-from jimpact.status import CODE
+from jimpact.numerics.driver import until_over
+from jimpact.tools.loops import any_lane, over_lanes
+from jimpact.tools.status import CODE
 
 # M is singular where its scaled least eigenvalue is below this share of that at the start
 _SINGULAR = 1e-6

@@ -10,8 +10,6 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from jimpact.bodies.base import Body
-from jimpact.events import stepper
-from jimpact.loops import any_lane
 from jimpact.motion.dynamics import (
     definite,
     free_acceleration,
@@ -47,8 +45,10 @@ from jimpact.motion.slip_in_space import (
     turning_errors,
 )
 from jimpact.motion.system import System
-from jimpact.precision import precision
-from jimpact.status import CODE
+from jimpact.numerics import stepper
+from jimpact.tools.loops import any_lane
+from jimpact.tools.precision import precision
+from jimpact.tools.status import CODE
 
 SMALLEST_STEP = 1e-15  # of the time: below it a step does not move time any more
 # Error allowed in the ledger, as a share of the work of the errors allowed in q and v: ten times

@@ -5,7 +5,11 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from jimpact._checks import (
+from jimpact.core.law import Law
+from jimpact.motion.flow import check_rtol
+from jimpact.motion.pile_contacts import PileContacts, contacts_of_step
+from jimpact.motion.system import System
+from jimpact.tools.checks import (
     as_whole,
     check_choice,
     check_shape,
@@ -13,10 +17,6 @@ from jimpact._checks import (
     is_traced,
     short_repr,
 )
-from jimpact.law import Law
-from jimpact.motion.flow import check_rtol
-from jimpact.motion.pile_contacts import PileContacts, contacts_of_step
-from jimpact.motion.system import System
 
 TOLERANCES = {"float64": (1e-10, 1e-12), "float32": (1e-5, 1e-7)}  # rtol, atol of the flights
 # Share of the largest gap velocity: a slower contact that is pressed back remains closed. Ten times

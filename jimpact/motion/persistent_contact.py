@@ -21,17 +21,17 @@ from jimpact.motion.dynamics import (
     user_force,
 )
 from jimpact.motion.system import System
-from jimpact.precision import precision
-from jimpact.solvers.dense import (
+from jimpact.numerics.dense import (
     determinants,
     load_shares,
     regularized,
     solve_definite,
     solve_mass_matrix,
 )
-from jimpact.solvers.friction import solve
-from jimpact.solvers.lcp import solve_lcp
-from jimpact.status import CODE
+from jimpact.numerics.friction import solve
+from jimpact.numerics.lcp import solve_lcp
+from jimpact.tools.precision import precision
+from jimpact.tools.status import CODE
 
 # Beside a matrix with unit diagonal: it decides where that is singular (redundant contacts that
 # stick), and refinements remove what it changes elsewhere. Much less, and rounding decides, too.

@@ -6,10 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_concrete, check_kind, in_common_dtype
 from jimpact.bodies.closed_pairs import listed_pairs
-from jimpact.compiling import quick_jit
-from jimpact.law import Law
+from jimpact.core.law import Law
+from jimpact.core.scene import Scene
 from jimpact.motion.arguments import (
     check_motion,
     check_stepped_law,
@@ -20,7 +19,8 @@ from jimpact.motion.arguments import (
 from jimpact.motion.dynamics import is_pile
 from jimpact.motion.stepping import step_of_pile
 from jimpact.motion.system import System
-from jimpact.scene import Scene
+from jimpact.tools.checks import as_float_array, check_concrete, check_kind, in_common_dtype
+from jimpact.tools.compiling import quick_jit
 
 
 class PileContacts(NamedTuple):

@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.files.records import as_data, fields_as_data
-from jimpact.status import STATUS, Status
+from jimpact.tools.records import as_data, fields_as_data
+from jimpact.tools.status import STATUS, Status
 
 EVENT_KINDS = ("none", "impact", "accumulation", "contact", "detachment", "friction", "paroxysm")
 _ROUNDING = 1e-12  # of the largest work: what is smaller is not printed

@@ -8,16 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import (
-    as_float_array,
-    as_whole,
-    check_kind,
-    in_common_dtype,
-    is_traced,
-)
 from jimpact.bodies.base import check_penetration
-from jimpact.compiling import full_precision, is_top_level_call, quick_jit
-from jimpact.law import Law
+from jimpact.core.law import Law
 from jimpact.laws.forces import Force
 from jimpact.motion.arguments import (
     as_times,
@@ -49,8 +41,16 @@ from jimpact.motion.record import Events, Motion, joined
 from jimpact.motion.stepping import time_stepping
 from jimpact.motion.system import System
 from jimpact.motion.tables import Course, MotionProblem, Past
-from jimpact.progress import progress_bar, waiting
-from jimpact.status import CODE
+from jimpact.tools.checks import (
+    as_float_array,
+    as_whole,
+    check_kind,
+    in_common_dtype,
+    is_traced,
+)
+from jimpact.tools.compiling import full_precision, is_top_level_call, quick_jit
+from jimpact.tools.progress import progress_bar, waiting
+from jimpact.tools.status import CODE
 
 CHUNK = 500  # events of one run of the program; more take memory in short motions
 MOST_EVENTS = 100_000  # default `max_events` on the host; more only delays the status `max_events`

@@ -26,7 +26,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jimpact.loops import any_lane
 from jimpact.motion.persistent_contact import (
     BEGINS,
     Contacts,
@@ -37,7 +36,8 @@ from jimpact.motion.persistent_contact import (
     forces,
     length,
 )
-from jimpact.solvers.dense import solve_by_pivots
+from jimpact.numerics.dense import solve_by_pivots
+from jimpact.tools.loops import any_lane
 
 # Least part of the slip at the beginning of a step that lies ahead within it. Ten times more, and
 # what a landing leaves of slip that turns is ten times as large.

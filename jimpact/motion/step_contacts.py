@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jimpact.bodies.closed_pairs import ActivePairs, block, over_blocks, with_block
 from jimpact.motion.dynamics import is_pile, mass_at, seen_from_base
 from jimpact.motion.system import System
-from jimpact.solvers.dense import solve_mass_matrix
+from jimpact.numerics.dense import solve_mass_matrix
 
 
 class AllContacts(NamedTuple):

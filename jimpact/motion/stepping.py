@@ -27,9 +27,9 @@ import jax
 import jax.numpy as jnp
 
 from jimpact.bodies.closed_pairs import ActivePairs
-from jimpact.derive import without_derivatives
-from jimpact.impacts import impact
-from jimpact.law import Law, within_domains
+from jimpact.core.impacts import impact
+from jimpact.core.law import Law, within_domains
+from jimpact.core.scene import Scene
 from jimpact.motion.dynamics import (
     carried_along,
     definite,
@@ -46,10 +46,10 @@ from jimpact.motion.step_contacts import ActiveContacts, AllContacts, PileImpuls
 from jimpact.motion.system import System
 from jimpact.motion.tables import Course
 from jimpact.motion.transitions import FAILS, scene_at
-from jimpact.precision import precision
-from jimpact.scene import Scene
-from jimpact.solvers.many_contacts import Many, solve_many
-from jimpact.status import CODE
+from jimpact.numerics.derive import without_derivatives
+from jimpact.numerics.many_contacts import Many, solve_many
+from jimpact.tools.precision import precision
+from jimpact.tools.status import CODE
 
 # Gap velocities below _ROUNDING times the largest speed of the motion, or its
 # rounding, are what solving for contacts at rest leaves. Ten times less, and resting beads strike

@@ -7,7 +7,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jimpact._checks import (
+from jimpact.bodies.base import STANDARD_GRAVITY, Body, LinearPotential, Potential
+from jimpact.bodies.functions import FunctionBody
+from jimpact.tools.checks import (
     as_float_array,
     check_function,
     check_shape,
@@ -15,8 +17,6 @@ from jimpact._checks import (
     in_numbers,
     is_traced,
 )
-from jimpact.bodies.base import STANDARD_GRAVITY, Body, LinearPotential, Potential
-from jimpact.bodies.functions import FunctionBody
 
 Base = Callable[[jax.Array], jax.Array]  # t () -> displacement y_b (d,) [m]
 

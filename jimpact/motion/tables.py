@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from jimpact.derive import by_jacobian
 from jimpact.motion.flow import Settings, State, packed, unpacked
 from jimpact.motion.record import KIND_CODE, Events
 from jimpact.motion.system import System
 from jimpact.motion.transitions import After, sides_of
+from jimpact.numerics.derive import by_jacobian
 
 # Power of the largest number that makes tangents of 1e-31 (float32) infinite the second time, but
 # none below 1e3 the first time.

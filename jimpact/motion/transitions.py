@@ -5,8 +5,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jimpact.impacts import impact
-from jimpact.law import Law
+from jimpact.core.impacts import impact
+from jimpact.core.law import Law
+from jimpact.core.scene import Scene
 from jimpact.motion.dynamics import (
     carried_along,
     kinetic,
@@ -31,9 +32,8 @@ from jimpact.motion.persistent_contact import (
 )
 from jimpact.motion.record import KIND_CODE
 from jimpact.motion.system import System
-from jimpact.precision import precision
-from jimpact.scene import Scene
-from jimpact.status import CODE, STATUS
+from jimpact.tools.precision import precision
+from jimpact.tools.status import CODE, STATUS
 
 # A contact that still approaches is no failure: it has another impact at the same instant.
 FAILS = tuple(row.failure and row.name != "inadmissible_velocity" for row in STATUS)

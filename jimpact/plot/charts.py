@@ -31,7 +31,7 @@ from jimpact.plot.style import (
     side_by_side,
     styled,
 )
-from jimpact.status import CODE, STATUS
+from jimpact.tools.status import CODE, STATUS
 
 _LAW_MARKERS = "*phX8d"
 _LEAST = 1e-16  # smaller relative errors are drawn here: rounding

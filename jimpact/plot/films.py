@@ -11,7 +11,6 @@ from matplotlib import rc_context
 from matplotlib.animation import FFMpegWriter, FuncAnimation, PillowWriter
 from matplotlib.figure import Figure
 
-from jimpact._checks import check_values
 from jimpact.bodies.base import Body, projected
 from jimpact.motion.dynamics import seen_from_base
 from jimpact.motion.record import Motion
@@ -27,7 +26,8 @@ from jimpact.plot.motions import (
     stretch_of,
 )
 from jimpact.plot.style import GREY
-from jimpact.progress import counting_bar
+from jimpact.tools.checks import check_values
+from jimpact.tools.progress import counting_bar
 
 ENDINGS = (".gif", ".mp4", ".html")
 _SHORTEST = 2.0  # [s] films of shorter motions are slow; ten times more slows most motions down

@@ -9,9 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.special import chdtri, ndtri
 
-from jimpact._checks import check_choice, check_kind
 from jimpact.fits.uncertainty import Fit, Profile
 from jimpact.plot.style import COLOURS, GREY, SMALL, new_figure, new_panels, styled, write
+from jimpact.tools.checks import check_choice, check_kind
 
 _TITLE = 45  # letters of a line of a panel's title
 _TOP = 3.0  # of a profile's axis, over the limit: only what is below matters

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
-from jimpact.files.records import readable_unit
 from jimpact.laws.histories import History
 from jimpact.methods.comparison import Comparison
 from jimpact.plot.style import (
@@ -26,6 +25,7 @@ from jimpact.plot.style import (
 )
 from jimpact.theory.admissible import admissible_set
 from jimpact.theory.dispersion import energy_dispersion, energy_ratio
+from jimpact.tools.records import readable_unit
 
 _OUTCOMES = 4000  # dots of a set of outcomes; ten times more would only be one area
 

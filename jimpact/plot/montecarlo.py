@@ -8,10 +8,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jimpact.files.records import readable_unit
 from jimpact.montecarlo.result import MonteCarlo
 from jimpact.montecarlo.statistics import FAILURE
 from jimpact.plot.style import SMALL, WIDTH, colour_of, styled
+from jimpact.tools.records import readable_unit
 
 _BARS = 30  # of a histogram: each is several pixels wide
 _MEAN_AT, _TOP = 1.12, 1.25  # height of the mean, and of the axis, over that of the highest bar

@@ -11,12 +11,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jimpact._checks import check_kind
 from jimpact.bodies.base import Body, rate_of, split_name
 from jimpact.motion.dynamics import kinetic, potential
 from jimpact.motion.record import Motion
 from jimpact.motion.system import System
 from jimpact.plot.style import COLOURS, GREY, colour_of, new_figure, styled
+from jimpact.tools.checks import check_kind
 
 POINT = 0.02  # radius in which a point mass is drawn, of the range of its coordinates
 _MARKED = ("accumulation", "detachment", "friction")  # events with a line style of their kind

@@ -13,9 +13,9 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from jimpact._checks import check_kind
 from jimpact.bodies.base import split_name
-from jimpact.scene import Scene, dense_mass
+from jimpact.core.scene import Scene, dense_mass
+from jimpact.tools.checks import check_kind
 
 SHEET = Path(__file__).with_name("jimpact.mplstyle")
 _SETTINGS = matplotlib.rc_params_from_file(SHEET, use_default_template=False)

@@ -8,13 +8,13 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
-from jimpact._checks import check_kind, check_shape, check_values
 from jimpact.bodies.assembly import Bodies
 from jimpact.bodies.base import Body, projected
+from jimpact.core.scene import PairNormals, Scene, as_velocity
 from jimpact.motion.system import System
 from jimpact.plot.motions import draw_body
 from jimpact.plot.style import COLOURS, GREY, colour_of, new_figure, styled, write
-from jimpact.scene import PairNormals, Scene, as_velocity
+from jimpact.tools.checks import check_kind, check_shape, check_values
 
 _GAP = 0.5  # how wide an open contact is drawn, in radii of the largest body
 _LEAST = 0.35  # radius of a small body, likewise

@@ -9,7 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from jimpact.contact import kinetic_norm
+from jimpact.core.contact import kinetic_norm
+from jimpact.core.scene import dense_mass
 from jimpact.plot.style import (
     COLOURS,
     COLUMNS,
@@ -23,7 +24,6 @@ from jimpact.plot.style import (
     styled,
     write,
 )
-from jimpact.scene import dense_mass
 from jimpact.theory.admissible import AdmissibleSet
 from jimpact.theory.rocking import (
     OUTCOMES,

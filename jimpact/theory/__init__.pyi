@@ -1,6 +1,5 @@
 """Public names of `ji.theory` and where they live."""
 
-from .accelerations import contact_problem as contact_problem, quasi_lagrange as quasi_lagrange
 from .admissible import AdmissibleSet as AdmissibleSet, admissible_set as admissible_set
 from .chains import (
     SeparationTimes as SeparationTimes,

@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from jimpact._checks import as_float_array, as_whole, check_values
-from jimpact.scene import Scene, as_velocity, dense_mass, gap_velocity, kinetic_energy
-from jimpact.status import sign_tolerance
+from jimpact.core.scene import Scene, as_velocity, dense_mass, gap_velocity, kinetic_energy
 from jimpact.theory.capped_polyhedron import (
     CappedPolyhedron,
     capped_polyhedron,
     cone_facets,
 )
+from jimpact.tools.checks import as_float_array, as_whole, check_values
+from jimpact.tools.status import sign_tolerance
 
 # Contacts count as redundant when the matrix of their cosines has an eigenvalue below this
 # multiple of eps * m.

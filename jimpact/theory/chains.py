@@ -8,9 +8,9 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.special import gammaln
 
-from jimpact._checks import as_numbers, as_whole, check_values
-from jimpact.compiling import full_precision
-from jimpact.scene import Scene, as_velocity, gap_velocity, velocity_change
+from jimpact.core.scene import Scene, as_velocity, gap_velocity, velocity_change
+from jimpact.tools.checks import as_numbers, as_whole, check_values
+from jimpact.tools.compiling import full_precision
 
 # Largest stiffness ratio, and one over the least, whose first opening is searched. Ten times more:
 # three times as many periods of the stiff contact to look through, for an outcome at its limit.

@@ -4,9 +4,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jimpact._checks import as_numbers
-from jimpact.contact import kinetic_norm, normalized_gap_velocity
-from jimpact.scene import Scene, as_velocity, velocity_change
+from jimpact.core.contact import kinetic_norm, normalized_gap_velocity
+from jimpact.core.scene import Scene, as_velocity, velocity_change
+from jimpact.tools.checks import as_numbers
 
 # Normalized approach velocities that differ by less than this, relative to the larger one, are
 # equal: then both sides are as near. Ten times more would still be far below what is measured.

@@ -5,7 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jimpact.scene import Scene, as_velocity, kinetic_energy, momentum
+from jimpact.core.scene import Scene, as_velocity, kinetic_energy, momentum
 
 
 def energy_ratio(scene: Scene, before: Any, after: Any) -> jax.Array:

@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, as_numbers, check_shape
-from jimpact.compiling import full_precision
-from jimpact.contact import kinetic_norm, normalized_delassus, normalized_gap_velocity
-from jimpact.scene import Scene, velocity_change
-from jimpact.solvers.lcp import solve_lcp
-from jimpact.solvers.tridiagonal import as_matrix
+from jimpact.core.contact import kinetic_norm, normalized_delassus, normalized_gap_velocity
+from jimpact.core.scene import Scene, velocity_change
+from jimpact.numerics.lcp import solve_lcp
+from jimpact.numerics.tridiagonal import as_matrix
 from jimpact.theory.quasi_velocities import quasi_basis, to_quasi_velocities
+from jimpact.tools.checks import as_float_array, as_numbers, check_shape
+from jimpact.tools.compiling import full_precision
 
 
 class InclusionOutcome(NamedTuple):

@@ -8,13 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, as_numbers, check_shape
-from jimpact.impacts import impact
-from jimpact.law import Law
-from jimpact.montecarlo.gaps import gap_scale as gap_scale
+from jimpact.core.impacts import impact
+from jimpact.core.law import Law
+from jimpact.core.scene import Scene, with_gaps
+from jimpact.laws.gap_scale import gap_scale as gap_scale
 from jimpact.montecarlo.result import MonteCarlo
-from jimpact.scene import Scene, with_gaps
-from jimpact.status import STATUS
+from jimpact.tools.checks import as_float_array, as_numbers, check_shape
+from jimpact.tools.status import STATUS
 
 # Linearized over sampled standard deviation, less 1, up to which the outcome is called linear.
 AGREES = 0.2

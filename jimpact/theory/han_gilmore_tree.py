@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from jimpact._checks import as_whole, check_per_contact, check_values, is_traced
-from jimpact.scene import Scene, as_velocity, dense_mass
+from jimpact.core.scene import Scene, as_velocity, dense_mass
+from jimpact.tools.checks import as_whole, check_per_contact, check_values, is_traced
 
 # Relative to the largest normalized approach velocity at the start: smaller gap velocities and
 # impulses are zero, velocities that differ by less are the same. Ten times more would merge

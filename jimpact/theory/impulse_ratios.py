@@ -5,9 +5,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from jimpact._checks import as_numbers
+from jimpact.core.scene import Scene
 from jimpact.laws.impulse_correlation import interval
-from jimpact.scene import Scene
+from jimpact.tools.checks import as_numbers
 
 
 def distributing_rule(energy: Any, stiffness: Any, exponent: Any) -> jax.Array:

@@ -5,7 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jimpact._checks import as_float_array, check_values
+from jimpact.tools.checks import as_float_array, check_values
 
 
 def hertz_stiffness(

@@ -6,16 +6,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jimpact._checks import as_numbers
-from jimpact.compiling import full_precision
-from jimpact.contact import (
+from jimpact.core.contact import (
     kinetic_norm,
     normalized_delassus as normalized_delassus,
     normalized_gap_velocity as normalized_gap_velocity,
 )
-from jimpact.quasi_space import quasi_basis as quasi_basis
-from jimpact.scene import Scene, as_velocity, gap_velocity, momentum, velocity_change
-from jimpact.solvers.tridiagonal import as_matrix
+from jimpact.core.quasi_space import quasi_basis as quasi_basis
+from jimpact.core.scene import Scene, as_velocity, gap_velocity, momentum, velocity_change
+from jimpact.numerics.tridiagonal import as_matrix
+from jimpact.tools.checks import as_numbers
+from jimpact.tools.compiling import full_precision
 
 
 class ContactPower(eqx.Module):

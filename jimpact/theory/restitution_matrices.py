@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_numbers, check_values
-from jimpact.compiling import full_precision
-from jimpact.contact import kinetic_norm, normalized_delassus, normalized_gap_velocity
-from jimpact.scene import Scene, kinetic_energy, velocity_change
-from jimpact.solvers.tridiagonal import as_matrix
+from jimpact.core.contact import kinetic_norm, normalized_delassus, normalized_gap_velocity
+from jimpact.core.scene import Scene, kinetic_energy, velocity_change
+from jimpact.numerics.tridiagonal import as_matrix
+from jimpact.tools.checks import as_numbers, check_values
+from jimpact.tools.compiling import full_precision
 
 # Most rows of a matrix: its 2^12 supports of one eigenproblem each take a fraction of a second.
 # Each row more doubles that.

@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_axis, as_numbers, check_values
 from jimpact.bodies.shapes import Block
-from jimpact.compiling import precise_jit
-from jimpact.impacts import impact
+from jimpact.core.impacts import impact
 from jimpact.laws.lzb import LZB
-from jimpact.status import STATUS
+from jimpact.tools.checks import as_axis, as_numbers, check_values
+from jimpact.tools.compiling import precise_jit
+from jimpact.tools.status import STATUS
 
 # After the impact a corner counts as staying on the ground up to this gap velocity, as part of the
 # approach of B: real corners are not sharp, and slow ones touch down again at once. Ten times more

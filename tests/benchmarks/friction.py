@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jimpact as ji
-from jimpact.status import CODE
+from jimpact.tools.status import CODE
 
 jax.config.update("jax_enable_x64", True)
 

@@ -13,7 +13,7 @@ jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 
-from jimpact.solvers.lcp import solve_lcp  # noqa: E402
+from jimpact.numerics.lcp import solve_lcp  # noqa: E402
 
 BATCH, REPEATS = 10_000, 9
 

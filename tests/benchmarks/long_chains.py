@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import jimpact as ji
-from jimpact.events.tableaux import DOP853
 from jimpact.methods.schemes import aligned
+from jimpact.numerics.tableaux import DOP853
 
 LENGTHS = (10, 30, 100, 300, 1000)
 RESTITUTIONS = (1.0, 0.9)

@@ -14,8 +14,8 @@ import numpy as np
 from harness import arguments, save_figure, stage
 
 import jimpact as ji
-from jimpact.files.records import Column, Table
 from jimpact.methods.contenders import Contender, Solution
+from jimpact.tools.records import Column, Table
 
 SCENES = {
     "c1: three balls": (ji.chain([1.0] * 3), [1.0, 0.0, 0.0]),

@@ -272,7 +272,7 @@ def share(kind, count):
 
 def impact_row(method, kind, count):
     """One row: how the impacts of a kind end, and what they cost."""
-    from jimpact.status import STATUS
+    from jimpact.tools.status import STATUS
 
     status, seconds = alone(method, kind, count)
     mu = draw_of(kind, count).friction[: len(status)]

@@ -28,8 +28,8 @@ from kernels import compiled, diffrax_event, siconos
 
 import jimpact as ji
 from jimpact import velocity_change
-from jimpact.events.tableaux import DOP853
 from jimpact.methods.schemes import aligned
+from jimpact.numerics.tableaux import DOP853
 
 BATCH, CHUNK, REPEATS = 4096, 256, 11
 TRUTH, FINE, COARSE = 1e-13, 3e-8, 1e-6

@@ -10,8 +10,8 @@ import programs
 import pytest
 from programs import names
 
-from jimpact.solvers import lcp
-from jimpact.solvers.lcp import solve_lcp
+from jimpact.numerics import lcp
+from jimpact.numerics.lcp import solve_lcp
 
 
 def test_redundant_contacts_share_in_equal_parts():

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.solvers.dense import determinants, solve_by_pivots, solve_mass_matrix
+from jimpact.numerics.dense import determinants, solve_by_pivots, solve_mass_matrix
 
 RNG = np.random.default_rng(0)
 SIZE = 5

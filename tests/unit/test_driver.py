@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import jimpact as ji
-from jimpact.events import driver
+from jimpact.numerics import driver
 
 
 @pytest.mark.release

@@ -7,10 +7,10 @@ from fit_cases import BALLS, PAIR, PRE_3, SHOTS, THREE, Coupled, simulated, two_
 from scipy import optimize
 
 import jimpact as ji
-from jimpact.files.records import with_error
 from jimpact.fits.parameters import LawInScene, bounds_of, checked_ties, free_parameters, tied
 from jimpact.fits.solve import Damping
 from jimpact.fits.uncertainty import Fit
+from jimpact.tools.records import with_error
 
 
 def test_entries_are_named_as_in_the_report():

@@ -13,9 +13,9 @@ import pytest
 from programs import CODE, OPTIMIZED
 from spatial_scenes import random_boxes
 
-from jimpact.solvers import dense
-from jimpact.solvers.friction import distribute, solve
-from jimpact.solvers.many_contacts import solve_many
+from jimpact.numerics import dense
+from jimpact.numerics.friction import distribute, solve
+from jimpact.numerics.many_contacts import solve_many
 
 pytestmark = pytest.mark.release  # they compile programs of their own
 

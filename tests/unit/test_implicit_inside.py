@@ -10,12 +10,12 @@ from programs import CODE
 from spatial_scenes import NAMED
 
 import jimpact as ji
-from jimpact.contact import contact_of
+from jimpact.core.contact import contact_of
 from jimpact.events import implicit_steps
 from jimpact.events.contact_flow import Chain, Dense
-from jimpact.events.driver import SLOTS
 from jimpact.events.impact_dynamics import method_for
-from jimpact.solvers.step_impulses import StepProblem, descent_lengths, solve
+from jimpact.numerics.driver import SLOTS
+from jimpact.numerics.step_impulses import StepProblem, descent_lengths, solve
 
 pytestmark = pytest.mark.release  # they compile programs of their own
 

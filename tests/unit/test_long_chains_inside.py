@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import pytest
 
 import jimpact as ji
-from jimpact.contact import contact_of
+from jimpact.core.contact import contact_of
 from jimpact.events.impact_dynamics import flow_of
 from jimpact.events.look_ahead import comes_to_rest
 

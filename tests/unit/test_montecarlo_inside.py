@@ -25,10 +25,10 @@ from jimpact import (
     monte_carlo,
     read_samples,
 )
+from jimpact.core.registry import registered_laws
 from jimpact.montecarlo import statistics as histograms, store
 from jimpact.montecarlo.statistics import merged, moments
 from jimpact.montecarlo.store import fingerprint
-from jimpact.registry import registered_laws
 
 BALLS = chain([0.25, 1.0, 0.25])
 

@@ -16,7 +16,7 @@ from matplotlib.text import Text
 from pictures_cases import BALLS, STRIKE, force_chains, samples
 
 import jimpact as ji
-from jimpact.audits import Audit
+from jimpact.core.audits import Audit
 from jimpact.fits.profiles import Contour
 from jimpact.fits.uncertainty import Profile
 from jimpact.methods.advice_report import Advice, Candidate

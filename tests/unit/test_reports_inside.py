@@ -19,7 +19,7 @@ from jimpact.fits.selection import LawFit, LawFits
 from jimpact.fits.uncertainty import Profile
 from jimpact.motion.record import KIND_CODE, Motion, no_events
 from jimpact.plot.films import positions
-from jimpact.progress import wrapped
+from jimpact.tools.progress import wrapped
 
 
 def test_long_lines_keep_their_column(monkeypatch):

@@ -7,8 +7,8 @@ import pytest
 from programs import CODE
 
 import jimpact as ji
-from jimpact.contact import contact_of, coupled_groups
-from jimpact.scene import pad_scene
+from jimpact.core.contact import contact_of, coupled_groups
+from jimpact.core.scene import pad_scene
 
 pytestmark = pytest.mark.release  # they compile programs of their own
 

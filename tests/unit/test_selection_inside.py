@@ -8,11 +8,11 @@ from scipy.special import erf
 from selection_cases import PAIR, PRE, after
 
 import jimpact as ji
+from jimpact.core.law import with_parameter
+from jimpact.core.registry import simplest_first
 from jimpact.fits.posterior import _priors
 from jimpact.fits.selection import _candidates
-from jimpact.law import with_parameter
 from jimpact.laws.velocity_dependent import approach_speed
-from jimpact.registry import simplest_first
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jimpact as ji
-from jimpact.events import stepper
+from jimpact.numerics import stepper
 
 
 @pytest.mark.release

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jimpact.events.tableaux import DOP853
+from jimpact.numerics.tableaux import DOP853
 
 HERE = Path(__file__).parent
 FLAGS = ("-O3", "-march=native", "-std=c++17")

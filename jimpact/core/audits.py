@@ -1,0 +1,180 @@
+"""Consistency of an outcome: kinematic, kinetic and energetic, and the momentum balance."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact.core.contact import contact_of
+from jimpact.core.impacts import Impact, judged_beyond
+from jimpact.core.scene import Scene, as_velocity, gap_velocity, kinetic_energy, momentum
+from jimpact.numerics.tridiagonal import diagonal
+from jimpact.tools.compiling import full_precision
+from jimpact.tools.status import STATUS, sign_tolerance
+
+CONSISTENCIES = ("kinematic", "kinetic", "energetic", "momentum")
+
+
+class Audit(eqx.Module):
+    """Whether four conditions hold, and the numbers behind them, scaled by the impact's size.
+
+    Attributes:
+        kinematic: whether gamma+ >= 0 at closed contacts ().
+        kinetic: whether p >= 0 ().
+        energetic: whether no energy is gained ().
+        momentum: whether contact impulses explain the change ().
+        worst_gap_velocity: the least gamma+ ().
+        worst_impulse: the least p ().
+        energy_gain: T+ - T- less what was stored ().
+        momentum_residual: largest entry of M (v+ - v-) - N p ().
+    """
+
+    kinematic: jax.Array
+    kinetic: jax.Array
+    energetic: jax.Array
+    momentum: jax.Array
+    worst_gap_velocity: jax.Array
+    worst_impulse: jax.Array
+    energy_gain: jax.Array
+    momentum_residual: jax.Array
+
+    @property
+    def consistent(self) -> jax.Array:
+        """Whether all four hold."""
+        return self.kinematic & self.kinetic & self.energetic & self.momentum
+
+    @property
+    def broken(self) -> list[str]:
+        """Names of the conditions that do not hold."""
+        return [name for name in CONSISTENCIES if not bool(getattr(self, name))]
+
+
+@full_precision
+def audit(scene: Scene, velocity: Any, out: Impact) -> Audit:
+    """Check an outcome against what every impact must satisfy, whatever the law.
+
+    Equation: closed contacts `gamma+ >= 0` (kinematic), `p >= 0` (kinetic),
+    `T+ - T- <= sum U_0` (energetic), `M (v+ - v-) = N p` (momentum).
+
+    Args:
+        scene: the scene of the impact.
+        velocity: v- (n,) [m/s].
+        out: what `impact` returned, or an `Impact` filled by hand from measurements.
+
+    Returns:
+        `Audit`: a boolean () for each of the four, `consistent` for all; `print` says it in words.
+
+    Raises:
+        ValueError: the number of velocities is not that of coordinates.
+
+    Source: Brogliato (2016), section 6.2.4.
+
+    >>> import jimpact as ji
+    >>> scene, v = ji.chain([1.0, 1.0]), [1.0, 0.0]
+    >>> bool(ji.audit(scene, v, ji.impact(ji.Newton(0.5), scene, v)).consistent)
+    True
+    """
+    v = as_velocity(scene, velocity)
+    contact = contact_of(scene, v, uses_gaps=True)
+    root = jnp.sqrt(diagonal(contact.delassus))
+    gamma = jnp.where(scene.closed, contact.gap_velocity, 0.0)
+    gamma_plus = gap_velocity(scene, out.velocity)
+    approach = jnp.sum((jnp.minimum(gamma, 0.0) / root) ** 2)
+    size = jnp.sqrt(approach + 2 * out.initial_energy)
+    size = jnp.where(size > 0, size, 1.0)
+    jump = momentum(scene, out.velocity - v)
+    change = 0.5 * jump @ (out.velocity + v)  # T+ - T- without their cancellation
+    residual = jump - scene.normals @ out.impulse
+    if scene.tangents is not None:
+        residual = residual - scene.tangents @ out.tangential_impulse
+    if scene.constraints is not None:  # reactions of the constraints are not listed in `out`
+        basis = jnp.linalg.qr(scene.constraints)[0]
+        residual = residual - basis @ (basis.T @ residual)
+    # as `impact` judges: an approach within rounding is not the law's
+    rounding = contact.rounding(out.impulse, out.tangential_impulse)
+    within = jnp.clip(gamma_plus, -rounding, 0.0)
+    least = jnp.where(scene.closed, (gamma_plus - within) / root, jnp.inf)
+    worst_gap_velocity = jnp.min(least) / size
+    worst_impulse = jnp.min(out.impulse * root) / size
+    gain = (change - out.initial_energy) / size**2
+    off = jnp.abs(residual).max() / jnp.maximum(jnp.abs(momentum(scene, v)).max(), 1e-300)
+    tolerance = judged_beyond(out.velocity.dtype, jnp.asarray(out.accuracy))
+    return Audit(
+        kinematic=worst_gap_velocity >= -tolerance,
+        kinetic=worst_impulse >= -tolerance,
+        energetic=gain <= tolerance,
+        momentum=off <= sign_tolerance(out.velocity.dtype),
+        worst_gap_velocity=worst_gap_velocity,
+        worst_impulse=worst_impulse,
+        energy_gain=gain,
+        momentum_residual=off,
+    )
+
+
+def nothing_approaches(scene: Scene, velocity: Any) -> str | None:
+    """A sentence for summaries if no contact approaches, so that no impact happens; else None."""
+    contact = contact_of(scene, as_velocity(scene, velocity), uses_gaps=True)
+    approaches = np.asarray(contact.gap_velocity < 0)
+    if (approaches & np.asarray(scene.closed)).any():
+        return None
+    if approaches.any():
+        return (
+            "no closed contact approaches (gamma- < 0), only open ones do: laws that use gaps are "
+            "Compliant and Binary"
+        )
+    return "nothing approaches (gamma- < 0 at no contact): is the sign of the velocities as meant?"
+
+
+@full_precision
+def summary(out: Impact, scene: Scene, velocity: Any) -> str:
+    """A printable report of one impact (or, for a batch, of its status codes).
+
+    Args:
+        out: what `impact` returned, one or a batch.
+        scene: of the impact.
+        velocity: v- (n,) [m/s].
+
+    Returns:
+        Text of several lines: status, energy, audit, velocities and impulses of all contacts.
+
+    Raises:
+        ValueError: not one velocity per coordinate.
+
+    >>> import jimpact as ji
+    >>> scene, v = ji.chain([1.0, 1.0]), [1.0, 0.0]
+    >>> print(ji.summary(ji.impact(ji.Newton(0.5), scene, v), scene, v).splitlines()[0])
+    status         ok: resolved within tolerance
+    """
+    codes = np.asarray(out.status)
+    if codes.ndim:
+        counts = zip(*np.unique(codes, return_counts=True))
+        rows = [f"{STATUS[c].name:24s}{k:10d}" for c, k in counts]
+        return "\n".join([f"{codes.size} impacts by status", *rows])
+    row = STATUS[int(codes)]
+    before = float(kinetic_energy(scene, velocity))
+    remaining = (before + float(out.energy_change)) / before if before else float("nan")
+    broken = audit(scene, velocity, out).broken
+    words = [f"{name} {'VIOLATED' if name in broken else 'ok'}" for name in CONSISTENCIES]
+    reason = nothing_approaches(scene, velocity)
+    quiet = reason is not None and not np.asarray(out.impulse).any()
+    lines = [
+        f"status         {row.name}: {row.message}",
+        *([f"impact         none: {reason}"] if quiet else []),
+        f"energy         {before:.6g} J before, change {float(out.energy_change):.6g} J "
+        f"({100 * remaining:.4g} % kept)",
+        f"audit          {', '.join(words)}",
+        "coordinate          v-             v+   [m/s]",
+    ]
+    pairs = zip(np.asarray(velocity, float), np.asarray(out.velocity, float))
+    lines += [f"{i + 1:10d} {a:14.6g} {b:14.6g}" for i, (a, b) in enumerate(pairs)]
+    lines.append("contact          gamma-         gamma+   [m/s]     impulse [N s]")
+    g0, g1 = (
+        np.asarray(gap_velocity(scene, velocity)),
+        np.asarray(gap_velocity(scene, out.velocity)),
+    )
+    for j, (a, b, p, closed) in enumerate(zip(g0, g1, np.asarray(out.impulse), scene.closed)):
+        note = "" if closed else "   open: takes no part" if p == 0 else "   open before"
+        lines.append(f"{j + 1:7d} {a:15.6g} {b:14.6g} {p:21.6g}{note}")
+    return "\n".join(lines)

@@ -1,0 +1,525 @@
+"""Contact space: the arguments of an impact law, and the groups of coupled contacts.
+
+A scene of n coordinates and m contacts is reduced to W, gamma- and, where it has tangents, the
+tangential rows: everything that an impact law may depend on.
+"""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact.core.scene import Scene, gap_velocity, solve_mass, without_constraints
+from jimpact.numerics.sparse import Sparse
+from jimpact.numerics.tangential import TangentialBlock
+from jimpact.numerics.tridiagonal import (
+    Structure,
+    Symmetric,
+    Tridiagonal,
+    as_matrix,
+    diagonal,
+    scaled,
+    structure_of,
+)
+from jimpact.tools.checks import as_float_array, is_traced
+from jimpact.tools.compiling import full_precision
+from jimpact.tools.precision import precision, without_rounding
+
+# Groups of unequal size are padded to the largest of them, because compiling another program takes
+# longer than many impacts. A second program for the smaller groups must save this factor of the
+# entries of W. Ten times more: one large group would make every small one as expensive.
+WORTH_A_PROGRAM = 4
+
+# Contact indices (count, size), one array for each program. A smaller group is padded by m plus the
+# index of its first contact, so that the padding has the group's scale of stored energy. The
+# indices are data, not structure: scenes whose groups differ only in their members share the
+# compiled impact.
+Groups = tuple[np.ndarray, ...]
+
+
+class Contact(eqx.Module):
+    """All that a law may depend on in an impact, with derived quantities.
+
+    Equation: `gamma+ = gamma- + W p + W_nt p_t`, `u+ = u- + W_tn p + W_tt p_t`, with normals N,
+    tangents H, W = N^T M^-1 N, W_nt = N^T M^-1 H = W_tn^T, W_tt = H^T M^-1 H, slip velocities
+    u = H^T v, normal impulses p and tangential impulses p_t.
+
+    Open contacts are decoupled (their rows of W are 0 off the diagonal, gamma- = 0, no stored
+    energy), unless the law uses gaps; gap velocities within `noise` are 0. `impact` always calls
+    `impulses`. If no contact approaches or stores energy, it passes gamma- = -1 and discards the
+    result, so that gradients stay finite.
+
+    Args:
+        delassus: W (m, m) [1/kg], or a `Tridiagonal` (a chain) or `Sparse` (a packing).
+        gap_velocity: gamma- (m,) [m/s], < 0 on approach.
+        closed: (m,) contacts without a gap; None: all.
+        gaps: (m,) [m]; None: 0.
+        stored: energy (m,) [J] in the contacts before the impact (precompression); None: 0.
+        norm: (m,) sqrt(grad f_j^T M^-1 grad f_j), f_j the gap function, ignoring bilateral
+            constraints; None: sqrt(W_jj), equal if there are none.
+        noise: (m,) [m/s] uncertainty of gamma- by the rounding of v-; None: 0.
+        tangential_block: (W_nt (m, t), W_tt (t, t), u- (t,) [m/s]), None without tangents; t = m
+            in the plane, 2 m in space, contact by contact.
+
+    Source: Brogliato, Nonsmooth Mechanics (3rd ed., 2016), (6.22)-(6.35).
+
+    >>> import jimpact as ji
+    >>> contact = ji.Contact([[2.0, -1.0], [-1.0, 2.0]], [-1.0, 0.0])
+    >>> ji.Newton(0.5).impulses(contact).normal.round(6).tolist()
+    [1.0, 0.5]
+    """
+
+    delassus: Symmetric
+    gap_velocity: jax.Array
+    closed: jax.Array
+    gaps: jax.Array
+    stored: jax.Array
+    norm: jax.Array
+    noise: jax.Array
+    tangential_block: TangentialBlock | None
+
+    def __init__(
+        self,
+        delassus: Any,
+        gap_velocity: Any,
+        *,
+        closed: Any = None,
+        gaps: Any = None,
+        stored: Any = None,
+        norm: Any = None,
+        noise: Any = None,
+        tangential_block: Any = None,
+    ):
+        own_form = isinstance(delassus, (Tridiagonal, Sparse))
+        self.delassus = delassus if own_form else as_float_array("delassus", delassus)
+        self.gap_velocity = as_float_array("gap_velocity", gap_velocity)
+        zero = jnp.zeros_like(self.gap_velocity)
+        self.closed = zero == 0 if closed is None else jnp.asarray(closed, bool)
+        self.gaps = zero if gaps is None else gaps
+        self.stored = zero if stored is None else stored
+        self.norm = jnp.sqrt(diagonal(self.delassus)) if norm is None else norm
+        self.noise = zero if noise is None else noise
+        self.tangential_block = None
+        if tangential_block is not None:
+            self.tangential_block = TangentialBlock(*map(jnp.asarray, tangential_block))
+
+    @property
+    def contacts(self) -> int:
+        """Number m of contacts."""
+        return self.gap_velocity.shape[0]
+
+    @property
+    def tangents(self) -> int:
+        """Tangents of each contact: 0, 1 (planar) or 2."""
+        return 0 if self.slip is None else self.slip.shape[0] // self.contacts
+
+    @property
+    def cross(self) -> jax.Array | None:
+        """W_nt (m, t) [1/kg]; None without tangents."""
+        return None if self.tangential_block is None else self.tangential_block.normal_tangent
+
+    @property
+    def tangential(self) -> jax.Array | None:
+        """W_tt (t, t) [1/kg]; None without tangents."""
+        return None if self.tangential_block is None else self.tangential_block.tangent
+
+    @property
+    def slip(self) -> jax.Array | None:
+        """u- (t,) [m/s]; None without tangents."""
+        return None if self.tangential_block is None else self.tangential_block.slip
+
+    @property
+    def structure(self) -> Structure:
+        """Which entries of W are stored."""
+        return structure_of(self.delassus)
+
+    @property
+    def normalized_delassus(self) -> Symmetric:
+        """G: W between unit normals."""
+        return scaled(self.delassus, 1 / self.norm)
+
+    @property
+    def normalized_gap_velocity(self) -> jax.Array:
+        """qn- = gamma- / |grad f| (m,) [sqrt(J)]."""
+        return self.gap_velocity / self.norm
+
+    @property
+    def normal_delassus(self) -> jax.Array:
+        """W (m, m) [1/kg] as an array, of a chain too."""
+        return as_matrix(self.delassus)
+
+    @property
+    def whole_delassus(self) -> jax.Array:
+        """[[W, W_nt], [W_tn, W_tt]] (m + t, m + t); W where there are no tangents."""
+        w = self.normal_delassus
+        if self.tangential_block is None:
+            return w
+        cross, tangent, _ = self.tangential_block
+        return jnp.block([[w, cross], [cross.T, tangent]])
+
+    @property
+    def size(self) -> jax.Array:
+        """Energy scale () [sqrt(J)]: root of twice the energy of approach plus the stored one."""
+        root = jnp.sqrt(diagonal(self.delassus))
+        approach = jnp.sum((jnp.minimum(self.gap_velocity, 0.0) / root) ** 2)
+        return jnp.sqrt(approach + 2 * jnp.sum(self.stored))
+
+    @property
+    def happens(self) -> jax.Array:
+        """Whether () there is an impact: a contact approaches, stores energy or is not finite."""
+        gamma = self.gap_velocity
+        return jnp.any(gamma < 0) | jnp.any(self.stored > 0) | ~jnp.all(jnp.isfinite(gamma))
+
+    def within(self, noise: jax.Array) -> "Contact":
+        """The contact with gap velocities up to `noise` () [m/s] set to 0, as within rounding."""
+        gamma = without_rounding(self.gap_velocity, noise)
+        return eqx.tree_at(
+            lambda contact: (contact.gap_velocity, contact.noise),
+            self,
+            (gamma, jnp.maximum(self.noise, noise)),
+        )
+
+    def approaching(self, speed: jax.Array) -> "Contact":
+        """The contact with all gap velocities lower by `speed` () [m/s]."""
+        return eqx.tree_at(lambda contact: contact.gap_velocity, self, self.gap_velocity - speed)
+
+    @full_precision
+    def gap_velocity_after(self, normal: jax.Array, tangential: jax.Array | None) -> jax.Array:
+        """gamma+ (m,) [m/s] of impulses, normal p (m,) and tangential p_t (t,)."""
+        after = self.gap_velocity + self.delassus @ normal
+        if self.tangential_block is None or tangential is None:
+            return after
+        return after + self.tangential_block.normal_tangent @ tangential
+
+    @full_precision
+    def slip_after(self, normal: jax.Array, tangential: jax.Array) -> jax.Array:
+        """u+ (t,) [m/s] of impulses, normal (m,) and tangential (t,), where there are tangents."""
+        assert self.tangential_block is not None
+        cross, tangent, slip = self.tangential_block
+        return slip + cross.T @ normal + tangent @ tangential
+
+    @full_precision
+    def energy_change(self, normal: jax.Array, tangential: jax.Array | None = None) -> jax.Array:
+        """T+ - T- () [J] of normal and tangential impulses: their work at the mean velocities."""
+        mean = 0.5 * (self.gap_velocity + self.gap_velocity_after(normal, tangential))
+        if tangential is None or self.slip is None:
+            return mean @ normal
+        return mean @ normal + 0.5 * (self.slip + self.slip_after(normal, tangential)) @ tangential
+
+    @property
+    def kinetic_angles(self) -> jax.Array:
+        """Angles (m, m) [rad] between contacts; pi/2: they are decoupled."""
+        return _angles(self.delassus)
+
+    @full_precision
+    def rounding(self, normal: jax.Array, tangential: jax.Array | None) -> jax.Array:
+        """Rounding (m,) of gamma+ after normal and tangential impulses: terms of W p may cancel."""
+        w = self.delassus
+        size: jax.Array = abs(w) @ jnp.abs(normal)  # type: ignore[operator]
+        if self.cross is not None and tangential is not None:
+            size = size + jnp.abs(self.cross) @ jnp.abs(tangential)
+        rounding = precision(size.dtype).rounding
+        return self.noise + rounding * (jnp.abs(self.gap_velocity) + size)
+
+
+@full_precision
+def contact_of(
+    scene: Scene, velocity: jax.Array, stored: jax.Array | None = None, uses_gaps: bool = False
+) -> Contact:
+    """The contacts of a scene at a velocity v- (n,); `uses_gaps`: open ones take part.
+
+    Those with a gap of infinity never do.
+    """
+    gamma, noise = rounded_gap_velocity(scene, velocity)
+    w, block = delassus_matrix(scene), None
+    if scene.tangents is not None:
+        moved = solve_mass(scene, scene.tangents)
+        cross, tangent = scene.normals.T @ moved, scene.tangents.T @ moved
+        block = TangentialBlock(cross, tangent, scene.tangents.T @ velocity)
+    stored = jnp.zeros_like(gamma) if stored is None else jnp.broadcast_to(stored, gamma.shape)
+    contact = Contact(
+        w,
+        gamma,
+        closed=scene.closed,
+        gaps=scene.gaps,
+        stored=jnp.where(scene.closed, stored, 0.0).astype(gamma.dtype),
+        norm=jnp.sqrt(diagonal(w)) if scene.constraints is None else kinetic_norm(scene),
+        noise=noise,
+        tangential_block=block,
+    )
+    if scene.gaps is None:
+        return contact
+    return _taking_part(contact, scene.gaps < jnp.inf if uses_gaps else scene.closed)
+
+
+def _taking_part(contact: Contact, part: jax.Array) -> Contact:
+    """The contact where those outside `part` (m,) are decoupled, at rest, and at a gap of 1 m."""
+    w = decoupled(contact.delassus, part)
+    block = contact.tangential_block
+    if block is not None:
+        each = block.slip.shape[0] // part.shape[0]
+        rows = jnp.repeat(part, each)
+        # a row that takes no part keeps a diagonal entry of the size of W's
+        unit = jnp.diag(jnp.where(rows, 0.0, jnp.repeat(diagonal(w), each)))
+        block = TangentialBlock(
+            jnp.where(part[:, None] & rows[None, :], block.normal_tangent, 0.0),
+            jnp.where(rows[:, None] & rows[None, :], block.tangent, unit),
+            jnp.where(rows, block.slip, 0.0),
+        )
+    gamma = jnp.where(part, contact.gap_velocity, 0.0)
+    gaps = jnp.where(part, contact.gaps, 1.0)
+    return dataclasses.replace(
+        contact, delassus=w, gap_velocity=gamma, gaps=gaps, tangential_block=block
+    )
+
+
+@full_precision
+def rounded_gap_velocity(scene: Scene, velocity: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """gamma- (m,), 0 where it is within the rounding of v-, and that rounding (m,).
+
+    The derivative of gamma- remains that of N^T v- where its value is set to 0.
+    """
+    gamma, speed = gap_velocity(scene, velocity), jax.lax.stop_gradient(jnp.abs(velocity))
+    if scene.pairs is not None:
+        size = jax.tree.map(jnp.abs, scene.pairs).rates(speed)
+    elif scene.walls is None:
+        size = jnp.abs(scene.normals).T @ speed
+    else:
+        left, right = scene.walls
+        padded = jnp.pad(speed, (int(left), int(right)))
+        size = padded[:-1] + padded[1:]
+    noise = jax.lax.stop_gradient(precision(speed.dtype).rounding * size)
+    return without_rounding(gamma, noise), noise
+
+
+@full_precision
+def delassus_matrix(scene: Scene) -> Symmetric:
+    """`W = N^T M^-1 N` [1/kg]: (m, m), or `Tridiagonal` for a chain.
+
+    Args:
+        scene: n coordinates, m contacts.
+
+    Returns:
+        W (m, m) [1/kg], symmetric; indexed like an array where it is `Tridiagonal`.
+
+    Source: Brogliato (2016), (6.35) where bilateral constraints are present.
+
+    >>> import jimpact as ji
+    >>> ji.delassus_matrix(ji.chain([1.0, 2.0, 2.0])).diagonal.tolist()
+    [1.5, 1.0]
+    """
+    if scene.pairs is not None:
+        return scene.pairs.delassus(scene.mass)
+    if scene.walls is None:
+        return scene.normals.T @ solve_mass(scene, scene.normals)
+    left, right = scene.walls
+    inverse = 1 / scene.mass
+    padded = jnp.pad(inverse, (int(left), int(right)))
+    shared = inverse[int(not left) : scene.size - int(not right)]
+    return Tridiagonal(padded[:-1] + padded[1:], -shared, scene.contacts <= scene.size)
+
+
+def decoupled(delassus: Symmetric, closed: jax.Array) -> Symmetric:
+    """W whose rows and columns of open contacts hold their diagonal only."""
+    if isinstance(delassus, Sparse):
+        return delassus.within(closed)
+    if isinstance(delassus, Tridiagonal):
+        off = jnp.where(closed[:-1] & closed[1:], delassus.off_diagonal, 0.0)
+        return Tridiagonal(delassus.diagonal, off, delassus.regular)
+    keep = (closed[:, None] & closed[None, :]) | jnp.eye(closed.shape[0], dtype=bool)
+    return jnp.where(keep, delassus, 0.0)
+
+
+def kinetic_norm(scene: Scene) -> jax.Array:
+    """`|grad f_j|` in the metric of M^-1 (m,), the square roots of the free W_jj."""
+    if scene.walls is not None or scene.pairs is not None:
+        return jnp.sqrt(diagonal(delassus_matrix(scene)))
+    moved = solve_mass(without_constraints(scene), scene.normals)
+    return jnp.sqrt(jnp.sum(scene.normals * moved, axis=0))
+
+
+@full_precision
+def normalized_delassus(scene: Scene) -> Symmetric:
+    """`G = W` between unit normals: unit diagonal, `G_ij = -cos(theta_ij)`.
+
+    Bilateral constraints distort it, its diagonal included: Brogliato (2016), (6.35).
+
+    Args:
+        scene: n coordinates, m contacts.
+
+    Returns:
+        G (m, m), or `Tridiagonal` for a chain.
+
+    >>> import jimpact as ji
+    >>> ji.theory.normalized_delassus(ji.chain([1.0, 1.0, 1.0])).off_diagonal.round(3).tolist()
+    [-0.5]
+    """
+    return scaled(delassus_matrix(scene), 1 / kinetic_norm(scene))
+
+
+@full_precision
+def normalized_gap_velocity(scene: Scene, velocity: Any) -> jax.Array:
+    """`gamma_j / |grad f_j|` (m,) [sqrt(J)], the normal quasi-velocities.
+
+    Args:
+        scene: n coordinates, m contacts.
+        velocity: (n,) [m/s].
+
+    Returns:
+        qn (m,) [sqrt(J)], < 0 on approach.
+
+    Raises:
+        ValueError: not one velocity per coordinate.
+
+    Source: Brogliato (2016), (6.23).
+
+    >>> import jimpact as ji
+    >>> ji.theory.normalized_gap_velocity(ji.chain([0.5, 0.5]), [1.0, 0.0]).tolist()
+    [-0.5]
+    """
+    return gap_velocity(scene, velocity) / kinetic_norm(scene)
+
+
+@full_precision
+def kinetic_angles(scene: Scene) -> jax.Array:
+    """Angles `theta_ij = pi - arccos(G_ij)` (m, m) [rad] between contacts; pi/2: decoupled.
+
+    Args:
+        scene: n coordinates, m contacts.
+
+    Returns:
+        Angles (m, m) [rad], pi on the diagonal.
+
+    G is the normalized `delassus_matrix`, so bilateral constraints count: contacts of bodies that a
+    constraint ties together are coupled. (6.66) takes the masses alone, where they are decoupled:
+    that is the angle of `Scene(scene.mass, scene.normals)`.
+
+    Not differentiable on its diagonal (theta_jj = pi) nor for redundant contacts.
+    Source: Brogliato (2016), (6.66), with the W of the constrained bodies.
+
+    >>> import jimpact as ji
+    >>> float(ji.kinetic_angles(ji.chain([1.0, 2.0, 3.0]))[0, 1].round(4))
+    1.1071
+    """
+    return _angles(delassus_matrix(scene))
+
+
+def _angles(w: Symmetric) -> jax.Array:
+    """Kinetic angles (m, m) [rad] from a Delassus matrix."""
+    cosine = as_matrix(scaled(w, 1 / jnp.sqrt(diagonal(w))))
+    return jnp.pi - jnp.arccos(jnp.clip(cosine, -1.0, 1.0))
+
+
+def coupled_groups(scene: Scene) -> Groups | None:
+    """Groups of contacts between which the Delassus matrix is zero whatever its values.
+
+    Groups follow from the zeros of M, N, tangents and constraints, never from rounded values of W:
+    contacts of a group move a common coordinate, or coordinates joined by an entry of a dense M or
+    by bilateral constraints. Open contacts are in no group (with traced gaps all contacts count as
+    closed). The result is None where all contacts form one group, where the zeros are not known on
+    the host, and for a chain or packing, whose W has only O(m) entries.
+
+    >>> import jimpact as ji
+    >>> from jimpact.core.contact import coupled_groups
+    >>> two_pairs = ji.Scene([1.0] * 4, [[-1, 0], [1, 0], [0, -1], [0, 1]])  # o o  o o
+    >>> [group.tolist() for group in coupled_groups(two_pairs)]
+    [[[0], [1]]]
+    """
+    m, tangents = scene.contacts, scene.tangents
+    if scene.walls is not None or scene.pairs is not None or m == 1:
+        return None
+    if is_traced((scene.normals, tangents, scene.constraints)):
+        return None
+    if scene.mass.ndim == 2 and is_traced(scene.mass):
+        return None
+    known = scene.gaps is not None and not is_traced(scene.gaps)
+    members = np.flatnonzero(np.asarray(scene.gaps) <= 0) if known else np.arange(m)
+    if len(members) == 0:
+        return None
+    moves = np.asarray(scene.normals) != 0
+    if tangents is not None:
+        moves |= (np.asarray(tangents) != 0).reshape(len(moves), m, -1).any(axis=2)
+    touched = [moves[:, members]]
+    if scene.mass.ndim == 2:
+        touched.append(np.asarray(scene.mass) != 0)
+    if scene.constraints is not None:
+        touched.append(np.asarray(scene.constraints) != 0)
+    label = components(np.concatenate(touched, axis=1))[: len(members)]
+    groups = [members[label == first] for first in np.unique(label)]
+    return None if len(groups[0]) == m else _by_size(groups, m)
+
+
+def components(touches: np.ndarray) -> np.ndarray:
+    """For each column of a boolean matrix the first column of its connected component."""
+    count = touches.shape[1]
+    label = np.arange(count)
+    while True:
+        of_row = np.where(touches, label[None, :], count).min(axis=1)
+        least = np.where(touches, of_row[:, None], count).min(axis=0)
+        least = least[least]  # of the column it points to: long chains take few rounds
+        if (least == label).all():
+            return label
+        label = least
+
+
+def _by_size(groups: list[np.ndarray], m: int) -> Groups:
+    """The groups in one array, or the smaller ones and the larger ones in two."""
+    groups = sorted(groups, key=len)  # stable
+    size = np.array([len(group) for group in groups])
+    few = np.arange(
+        len(groups)
+    )  # entry i: number of entries of W if the first i groups have their own array
+    entries = few * size[few - 1] ** 2 + (len(groups) - few) * size[-1] ** 2
+    cut = int(np.argmin(entries)) if entries[0] > WORTH_A_PROGRAM * entries.min() else 0
+
+    def padded(part: list[np.ndarray]) -> np.ndarray:
+        """Index arrays in rows of the last one's length."""
+        most = len(part[-1])
+        return np.stack([np.pad(g, (0, most - len(g)), constant_values=m + g[0]) for g in part])
+
+    return tuple(padded(part) for part in (groups[:cut], groups[cut:]) if part)
+
+
+def contacts_of_groups(
+    scene: Scene, velocity: jax.Array, stored: jax.Array, groups: Groups
+) -> list[Contact]:
+    """For each array of groups (c, g) their contacts, with a leading axis (c,).
+
+    W of all contacts is never formed. An entry that only pads its group is like an open contact.
+    """
+    gamma, noise = rounded_gap_velocity(scene, velocity)
+    m, norm = scene.contacts, kinetic_norm(scene)
+    gaps = jnp.zeros_like(gamma) if scene.gaps is None else scene.gaps
+    each = 0 if scene.tangents is None else scene.tangents.shape[1] // m
+    columns = scene.normals
+    if scene.tangents is not None:
+        columns = jnp.concatenate([columns, scene.tangents], axis=1)
+        slip = scene.tangents.T @ velocity
+    moved = solve_mass(scene, columns)
+
+    def contacts_of(padded: np.ndarray) -> Contact:
+        """The contacts of groups of one size."""
+        index = padded % m
+        g = index.shape[1]
+        tangents = each * index[:, :, None] + jnp.arange(each)[None, None, :]
+        tangents = tangents.reshape(len(index), each * g)
+        directions = jnp.concatenate([index, m + tangents], axis=1)
+        part = jnp.asarray(padded < m) & scene.closed[index]
+        matrix = jnp.einsum("nca,ncb->cab", columns[:, directions], moved[:, directions])
+        block = (matrix[:, :g, g:], matrix[:, g:, g:], slip[tangents]) if each else None
+        contact = Contact(
+            matrix[:, :g, :g],
+            gamma[index],
+            closed=part,
+            gaps=gaps[index],
+            stored=jnp.where(part, stored[index], 0.0),
+            norm=norm[index],
+            noise=noise[index],
+            tangential_block=block,
+        )
+        return jax.vmap(_taking_part)(contact, part)
+
+    return [contacts_of(padded) for padded in groups]

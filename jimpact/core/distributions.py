@@ -1,0 +1,231 @@
+"""What a sample is drawn from: uniform, normal, rows of an array, the user's own function."""
+
+import abc
+import operator
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact.core.law import Domain, Law, free_parameters_of
+from jimpact.tools.checks import as_float_array, as_numbers, check_shape
+
+OVERLAP = (
+    "a negative gap is an overlap, that is a precompressed contact: give LZB the energy stored in "
+    "it (`initial_energy`) and leave the gap at 0."
+)
+
+
+class Distribution(eqx.Module):
+    """Independent entries, each with its own parameters, or the same for all."""
+
+    def __repr__(self) -> str:
+        """The distribution as one writes it."""
+        words = ", ".join(f"{name}={_short(value)}" for name, value in vars(self).items())
+        return f"{type(self).__name__}({words})"
+
+    @abc.abstractmethod
+    def sample(self, key: jax.Array, size: int, dtype: Any, non_negative: bool) -> jax.Array:
+        """One draw (size,); with `non_negative` truncated at 0."""
+
+    def check(self, name: str, size: int, non_negative: bool) -> None:
+        """Raise where the parameters do not fit."""
+        for field, value in vars(self).items():
+            if np.shape(value) not in ((), (size,)):
+                raise ValueError(
+                    f"Argument `{name}` must have scalars or {size} values in `{field}`, but is "
+                    f"{self!r}."
+                )
+
+
+class Uniform(Distribution):
+    """Independent and uniform between `low` and `high`.
+
+    Args:
+        low: scalar or one per entry (m,), in the unit of what is drawn.
+        high: likewise, >= low.
+
+    Raises:
+        ValueError: not finite, high < low.
+
+    >>> import jimpact as ji
+    >>> ji.Uniform(0.0, [1e-6, 2e-6])
+    Uniform(low=0, high=[1e-06, 2e-06])
+    """
+
+    low: jax.Array
+    high: jax.Array
+
+    def __init__(self, low: Any, high: Any):
+        """Check both ends."""
+        self.low, self.high = as_numbers("low", low), as_numbers("high", high)
+        if np.any(np.asarray(self.low) > np.asarray(self.high)):
+            raise ValueError(f"Argument `high` must be at least `low`, but has {self!r}.")
+
+    def sample(self, key: jax.Array, size: int, dtype: Any, non_negative: bool) -> jax.Array:
+        """One draw (size,)."""
+        low, high = (jnp.broadcast_to(x, (size,)).astype(dtype) for x in (self.low, self.high))
+        return jnp.minimum(low + (high - low) * jax.random.uniform(key, (size,), dtype), high)
+
+    def check(self, name: str, size: int, non_negative: bool) -> None:
+        """Raise where `low` is negative and must not be, or the shapes do not fit."""
+        super().check(name, size, non_negative)
+        if non_negative and np.any(np.asarray(self.low) < 0):
+            raise ValueError(
+                f"Argument `{name}` must not yield negative values, but {self!r} does; {OVERLAP}"
+            )
+
+
+class Normal(Distribution):
+    """Independent and normal.
+
+    As a distribution of gaps it is truncated at 0 (drawn again, not clipped), so the gaps have a
+    larger mean and a smaller spread than `mean` and `std` say where these are comparable.
+
+    Args:
+        mean: scalar or one per entry (m,), in the unit of what is drawn.
+        std: standard deviation > 0, likewise.
+
+    Raises:
+        ValueError: not finite, std <= 0.
+
+    >>> import jimpact as ji
+    >>> ji.Normal(1e-5, 1e-6)
+    Normal(mean=1e-05, std=1e-06)
+    """
+
+    mean: jax.Array
+    std: jax.Array
+
+    def __init__(self, mean: Any, std: Any):
+        """Check both parameters."""
+        self.mean = as_numbers("mean", mean)
+        self.std = as_numbers("std", std, low=0.0, open_low=True)
+
+    def sample(self, key: jax.Array, size: int, dtype: Any, non_negative: bool) -> jax.Array:
+        """One draw (size,)."""
+        mean, std = (jnp.broadcast_to(x, (size,)).astype(dtype) for x in (self.mean, self.std))
+        if not non_negative:
+            return mean + std * jax.random.normal(key, (size,), dtype)
+        unit = jax.random.truncated_normal(key, -mean / std, jnp.inf, (size,), dtype)
+        return jnp.maximum(mean + std * unit, 0)  # rounding only
+
+    def check(self, name: str, size: int, non_negative: bool) -> None:
+        """Raise where a truncated distribution has a negative mean, or the shapes do not fit."""
+        super().check(name, size, non_negative)
+        if non_negative and np.any(np.asarray(self.mean) < 0):
+            raise ValueError(
+                f"Argument `{name}` is truncated at 0 and must have a mean of at least 0, but is "
+                f"{self!r}; {OVERLAP}"
+            )
+
+
+class GivenRows(eqx.Module):
+    """Given samples, `count` of them: sample i is row i."""
+
+    count: int
+
+    def __repr__(self) -> str:
+        """How many rows they are."""
+        return f"{self.count} given rows"
+
+
+class RandomLaw(eqx.Module):
+    """A law some of whose parameters are drawn anew for every sample: `key -> Law`.
+
+    Args:
+        law: everything that is not drawn.
+        parameters: by field, `restitution=Uniform(0.8, 0.9)`; entries are independent (give the
+            law a scalar to have one value for all contacts).
+
+    Raises:
+        ValueError: no such field, or a distribution that leaves its domain (as a Normal does
+            where the domain is bounded; a function `key -> Law` may do anything).
+
+    >>> import jax
+    >>> import jimpact as ji
+    >>> drawn = ji.RandomLaw(ji.Newton(0.5), restitution=ji.Uniform(0.8, 0.9))(jax.random.key(0))
+    >>> 0.8 <= float(drawn.restitution) <= 0.9
+    True
+    """
+
+    law: Law
+    parameters: dict[str, Distribution]
+
+    def __init__(self, law: Law, **parameters: Distribution):
+        """Check that the law has such parameters, and that they stay in their domains."""
+        known = free_parameters_of(law)
+        if not parameters:
+            raise ValueError(
+                "Argument `parameters` must name one that is random or more, of "
+                f"{', '.join(known)}."
+            )
+        for name, distribution in parameters.items():
+            if name not in known:
+                raise ValueError(
+                    f"Parameters of {type(law).__name__} that can be random are "
+                    f"{', '.join(known)}, but not `{name}`."
+                )
+            if not isinstance(distribution, Distribution):
+                raise TypeError(
+                    f"Argument `{name}` must be Uniform or Normal, but is {distribution!r}."
+                )
+            distribution.check(name, known[name].value.size, False)
+            _check_domain(name, distribution, known[name].domain)
+        self.law, self.parameters = law, parameters
+
+    def __repr__(self) -> str:
+        """The law's name with its random parameters."""
+        words = ", ".join(f"{name}={value!r}" for name, value in self.parameters.items())
+        return f"{type(self.law).__name__}({words})"
+
+    def __call__(self, key: jax.Array) -> Law:
+        """The law of this key."""
+        law, known = self.law, free_parameters_of(self.law)
+        for i, (name, distribution) in enumerate(sorted(self.parameters.items())):
+            old, path, _ = known[name]
+            new = distribution.sample(jax.random.fold_in(key, i), old.size, old.dtype, False)
+            law = eqx.tree_at(operator.attrgetter(path), law, new.reshape(old.shape))
+        return law
+
+
+def as_source(name: str, value: Any, size: int, non_negative: bool) -> Any:
+    """A distribution, a function of a key, rows (S, size), or a constant (size,); checked."""
+    if isinstance(value, Distribution):
+        value.check(name, size, non_negative)
+        return value
+    if callable(value):
+        drawn = value(jax.random.key(0, impl="threefry2x32"))
+        if not eqx.is_array(drawn):
+            raise TypeError(f"Argument `{name}` must give an array for a key, but gives {drawn!r}.")
+        check_shape(f"{name}(key)", drawn, (size,), "one draw")
+        return value
+    array = as_float_array(name, value)
+    several = array.ndim == 2
+    shape = (len(array), size) if several else (size,)
+    as_numbers(name, array, shape, "one sample a row" if several else "or one sample a row")
+    if non_negative and np.any(np.asarray(array) < 0):
+        where = np.argwhere(np.asarray(array) < 0)[0].tolist()
+        raise ValueError(
+            f"Argument `{name}` must not be negative, but has value "
+            f"{float(array[tuple(where)]):g} at index {where}; {OVERLAP}"
+        )
+    return array
+
+
+def _check_domain(name: str, drawn: Distribution, domain: Domain) -> None:
+    """Raise where a distribution can leave the domain of the parameter."""
+    low, high = domain.bounds
+    least, most = (drawn.low, drawn.high) if isinstance(drawn, Uniform) else (-np.inf, np.inf)
+    if np.min(least) < low or np.max(most) > high:
+        raise ValueError(
+            f"Argument `{name}` must lie in [{low:g}, {high:g}], but {drawn!r} can leave it."
+        )
+
+
+def _short(value: jax.Array) -> str:
+    """A number, or a list of numbers."""
+    entries = [f"{x:g}" for x in np.ravel(np.asarray(value))]
+    return entries[0] if np.ndim(value) == 0 else f"[{', '.join(entries)}]"

@@ -1,0 +1,456 @@
+"""`impact`: the one place that turns a law's impulses into velocities, energy and status."""
+
+import dataclasses
+import warnings
+from typing import Any, NamedTuple, Protocol, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact.core.contact import Contact, Groups, contacts_of_groups, coupled_groups
+from jimpact.core.law import Impulses, Law, check_law, is_separable, restrict_law, within_domains
+from jimpact.core.scene import (
+    Scene,
+    as_velocity,
+    gap_velocity,
+    is_allowed,
+    momentum,
+    pad_scene,
+    velocity_change,
+)
+from jimpact.numerics.derive import naming_the_adjoint
+from jimpact.numerics.tridiagonal import diagonal
+from jimpact.tools.checks import (
+    check_kind,
+    check_shape,
+    check_values,
+    in_common_dtype,
+    in_numbers,
+    is_traced,
+)
+from jimpact.tools.compiling import full_precision, is_top_level_call, quick_jit
+from jimpact.tools.precision import precision
+from jimpact.tools.status import CODE, STATUS, raise_for, sign_tolerance
+
+# Negative impulses are rounding up to this many times the impulse that would undo the noise of
+# gamma-: a law removes up to twice the noise, and coupled contacts pass it on a few times. Ten
+# times more would hide a contact that pulls slightly.
+ROUNDING_PUSHES = 8
+
+# Signs and gains of energy are violated beyond this multiple of the accuracy that a law allows
+# itself: an error of a velocity counts twice in the energy. Ten times more: a law that misses its
+# tolerance by 40 of them passes.
+ACCURACIES = 4
+
+# Number of contacts of the compiled program that single impacts of fewer contacts share. Compiling
+# takes a second for each number of contacts; padding by open contacts costs a tenth of the impact.
+# Ten times more would make every first impact slow.
+SHARED = 8
+
+
+class Impact(eqx.Module):
+    """Outcome of an impact; under `vmap` every field has the axes of the batch first.
+
+    `velocity` v+ (n,) [m/s]; `impulse` p (m,) [N s]; `tangential_impulse` (t,), t = 0 without
+    friction [N s]; `energy_change` T+ - T- () [J]; `initial_energy` stored before () [J]; `status`
+    () int32, a row of `jimpact.STATUS`, 0 = ok; `accuracy` (), the error of v+ that the law allows
+    itself, relative to the size of the impact.
+    """
+
+    velocity: jax.Array
+    impulse: jax.Array
+    tangential_impulse: jax.Array
+    energy_change: jax.Array
+    initial_energy: jax.Array
+    status: jax.Array
+    accuracy: jax.Array | float = 0.0
+
+    def __str__(self) -> str:
+        """Velocities, impulses, energy and status, in numbers."""
+        lines = [f"velocity        {in_numbers(self.velocity)} m/s"]
+        lines.append(f"impulse         {in_numbers(self.impulse)} N s")
+        if self.tangential_impulse.size:
+            lines.append(f"tangential      {in_numbers(self.tangential_impulse)} N s")
+        lines.append(f"energy change   {in_numbers(self.energy_change)} J")
+        status = in_numbers(self.status)
+        if self.status.ndim == 0 and status.isdigit():
+            status = STATUS[int(status)].name
+        return "\n".join([*lines, f"status          {status}"])
+
+
+@full_precision
+def impact(
+    law: Law, scene: Scene, velocity: Any, noise: Any = None, approach: Any = None
+) -> Impact:
+    """Velocities after the impact of `law` on `scene`; pure: jit, vmap and grad over all three.
+
+    Equation: `v+ = v- + M^-1 (N p + H p_t)`, `T+ - T- = (a + b) / 2`,
+    `a = (gamma+ + gamma-)^T p`, `b = (u+ + u-)^T p_t`; N (n, m) holds the contact normals,
+    H (n, t) the tangents, u = H^T v are the slip velocities.
+
+    Independent groups of contacts (two pairs of balls in one scene) are solved separately if the
+    scene is known, not traced, and the law allows it (`Law.separable`); the outcome is the same.
+    Approach within the rounding of v- (or within `noise`) counts as 0.
+
+    Args:
+        law: its parameters are scalars or (m,); a restitution matrix is (m, m).
+        scene: n coordinates, m contacts; contacts with gap > 0 take no part in instantaneous laws.
+        velocity: v- (n,) [m/s], [rad/s] for rotations.
+        noise: speed () [m/s] up to which an approach counts as rounding: in a motion v- has the
+            rounding of the largest earlier speeds. None: the rounding of v-.
+        approach: speed () [m/s] subtracted from every gap velocity before the law is applied; a
+            small value starts an impact without collision. None: 0.
+
+    Returns:
+        `Impact` with `velocity` (n,), `impulse` (m,), `tangential_impulse`, `energy_change` (),
+        `initial_energy` (), `status` () int32, 0 = ok (`raise_on_failure`, `jimpact.STATUS`).
+
+    Raises:
+        ValueError: shapes or ranges, on the host. Where they are traced, the status reports them:
+            `not_finite` (NaN in the velocity, a gap, `noise` or `approach`), or `out_of_range` (a
+            parameter outside its domain, a normal that is 0, a mass that is asymmetric or not
+            positive, a negative gap, `noise` or `approach`, a velocity that breaks a bilateral
+            constraint). An energy of the impact, `sum gamma-^2 / W_jj`, that the floating type
+            takes for 0 or infinite is `out_of_range` on the host, too: choose other units.
+            Warns where only open contacts approach and the law leaves those out.
+
+    >>> import jimpact as ji
+    >>> out = ji.impact(ji.LZB(0.9, stiffness=1.0, exponent=1.5), ji.chain([1, 1, 1]), [1, 0, 0])
+    >>> [round(float(v), 4) for v in out.velocity]
+    [-0.0086, 0.1041, 0.9045]
+    """
+    check_kind("law", law, Law)
+    check_kind("scene", scene, Scene)
+    v = as_velocity(scene, velocity, finite=True)
+    check_constrained(scene, v)
+    law, scene, v = in_common_dtype(law, scene, v)
+    check_law(law, scene, v.dtype)
+    for name, speed in (("noise", noise), ("approach", approach)):
+        check_values(name, speed, low=0.0)
+        if speed is not None:
+            check_shape(name, speed, (), "one speed")
+    offsets = _Offsets(
+        None if noise is None else jnp.asarray(noise, v.dtype),
+        None if approach is None else jnp.asarray(approach, v.dtype),
+    )
+    _warn_of_unused_gaps(law, scene, v)
+    separable = is_separable(law)
+    groups = coupled_groups(scene) if separable else None
+    few = scene.contacts <= SHARED and scene.walls != (True, True) and scene.tangents is None
+    pads = few and groups is None and separable and law.pads_scenes
+    if pads and not is_traced((law, scene, v, offsets)) and is_top_level_call():
+        return _impact_of_padded_scene(law, scene, v, offsets)
+    with naming_the_adjoint():
+        return _impact(law, scene, v, groups, offsets, Traced.of(law, scene, v, offsets))
+
+
+def _warn_of_unused_gaps(law: Law, scene: Scene, v: jax.Array) -> None:
+    """Warn where only open contacts approach, and the law leaves these out."""
+    if scene.gaps is None or law.uses_gaps or is_traced((scene, v)):
+        return
+    with jax.ensure_compile_time_eval():  # inside jit, too, where scene and v are known
+        approaches, stored = np.asarray(gap_velocity(scene, v)) < 0, law.stored
+    closed = np.asarray(scene.gaps) == 0
+    nothing = approaches.any() and not (approaches & closed).any()
+    if nothing and not is_traced(stored) and not np.any(stored):
+        warnings.warn(
+            f"Nothing happens: only open contacts (gap > 0) approach, and {type(law).__name__} "
+            "leaves them out. Laws that use gaps are Compliant and Binary.",
+            stacklevel=4,  # the line that calls `impact`, through `full_precision`
+        )
+
+
+class _Offsets(NamedTuple):
+    """`noise` and `approach` of `impact` [m/s]."""
+
+    noise: jax.Array | None
+    approach: jax.Array | None
+
+    def applied(self, contact: Contact) -> Contact:
+        """The contacts without gap velocities within the noise, and with the added approach."""
+        contact = contact if self.noise is None else contact.within(self.noise)
+        return contact if self.approach is None else contact.approaching(self.approach)
+
+
+NO_OFFSETS = _Offsets(None, None)
+
+
+class Traced(NamedTuple):
+    """Which arguments the host could not check, because they are traced."""
+
+    law: bool = False
+    scene: bool = False
+    constrained: bool = False  # whether the velocity keeps the bilateral constraints
+    offsets: bool = False
+
+    @classmethod
+    def of(cls, law: Law, scene: Scene, v: jax.Array, offsets: _Offsets = NO_OFFSETS) -> "Traced":
+        """Those of an impact."""
+        constrained = scene.constraints is not None and is_traced((scene.constraints, v))
+        return cls(is_traced(law), is_traced(scene), constrained, is_traced(offsets))
+
+    def status(
+        self,
+        arguments: tuple[Law, Scene, jax.Array, _Offsets],
+        code: jax.Array,
+        size: jax.Array,
+        finite: jax.Array,
+    ) -> jax.Array:
+        """Status () of an impact with these `arguments`: `code`, or why it has no outcome.
+
+        `size` () is the root of its energy [sqrt(J)]; `finite` (): whether its results are.
+        """
+        code = jnp.where(finite, code, CODE["not_finite"])
+        code = jnp.where(_has_scale(size, arguments[2]), code, CODE["out_of_range"])
+        if any(self):
+            refused = self._refusal(*arguments)
+            code = jnp.where(refused > CODE["ok"], refused, code)
+        return code.astype(jnp.int32)
+
+    def _refusal(self, law: Law, scene: Scene, v: jax.Array, offsets: _Offsets) -> jax.Array:
+        """`not_finite` or `out_of_range` where an argument is not allowed, else `ok`."""
+        inputs = [x for x, traced in zip((law, scene, None, offsets), self) if traced]
+        numbers = [x for x in jax.tree.leaves(inputs) if eqx.is_inexact_array(x)]
+        unknown = [jnp.any(jnp.isnan(x)) for x in numbers]
+        allowed = [jnp.asarray(True)]
+        if self.law:
+            allowed.append(within_domains(law))
+        if self.scene:
+            allowed.append(is_allowed(scene))
+        if self.constrained:
+            allowed.append(jnp.all(_keeps_constraints(scene.constraints, v)))
+        if self.offsets:
+            allowed += [(x >= 0) & (x < jnp.inf) for x in offsets if x is not None]
+        code = jnp.where(jnp.all(jnp.asarray(allowed)), CODE["ok"], CODE["out_of_range"])
+        return jnp.where(jnp.any(jnp.asarray(unknown, bool)), CODE["not_finite"], code)
+
+
+def _impact_of_padded_scene(law: Law, scene: Scene, v: jax.Array, offsets: _Offsets) -> Impact:
+    """The impact by the program for SHARED contacts: those that are added are open."""
+    padded = pad_scene(scene, SHARED)
+    velocity: Any = np.zeros(padded.scene.size, v.dtype)
+    velocity[padded.coordinates] = v
+    on_host = restrict_law(jax.tree.map(np.asarray, law), padded.copied)
+    out = _impact(on_host, padded.scene, velocity, None, offsets, Traced())
+    return dataclasses.replace(
+        out,
+        velocity=jnp.asarray(np.asarray(out.velocity)[padded.coordinates]),
+        impulse=jnp.asarray(np.asarray(out.impulse)[padded.contacts]),
+    )
+
+
+def check_constrained(scene: Scene, velocity: jax.Array) -> None:
+    """A velocity that breaks a bilateral constraint is an error."""
+    if scene.constraints is None or is_traced((scene.constraints, velocity)):
+        return
+    h, v = np.asarray(scene.constraints), np.asarray(velocity)
+    keeps = _keeps_constraints(h, v)
+    if not keeps.all():
+        j = int(np.argmin(keeps))
+        raise ValueError(
+            "Argument `velocity` must satisfy the bilateral constraints, grad h^T v = 0, but "
+            f"constraint {j + 1} has the rate {(h.T @ v)[j]:g}."
+        )
+
+
+def _keeps_constraints(constraints: Any, velocity: Any) -> Any:
+    """Whether (b,) a velocity satisfies each bilateral constraint within its tolerance."""
+    size = abs(constraints).T @ abs(velocity)
+    return abs(constraints.T @ velocity) <= sign_tolerance(velocity.dtype) * size
+
+
+@quick_jit
+def _impact(
+    law: Law,
+    scene: Scene,
+    v: jax.Array,
+    groups: Groups | None,
+    offsets: _Offsets,
+    traced: Traced,
+) -> Impact:
+    """The outcome from the law's impulses: velocities, energy and status."""
+    if groups is None:
+        contact = offsets.applied(law.contact(scene, v))
+        happens = contact.happens
+        outcome = _resolved(law, contact, happens)
+        stored = contact.stored
+    else:
+        outcome, happens, stored = _in_groups(law, scene, v, groups, offsets)
+    p, tangential = outcome.normal, outcome.tangential
+    jump = velocity_change(scene, p, tangential)
+    v_plus = v + jump
+    # the work of the impulses, summed over bodies: next to a much lighter body terms of W p cancel
+    change = 0.5 * momentum(scene, jump) @ (v + v_plus)
+    total = jnp.sum(stored)
+    code = jnp.where(change > total + outcome.noise, CODE["energy_gain"], CODE["ok"])
+    code = jnp.where(happens, jnp.maximum(code, outcome.status), CODE["ok"])
+    finite = jnp.all(jnp.isfinite(v_plus)) & jnp.all(jnp.isfinite(p)) & jnp.isfinite(change)
+    size = jnp.where(happens, outcome.size, 1.0)
+    code = traced.status((law, scene, v, offsets), code, size, finite)
+    return Impact(v_plus, p, tangential, change, total, code, outcome.accuracy)
+
+
+def _has_scale(size: jax.Array, v: jax.Array) -> jax.Array:
+    """Whether () the energy size^2 of an impact is neither 0 nor infinite to the precision.
+
+    True as well where the velocity (n,) is not finite, and the energy can have no value.
+    """
+    tiny = precision(size.dtype).tiny
+    inside = (size**2 >= tiny) & (size**2 < jnp.inf)
+    return inside | ~jnp.all(jnp.isfinite(v))
+
+
+class _Resolved(NamedTuple):
+    """Impulses of contacts, the status of the law and of their signs, and two scales."""
+
+    normal: jax.Array
+    tangential: jax.Array
+    status: jax.Array
+    size: jax.Array  # () of the impact, square root of an energy
+    noise: jax.Array  # () energy that the rounding of v- and the law's accuracy leave unknown
+    accuracy: jax.Array  # () see `Impact`
+
+
+def judged_beyond(dtype: Any, accuracy: Any) -> Any:
+    """Part of the impact's size beyond which signs and gains of energy are violated."""
+    return jnp.maximum(sign_tolerance(dtype), ACCURACIES * accuracy)
+
+
+def _resolved(law: Law, contact: Contact, happens: jax.Array) -> _Resolved:
+    """The law's impulses; 0 without an impact (`happens` false), and at open contacts."""
+    gamma = contact.gap_velocity
+    # without an impact the law gets gamma- = -1 and its result is discarded: gradients stay finite
+    harmless = jnp.where(happens, gamma, -jnp.ones_like(gamma))
+    approaching = eqx.tree_at(lambda c: c.gap_velocity, contact, harmless)
+    impulses = _impulses_of(law, law.impulses(approaching), contact)
+    part = happens & (contact.closed | law.uses_gaps)
+    p = jnp.where(part, impulses.normal, 0.0)
+    tangential = jnp.zeros(contact.tangents * contact.contacts, p.dtype)
+    if impulses.tangential is not None:
+        rows = jnp.repeat(part, contact.tangents)
+        tangential = jnp.where(rows, impulses.tangential, 0.0)
+    accuracy = law.accuracy(contact)
+    tolerance = judged_beyond(p.dtype, accuracy)
+    signs = _signs(contact, p, tangential, tolerance * contact.size)
+    code = jnp.maximum(impulses.status, signs)
+    code = jnp.where(happens, code, CODE["ok"])
+    noise = jnp.sum(contact.noise * jnp.abs(p)) + tolerance * contact.size**2
+    return _Resolved(p, tangential, code, contact.size, noise, jnp.asarray(accuracy, p.dtype))
+
+
+def _impulses_of(law: Law, returned: Any, contact: Contact) -> Impulses:
+    """What a law's `impulses` returned; raises unless they are impulses of these contacts."""
+    name = f"`{type(law).__name__}.impulses`"
+    if not isinstance(returned, tuple):  # an array would pass for its entries
+        raise TypeError(f"{name} must return `ji.Impulses`, but returns {type(returned).__name__}.")
+    impulses = Impulses(*returned)
+    t = contact.tangents * contact.contacts
+    for part, size in (("normal", contact.contacts), ("tangential", t)):
+        value = getattr(impulses, part)
+        if value is not None and jnp.shape(value) != (size,):
+            raise ValueError(
+                f"{name} must return `{part}` of shape ({size},), but returns one of shape "
+                f"{jnp.shape(value)}."
+            )
+    if isinstance(impulses.status, int) and impulses.status not in CODE.values():
+        raise ValueError(
+            f"{name} must return `status` of a row of `ji.STATUS`, below {len(STATUS)}, but "
+            f"returns {impulses.status}."
+        )
+    return impulses._replace(normal=jnp.asarray(impulses.normal))
+
+
+def _in_groups(
+    law: Law, scene: Scene, v: jax.Array, groups: Groups, offsets: _Offsets
+) -> tuple[_Resolved, jax.Array, jax.Array]:
+    """All groups solved side by side; whether there is an impact, and the stored energy (m,).
+
+    Signs are judged on the scale of their group. A group without an impact gets p = 0, unless the
+    law also pulls at separating contacts.
+    """
+    m = scene.contacts
+    stored = jnp.where(scene.closed, jnp.broadcast_to(law.stored, (m,)).astype(v.dtype), 0.0)
+    batches = [offsets.applied(c) for c in contacts_of_groups(scene, v, stored, groups)]
+    active = [jax.vmap(lambda contact: contact.happens)(contacts) for contacts in batches]
+    happens = jnp.any(jnp.concatenate(active))
+    p = jnp.zeros(m, v.dtype)
+    each = 0 if scene.tangents is None else scene.tangents.shape[1] // m
+    tangential = jnp.zeros((m, each), v.dtype)
+    code, square, noise = jnp.asarray(CODE["ok"]), jnp.zeros((), v.dtype), jnp.zeros((), v.dtype)
+    accuracy = jnp.zeros((), v.dtype)
+    for padded, contacts, acts in zip(groups, batches, active):
+        index = jnp.asarray(padded % m)
+        acts = happens & (acts | law.pulls)
+
+        def resolve_group(index: jax.Array, contact: Contact, acts: jax.Array) -> _Resolved:
+            """The impulses of one group."""
+            return _resolved(restrict_law(law, index), contact, acts)
+
+        if len(index) == 1:  # without the cost of a batch
+            one = resolve_group(*jax.tree.map(lambda x: x[0], (index, contacts, acts)))
+            part = jax.tree.map(lambda x: jnp.asarray(x)[None], one)
+        else:
+            part = jax.vmap(resolve_group)(index, contacts, acts)
+        at = padded.reshape(-1)
+        p = p.at[at].set(part.normal.reshape(-1), mode="drop")
+        rows = part.tangential.reshape(len(at), each)
+        tangential = tangential.at[at].set(rows, mode="drop")
+        code = jnp.maximum(code, jnp.max(part.status))
+        square, noise = square + jnp.sum(part.size**2), noise + jnp.sum(part.noise)
+        accuracy = jnp.maximum(accuracy, jnp.max(part.accuracy))
+    outcome = _Resolved(p, tangential.reshape(-1), code, jnp.sqrt(square), noise, accuracy)
+    return outcome, happens, stored
+
+
+def _signs(
+    contact: Contact, p: jax.Array, tangential: jax.Array, tolerance: jax.Array
+) -> jax.Array:
+    """negative_impulse or inadmissible_velocity beyond `tolerance`; 0 if neither."""
+    root = jnp.sqrt(diagonal(contact.delassus))
+    # the sign of an impulse that only undoes the rounding of v- is not judged
+    floor = tolerance + jnp.sqrt(jnp.sum((ROUNDING_PUSHES * contact.noise / root) ** 2))
+    pull = jnp.any(p * root < -floor)
+    after = contact.gap_velocity_after(p, tangential) + contact.rounding(p, tangential)
+    approach = jnp.any(contact.closed & (after / root < -tolerance))
+    code = jnp.where(approach, CODE["inadmissible_velocity"], CODE["ok"])
+    return jnp.where(pull, CODE["negative_impulse"], code)
+
+
+class _Outcome(Protocol):
+    """What has a status: an `Impact` or a `Motion`, one or a batch."""
+
+    @property
+    def status(self) -> Any:
+        """Codes () or of a batch."""
+
+
+OutcomeT = TypeVar("OutcomeT", bound=_Outcome)
+
+
+def raise_on_failure(out: OutcomeT) -> OutcomeT:
+    """Raise a RuntimeError naming every failed impact or motion (batched or not); else return it.
+
+    Codes that only inform (`plastic_limit`, `ill_conditioned`, `order_dependent`, ..) pass.
+
+    Args:
+        out: what `impact` or `simulate` returned, one or a batch.
+
+    Returns:
+        `out` itself.
+
+    Raises:
+        RuntimeError: a status that is a failure; with the places in the batch.
+
+    >>> import jimpact as ji
+    >>> apart = ji.impact(ji.Newton(0.5), ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 1.0])
+    >>> ji.raise_on_failure(apart)
+    Traceback (most recent call last):
+        ...
+    RuntimeError: Failed impacts among 1:
+      negative_impulse: a contact would have to pull (p < 0) (1)
+    """
+    explain = getattr(out, "explain_failure", lambda row, lanes: "")
+    raise_for(out.status, STATUS, f"{type(out).__name__.lower()}s", explain)
+    return out

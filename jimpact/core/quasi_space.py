@@ -1,0 +1,122 @@
+"""A basis of velocities normal and tangential to the contacts, in the kinetic metric."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact.core.contact import kinetic_norm, normalized_delassus
+from jimpact.core.scene import Scene, dense_mass, momentum, velocity_change
+from jimpact.numerics.tridiagonal import as_matrix
+from jimpact.tools.checks import is_traced
+from jimpact.tools.compiling import quick_jit
+from jimpact.tools.precision import precision
+
+# Relative difference below which shares of coordinates in the tangent space count as equal: the
+# first one is taken, so that a basis does not depend on the last digit. Ten times more would take
+# coordinates that span the space less well.
+_EQUAL_SHARE = 1e-3
+
+_REDUNDANT = (
+    "Argument `scene` must have independent contact normals and constraints to define "
+    "quasi-velocities, but has {}."
+)
+
+
+def quasi_basis(scene: Scene) -> tuple[jax.Array, jax.Array]:
+    """Bases `n_q` (n, m) and `t_q` (n, n - m - b) of the kinetic quasi-velocities.
+
+    Equation: `n_q = M^-1 N diag(1 / |grad f_j|)`, `t_q^T M n_q = 0`, `t_q^T grad h = 0`,
+    `t_q^T M t_q = I` (so that `D_t = I`).
+
+    Column i of t_q comes from a coordinate: the n - m - b coordinates with the largest shares
+    (in the kinetic metric) in the tangent space are projected onto it and orthonormalized in
+    their order; each column forms an acute angle with what is left of its coordinate. A chain
+    without walls: `(1, ..., 1) / sqrt(sum m)`.
+
+    Args:
+        scene: n coordinates, m contacts, b bilateral constraints.
+
+    Returns:
+        n_q [1 / sqrt(kg)], t_q [1 / sqrt(kg)].
+
+    Raises:
+        ValueError: redundant contacts, whose n_q are not independent (NaN or noise if traced).
+
+    Differentiable in the scene, but for the moments when another coordinate takes over.
+
+    Source: Brogliato, Nonsmooth Mechanics (2016), (6.22)-(6.23).
+
+    >>> import jimpact as ji
+    >>> normal, tangent = ji.theory.quasi_basis(ji.chain([2.0, 2.0]))
+    >>> [round(float(x), 6) for x in normal[:, 0]], [round(float(x), 6) for x in tangent[:, 0]]
+    ([-0.5, 0.5], [0.5, 0.5])
+    """
+    check_independent(scene)
+    return _basis(scene)
+
+
+@quick_jit
+def _basis(scene: Scene) -> tuple[jax.Array, jax.Array]:
+    """n_q and t_q, of a scene whose contacts are independent."""
+    fixed = _directions(scene)
+    metric = jax.vmap(partial(momentum, scene), 1, 1)  # M X
+    gram = as_matrix(normalized_delassus(fixed))
+    unit = jnp.eye(fixed.contacts, dtype=gram.dtype) / kinetic_norm(fixed)[:, None]
+    # M^-1 (N, grad h), unit columns
+    normal = jax.vmap(partial(velocity_change, fixed), 1, 1)(unit)
+    identity = jnp.eye(scene.size, dtype=gram.dtype)
+    free = identity - normal @ jnp.linalg.solve(gram, metric(normal).T)
+    chosen = _coordinates(metric(free), metric(identity), scene.size - fixed.contacts)
+    tangent = free[:, chosen]
+    triangle = jnp.linalg.cholesky(tangent.T @ metric(tangent))
+    tangent = jax.scipy.linalg.solve_triangular(triangle, tangent.T, lower=True).T
+    return normal[:, : scene.contacts], tangent
+
+
+def _directions(scene: Scene) -> Scene:
+    """The scene with its bilateral constraints as further contacts."""
+    fixed = scene.normals
+    if scene.constraints is not None:
+        fixed = jnp.concatenate([fixed, scene.constraints], axis=1)
+    if fixed.shape[1] > scene.size:
+        raise ValueError(_REDUNDANT.format(f"{fixed.shape[1]} of them for {scene.size} velocities"))
+    return Scene(scene.mass, fixed)
+
+
+def check_independent(scene: Scene) -> None:
+    """Raise a ValueError where contact normals and constraints are dependent (if concrete)."""
+    fixed = _directions(scene)
+    if is_traced((fixed.normals, fixed.mass)):
+        return
+    normals = np.asarray(fixed.normals, float)
+    gram = normals.T @ np.linalg.solve(dense_mass(fixed), normals)
+    norm = np.sqrt(np.diag(gram))
+    smallest = np.linalg.eigvalsh(gram / np.outer(norm, norm))[0]
+    if smallest < precision(gram.dtype).singular * len(gram):
+        raise ValueError(
+            _REDUNDANT.format(f"redundant ones: smallest eigenvalue of G {smallest:.3g}")
+        )
+
+
+def _coordinates(shares: jax.Array, mass: jax.Array, count: int) -> jax.Array:
+    """The `count` coordinates that span the tangent space best, ascending.
+
+    Pivoted Cholesky factorization of the Gram matrix of the projected coordinate directions.
+    """
+    if count == 0:
+        return jnp.zeros(0, jnp.int32)
+    scale = 1 / jnp.sqrt(jnp.diagonal(mass))
+    gram = jax.lax.stop_gradient(shares * scale[:, None] * scale[None, :])
+
+    def choose(i: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        """One more pivot, and the Gram matrix without its direction."""
+        rest, chosen = state
+        left = jnp.diagonal(rest)
+        pivot = jnp.argmax(left >= (1 - _EQUAL_SHARE) * jnp.max(left)).astype(jnp.int32)
+        column = rest[:, pivot]
+        return rest - jnp.outer(column, column) / left[pivot], chosen.at[i].set(pivot)
+
+    start = (gram, jnp.zeros(count, jnp.int32))
+    return jnp.sort(jax.lax.fori_loop(0, count, choose, start)[1])

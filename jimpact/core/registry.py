@@ -1,0 +1,189 @@
+"""The registry of laws: what studies, comparisons and the command line know by name."""
+
+import inspect
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, NamedTuple
+
+from jimpact.core.law import Law, options_of
+from jimpact.tools.checks import check_choice, check_kind, check_word
+
+EVERY_PROPERTY = frozenset(
+    {"impulse_sign", "gap_velocity_sign", "energy", "velocity_scaling", "mass_scaling"}
+)
+
+
+class Row(NamedTuple):
+    """A registered law, what it promises on every scene, and where it comes from.
+
+    `promises` names the properties the contract suite holds it to; where the law breaks another
+    one of them, its status must say so.
+    """
+
+    law: type[Law]
+    summary: str
+    right_when: str
+    fails_when: str
+    promises: frozenset[str]
+    source: str
+    bibtex: str
+    make: Callable[..., Law] | None = None  # from plain numbers, where the class takes others
+    simplicity: float | None = None  # place in the order of `simplest_first`
+
+    @property
+    def arguments(self) -> dict[str, inspect.Parameter]:
+        """What `build` takes, by name."""
+        return dict(inspect.signature(self.make or self.law).parameters)
+
+    @property
+    def options(self) -> tuple[str, ...]:
+        """Names of what says how the law is solved."""
+        return options_of(self.law)
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return tuple(name for name in self.arguments if name not in self.options)
+
+    @property
+    def required(self) -> tuple[str, ...]:
+        """Parameters without a default."""
+        empty = inspect.Parameter.empty
+        return tuple(name for name, x in self.arguments.items() if x.default is empty)
+
+    def build(self, **parameters: Any) -> Law:
+        """The law with these parameters."""
+        return (self.make or self.law)(**parameters)
+
+
+REGISTRY: dict[str, Row] = {}
+
+# What `advise` knows of the contacts, by the names of parameters.
+ADVISED = ("restitution", "stiffness", "exponent", "friction")
+
+
+def simplest_first() -> tuple[str, ...]:
+    """Names of the laws that `advise` tries, in the order of what they must know of the contacts.
+
+    >>> import jimpact as ji
+    >>> from jimpact.core.registry import simplest_first
+    >>> "newton" in ji.REGISTRY and simplest_first()[0]
+    'newton'
+    """
+    places = {name: row.simplicity for name, row in REGISTRY.items() if row.simplicity is not None}
+    return tuple(sorted(places, key=lambda name: places[name]))
+
+
+def register(
+    name: str,
+    law: Any = None,
+    *,
+    summary: str = "",
+    right_when: str = "",
+    fails_when: str = "",
+    promises: Iterable[str] = (),
+    source: str = "",
+    bibtex: str = "",
+    make: Callable[..., Law] | None = None,
+    simplicity: float | None = None,
+) -> Any:
+    """Enter a law in `ji.REGISTRY`: then `compare`, studies and the command line know it by name.
+
+    Args:
+        name: in small letters; what a study calls it.
+        law: the class; None: `register` is used as a decorator of it.
+        summary, right_when, fails_when: a line each, for `jimpact laws`.
+        promises: properties it keeps on every scene, of 'impulse_sign', 'gap_velocity_sign',
+            'energy', 'velocity_scaling', 'mass_scaling'.
+        source, bibtex: where it comes from.
+        make: builds it from plain numbers, where the class takes other things.
+        simplicity: place in the order in which `advise` tries laws, the simplest first: newton 1,
+            moreau 2, poisson 3, binary 4, lzb 5, compliant 6; None: `advise` leaves it out.
+
+    Returns:
+        The class, or the decorator.
+
+    Raises:
+        TypeError: no Law. ValueError: a name that another law has, an unknown promise, a law that
+            `advise` cannot make.
+
+    >>> import jimpact as ji
+    >>> @ji.register("gentle", summary="half of Newton's impulse")
+    ... class Gentle(ji.Newton):
+    ...     def impulses(self, contact):
+    ...         p, side, status = super().impulses(contact)
+    ...         return ji.Impulses(0.5 * p, side, status)
+    >>> ji.REGISTRY["gentle"].parameters
+    ('restitution', 'friction', 'tangential_restitution')
+    >>> del ji.REGISTRY["gentle"]
+    """
+
+    check_kind("name", name, str)
+
+    def enter(law: Any) -> Any:
+        """The class, entered."""
+        if not (isinstance(law, type) and issubclass(law, Law)):
+            raise TypeError(f"Argument `law` must be a class of Law, but is {law!r}.")
+        if name != name.lower() or not name:
+            raise ValueError(f"Argument `name` must be in small letters, but has value {name!r}.")
+        for promise in promises:
+            check_choice("promises", promise, sorted(EVERY_PROPERTY))
+        other = REGISTRY.get(name)  # of the same place: a module that is read again
+        if other is not None and _place(other.law) != _place(law):
+            raise ValueError(
+                f"Argument `name` must be new, but {name!r} is {other.law.__qualname__} of "
+                f"{other.law.__module__}."
+            )
+        row = Row(
+            law,
+            summary,
+            right_when,
+            fails_when,
+            frozenset(promises),
+            source,
+            bibtex,
+            make,
+            simplicity,
+        )
+        unknown = [key for key in row.required if key not in ADVISED]
+        if simplicity is not None and unknown:
+            raise ValueError(
+                f"Argument `simplicity` must be None for a law that needs `{unknown[0]}`: `advise` "
+                f"knows only {', '.join(ADVISED)}."
+            )
+        REGISTRY[name] = row
+        return law
+
+    return enter if law is None else enter(law)
+
+
+def _place(law: type[Law]) -> tuple[str, str]:
+    """Module and name of a class."""
+    return law.__module__, law.__qualname__
+
+
+def registered_laws(
+    values: Mapping[str, Any], names: Iterable[str] | None = None
+) -> tuple[dict[str, Law], dict[str, str]]:
+    """Laws of these names, from parameters by name; and why others are left out.
+
+    `names`: in the registry, in their order; None: all. A parameter that no law has is refused.
+
+    >>> import jimpact as ji
+    >>> from jimpact.core.registry import registered_laws
+    >>> assert ji.REGISTRY  # our own laws are registered where they are imported
+    >>> laws, left_out = registered_laws({"restitution": 0.9})
+    >>> laws["newton"], left_out["restitution_matrix"]
+    (Newton(restitution=0.9, friction=None, tangential_restitution=None), 'needs `matrix`')
+    """
+    taken = sorted({key for row in REGISTRY.values() for key in row.arguments})
+    for key in values:
+        check_word("A parameter of laws", key, taken)
+    laws, left_out = {}, {}
+    for name in REGISTRY if names is None else names:
+        row = REGISTRY[name]
+        missing = [f"`{key}`" for key in row.required if key not in values]
+        if missing:
+            left_out[name] = f"needs {', '.join(missing)}"
+        else:
+            laws[name] = row.build(**{key: values[key] for key in row.arguments if key in values})
+    return laws, left_out

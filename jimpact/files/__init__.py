@@ -1,1 +1,0 @@
-"""Files: studies, measured shots and tables as they are written, without JAX."""

@@ -1,0 +1,396 @@
+"""Sequential pair collisions in contact space, until no contact approaches.
+
+Everything is in normalized quantities: `qn = gamma / sqrt(W_jj)`, `pbar = sqrt(W_jj) p` and G with
+unit diagonal. A collision at contact j adds `pbar_j += s_j` and `qn += G_j s_j`, with
+`s_j = -(1 + e_j) qn_j`, so that its own gap velocity becomes `-e_j qn_j`. With friction it adds a
+tangential impulse, too: each collision is one contact's Coulomb problem (`friction.py`).
+With correlation ratios the closed contacts beside it get impulses in a given ratio to its own.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jimpact.numerics.derive import by_jacobian
+from jimpact.numerics.friction import solve as solve_friction
+from jimpact.numerics.tangential import TangentialBlock, per_tangent
+from jimpact.numerics.tridiagonal import (
+    Symmetric,
+    Tridiagonal,
+    as_matrix,
+    diagonal,
+    off_diagonal,
+    scaled,
+)
+from jimpact.tools.loops import while_loop
+from jimpact.tools.precision import precision
+from jimpact.tools.status import CODE
+
+# eps, relative to the largest normalized approach velocity at the start: slower approaches are
+# rounding (no collision), and criteria closer than that are equal. Errors of the velocities grow
+# with the root of the number of collisions, so this covers some ten thousand; ten times more would
+# lose the last slow collisions of long sequences.
+REST = 128.0
+# Three or more contacts: a last collision slower than this (relative, as REST) that leaves an
+# approach is one of an endless sequence; what remains of it is below REST. Ten times more would cut
+# off sequences that end.
+DECAYED = {"float64": 1e-9, "float32": 3e-4}
+
+
+class CoulombFriction(NamedTuple):
+    """The tangential block, normalized by the `sqrt(W_jj)` of each contact, and its parameters."""
+
+    block: TangentialBlock
+    coefficient: jax.Array  # mu (m,)
+    restitution: jax.Array  # e_t (m,)
+
+
+class Inputs(NamedTuple):
+    """The normalized problem; `coupling` holds the entries of G off its unit diagonal."""
+
+    coupling: jax.Array
+    restitution: jax.Array  # () or (m,): a scalar costs one tangent, not m
+    qn: jax.Array
+    root: jax.Array  # sqrt(W_jj), only compared
+    gaps: jax.Array | None  # None: no free flight
+    friction: CoulombFriction | None = None
+    # p_j of contacts beside the one that collides, over its p_i: (), (m,), or (m, m) in row i
+    ratio: jax.Array | None = None
+
+
+class Options(NamedTuple):
+    """Static options: the cyclic order (None: fastest or earliest), the limit, a chain or not."""
+
+    cycle: tuple[int, ...] | None
+    max_collisions: int
+    chain: bool
+
+
+class CollisionState(NamedTuple):
+    """State of the sequence between two collisions; `place`: next entry of a cyclic order."""
+
+    qn: jax.Array
+    p: jax.Array
+    number: jax.Array
+    place: jax.Array
+    speed: jax.Array  # normalized approach velocity of the last collision
+    tied: jax.Array
+    gaps: jax.Array | None
+    time: jax.Array
+    slip: jax.Array | None  # (t,) with friction
+    tangential: jax.Array | None  # impulses (t,)
+    code: jax.Array  # the worst status of a collision with friction
+
+
+class NextCollision(NamedTuple):
+    """The next collision: contact, next place in the cycle, time until then, tied or not."""
+
+    contact: jax.Array
+    place: jax.Array
+    wait: jax.Array
+    tied: jax.Array
+
+
+class SequenceEnd(NamedTuple):
+    """Integers of a finished run: status code and number of collisions (-1: endless)."""
+
+    code: jax.Array
+    number: jax.Array
+
+
+def solve(
+    delassus: Symmetric,
+    gamma: jax.Array,
+    restitution: jax.Array,
+    gaps: jax.Array | None,
+    cycle: tuple[int, ...] | None,
+    max_collisions: int,
+    friction: CoulombFriction | None = None,
+    ratio: jax.Array | None = None,
+) -> tuple[jax.Array, jax.Array | None, SequenceEnd]:
+    """Impulses p (m,), p_t (t,) [N s] and how it ended, differentiable in both modes."""
+    inputs = to_inputs(delassus, gamma, restitution, gaps, friction)._replace(ratio=ratio)
+    options = Options(cycle, max_collisions, isinstance(delassus, Tridiagonal))
+    (p, tangential), end = by_jacobian(lambda problem: run(problem, options), inputs)
+    return *impulses_of(p, tangential, jnp.sqrt(diagonal(delassus))), end
+
+
+def impulses_of(
+    p: jax.Array, tangential: jax.Array | None, root: jax.Array
+) -> tuple[jax.Array, jax.Array | None]:
+    """p (m,) and p_t (t,) [N s] of normalized ones."""
+    if tangential is None:
+        return p / root, None
+    return p / root, tangential / per_tangent(root, tangential)
+
+
+def to_inputs(
+    delassus: Symmetric,
+    gamma: jax.Array,
+    restitution: jax.Array,
+    gaps: jax.Array | None,
+    friction: CoulombFriction | None = None,
+) -> Inputs:
+    """The normalized problem. Gaps and `sqrt(W_jj)` only order the collisions: no derivatives."""
+    root = jnp.sqrt(diagonal(delassus))
+    g = scaled(delassus, 1 / root)
+    coupling = off_diagonal(g if isinstance(g, Tridiagonal) else as_matrix(g))
+    fixed = jax.lax.stop_gradient
+    if friction is not None:
+        friction = friction._replace(block=friction.block.scaled(root))
+    return Inputs(
+        coupling,
+        restitution,
+        gamma / root,
+        fixed(root),
+        None if gaps is None else fixed(gaps),
+        friction,
+    )
+
+
+def run(inputs: Inputs, options: Options) -> tuple[tuple[jax.Array, jax.Array | None], SequenceEnd]:
+    """Normalized impulses and the end of the sequence."""
+    g = coupling_matrix(inputs, options)
+    start = begin(inputs)
+    pair = inputs.qn.shape[0] == 2 and inputs.friction is None and inputs.ratio is None
+    endless, limit = jnp.array(False), start.p
+    if pair:
+        first = choose(inputs, options, g, start).contact
+        endless, limit = endless_pair(inputs, first)
+        endless = endless & approaches(inputs, start)
+
+    def unfinished(at: CollisionState) -> jax.Array:
+        """Whether there is a collision to come, and the limit is not reached."""
+        return ~endless & approaches(inputs, at) & (at.number < options.max_collisions)
+
+    end = while_loop(unfinished, lambda at: collide(inputs, options, g, at), start)
+    stopped = ~endless & approaches(inputs, end)
+    if not pair:
+        slow = end.speed < DECAYED.get(str(end.qn.dtype), 3e-4) * scale_of(inputs)
+        endless = slow & jnp.any(end.qn < 0) & ~stopped
+    code = jnp.where(end.tied, CODE["order_dependent"], CODE["ok"])
+    code = jnp.maximum(code, end.code)
+    code = jnp.where(endless, CODE["plastic_limit"], code)
+    code = jnp.where(stopped, CODE["max_steps"], code)
+    p = jnp.where(endless, limit, end.p) if pair else end.p
+    return (p, end.tangential), SequenceEnd(code, jnp.where(endless, -1, end.number))
+
+
+def coupling_matrix(inputs: Inputs, options: Options) -> Symmetric:
+    """G with its unit diagonal, tridiagonal for a chain."""
+    m, dtype = inputs.qn.shape[0], inputs.qn.dtype
+    if options.chain:
+        return Tridiagonal(jnp.ones(m, dtype), inputs.coupling)
+    i, j = jnp.triu_indices(m, 1)
+    upper = jnp.zeros((m, m), dtype).at[i, j].set(inputs.coupling)
+    return jnp.eye(m, dtype=dtype) + upper + upper.T
+
+
+def scale_of(inputs: Inputs) -> jax.Array:
+    """Largest normalized approach velocity at the start."""
+    return jax.lax.stop_gradient(jnp.max(jnp.maximum(-inputs.qn, 0.0)))
+
+
+def rest_of(inputs: Inputs) -> jax.Array:
+    """Normalized approach velocities up to this are rounding."""
+    return REST * precision(inputs.qn.dtype).eps * scale_of(inputs)
+
+
+def approaches(inputs: Inputs, at: CollisionState) -> jax.Array:
+    """Whether a contact approaches by more than rounding."""
+    return jnp.any(at.qn < -rest_of(inputs))
+
+
+def begin(inputs: Inputs) -> CollisionState:
+    """Before the first collision."""
+    dtype = inputs.qn.dtype
+    zero = jnp.array(0, jnp.int32)
+    return CollisionState(
+        qn=inputs.qn,
+        p=jnp.zeros_like(inputs.qn),
+        number=zero,
+        place=zero,
+        speed=jnp.array(jnp.inf, dtype),
+        tied=jnp.array(False),
+        gaps=inputs.gaps,
+        time=jnp.array(0, dtype),
+        slip=None if inputs.friction is None else inputs.friction.block.slip,
+        tangential=None if inputs.friction is None else jnp.zeros_like(inputs.friction.block.slip),
+        code=jnp.array(CODE["ok"], jnp.int32),
+    )
+
+
+def choose(inputs: Inputs, options: Options, g: Symmetric, at: CollisionState) -> NextCollision:
+    """The next contact to collide; some contact approaches."""
+    rest = rest_of(inputs)
+    approaching = at.qn < -rest
+    if options.cycle is not None:
+        cycle = jnp.array(options.cycle, jnp.int32)
+        turn = approaching[cycle]
+        ahead = turn & (jnp.arange(len(options.cycle), dtype=jnp.int32) >= at.place)
+        k = jnp.where(jnp.any(ahead), jnp.argmax(ahead), jnp.argmax(turn)).astype(jnp.int32)
+        return NextCollision(cycle[k], k + 1, jnp.zeros_like(at.time), jnp.array(False))
+    speed = jnp.where(approaching, -at.qn * inputs.root, 0.0)  # m/s
+    rivals, wait = approaching, jnp.zeros_like(speed)
+    if at.gaps is not None:
+        rivals, wait = first_to_close(inputs, at, approaching, speed)
+    noise = rest * inputs.root
+    fastest = jnp.max(jnp.where(rivals, speed - noise, -jnp.inf))
+    level = rivals & (speed + noise >= fastest)
+    j = jnp.argmax(level).astype(jnp.int32)  # the lowest index among equals
+    chosen = jnp.arange(speed.shape[0], dtype=jnp.int32) == j
+    floor = precision(speed.dtype).noise
+    coupled = jnp.abs(times(g, chosen.astype(speed.dtype))) > floor
+    equals = rivals if at.gaps is not None else level
+    return NextCollision(j, at.place, wait[j], jnp.any(equals & coupled & ~chosen))
+
+
+def first_to_close(
+    inputs: Inputs, at: CollisionState, approaching: jax.Array, speed: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Contacts that close first, within rounding, and the time (m,) until each closes."""
+    assert at.gaps is not None
+    assert inputs.gaps is not None
+    safe = jnp.where(approaching, speed, 1.0)
+    wait = jnp.where(approaching, at.gaps / safe, jnp.inf)
+    first = jnp.min(wait)
+    rounding = precision(speed.dtype).noise * (at.time + first + inputs.gaps / safe)
+    return approaching & (wait <= first + rounding), wait
+
+
+def times(g: Symmetric, vector: jax.Array) -> jax.Array:
+    """`G vector` without the reduced precision that accelerators use in products."""
+    if isinstance(g, jax.Array):
+        return jnp.sum(g * vector[None, :], axis=1)
+    return g @ vector
+
+
+def collide(inputs: Inputs, options: Options, g: Symmetric, at: CollisionState) -> CollisionState:
+    """One collision, after the free flight that leads to it."""
+    choice = choose(inputs, options, g, jax.lax.stop_gradient(at))
+    chosen = jnp.arange(at.qn.shape[0], dtype=jnp.int32) == choice.contact
+    slip, tangential, code = at.slip, at.tangential, at.code
+    if inputs.ratio is not None:
+        jump, status = _correlated(inputs, inputs.ratio, g, at, chosen)
+        after, code = at.qn + times(g, jump), jnp.maximum(code, status)
+    elif inputs.friction is None:
+        jump = jnp.where(chosen, -(1 + inputs.restitution) * at.qn, 0.0)
+        after = jnp.where(chosen, -inputs.restitution * at.qn, at.qn + times(g, jump))
+    else:
+        assert slip is not None
+        assert tangential is not None
+        jump, jump_t, status = _with_friction(inputs, inputs.friction, at, choice.contact)
+        cross, tangent, _ = inputs.friction.block
+        after = at.qn + times(g, jump) + cross @ jump_t
+        slip = slip + cross.T @ jump + tangent @ jump_t
+        tangential, code = tangential + jump_t, jnp.maximum(code, status)
+    gaps = at.gaps
+    if gaps is not None:
+        flown = gaps + jax.lax.stop_gradient(at.qn) * inputs.root * choice.wait
+        gaps = jnp.where(chosen, 0.0, jnp.maximum(flown, 0.0))
+    return CollisionState(
+        qn=after,
+        p=at.p + jump,
+        number=at.number + jnp.array(1, jnp.int32),
+        place=choice.place,
+        speed=jax.lax.stop_gradient(-at.qn[choice.contact]),
+        tied=at.tied | choice.tied,
+        gaps=gaps,
+        time=at.time + choice.wait,
+        slip=slip,
+        tangential=tangential,
+        code=code,
+    )
+
+
+def _correlated(
+    inputs: Inputs, ratio: jax.Array, g: Symmetric, at: CollisionState, chosen: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Impulses (m,) of a collision that contacts beside the `chosen` one share, and its status.
+
+    They grow as `pbar = s d`, d_j = 1 at the chosen contact. With a = G d contact j is compressed
+    while `qn_j + a_j s < 0`, and returns e_j^2 of the work of that. What is lost,
+    `L = sum (1 - e_j^2) d_j qn_j^2 / (2 a_j)`, is what kinetic energy loses:
+    `d.a s^2 / 2 + d.qn s + L = 0`, of which s is the larger root.
+    """
+    noise = precision(at.qn.dtype).noise
+    own = jnp.sum(jnp.where(chosen, inputs.root, 0.0))
+    if ratio.ndim == 2:
+        ratio = jnp.sum(jnp.where(chosen[:, None], ratio, 0.0), axis=0)
+    pressed = times(g, chosen.astype(at.qn.dtype)) < -noise
+    beside = pressed & (at.qn <= rest_of(inputs)) & ~chosen
+    d = jnp.where(chosen, 1.0, jnp.where(beside, ratio * inputs.root / own, 0.0))
+    a = times(g, d)
+    closing = (d > 0) & (at.qn < 0)
+    stays = closing & (a <= 0)  # it would be compressed for ever
+    stored = jnp.where(closing & ~stays, d * at.qn**2 / (2 * jnp.where(a > 0, a, 1.0)), 0.0)
+    curvature, slope = jnp.sum(d * a), -jnp.sum(d * at.qn)
+    square = slope**2 - 2 * curvature * jnp.sum((1 - inputs.restitution**2) * stored)
+    allowed = (square >= -noise * slope**2) & ~jnp.any(stays) & (curvature > 0)
+    real = allowed & (square > 0)
+    root = jnp.where(real, jnp.sqrt(jnp.where(real, square, 1.0)), 0.0)
+    s = (slope + root) / jnp.where(curvature > 0, curvature, 1.0)
+    left = at.qn + s * a
+    allowed = allowed & ~jnp.any(((d > 0) | beside) & (left < -rest_of(inputs)))
+    alone = jnp.where(chosen, -(1 + inputs.restitution) * at.qn, 0.0)
+    jump = jnp.where(allowed & jnp.any(beside), s * d, alone)
+    return jump, jnp.where(allowed, CODE["ok"], CODE["infeasible"])
+
+
+def _with_friction(
+    inputs: Inputs, friction: CoulombFriction, at: CollisionState, contact: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Impulses (m,) and (t,) of a collision at one contact, and its status."""
+    m, t = friction.block.normal_tangent.shape
+    each = t // m
+    rows = contact * each + jnp.arange(each, dtype=contact.dtype)
+    cross = friction.block.normal_tangent[contact, rows][None]
+    tangent = friction.block.tangent[rows[:, None], rows[None]]
+    matrix = jnp.block([[jnp.ones((1, 1), cross.dtype), cross], [cross.T, tangent]])
+    e = jnp.broadcast_to(inputs.restitution, (m,))[contact]
+    assert at.slip is not None
+    impulses = solve_friction(
+        matrix,
+        ((1 + e) * at.qn[contact])[None],
+        (1 + friction.restitution[contact]) * at.slip[rows],
+        friction.coefficient[contact][None],
+        complementary=True,
+    )
+    jump = jnp.zeros_like(at.qn).at[contact].set(impulses.normal[0])
+    jump_t = jnp.zeros_like(at.slip).at[rows].set(impulses.tangential)
+    return jump, jump_t, impulses.status
+
+
+def endless_pair(inputs: Inputs, first: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Whether two contacts collide without end, `first` to begin, and the impulses of that limit.
+
+    Approach speeds of successive collisions at j, k, j, ... obey, c = -G_12,
+
+        s_3 = c (1 + e_k) s_2 - e_j s_1,
+
+    two steps of which have trace `c^2 (1 + e_1) (1 + e_2) - e_1 - e_2` and determinant e_1 e_2.
+    They stay positive iff both eigenvalues are (z >= 1, c > 0) and s_3 / s_1 is not below the
+    smaller one, `chi(lambda) = lambda^2 - trace lambda + det = 0`. The limit is gamma = 0.
+    """
+    e, qn = jnp.broadcast_to(inputs.restitution, (2,)), inputs.qn
+    c = -inputs.coupling[0]
+    noise = precision(qn.dtype).noise
+    e_j, e_k, s_1 = e[first], e[1 - first], -qn[first]
+    s_2 = c * (1 + e_j) * s_1 - qn[1 - first]
+    both = e_j * e_k
+    trace = c**2 * (1 + e_j) * (1 + e_k) - e_j - e_k
+    ratio = c * (1 + e_k) * s_2 / s_1 - e_j
+    chi = ratio**2 - trace * ratio + both
+    above = (ratio >= trace / 2) | (chi <= noise * (ratio**2 + trace * ratio + both))
+    possible = (c > 0) & (trace >= 2 * jnp.sqrt(jax.lax.stop_gradient(both)))
+    endless = possible & (s_2 > 0) & (ratio >= 0) & above
+    # redundant contacts (c = 1) have no inverse: there s_3 = e_1 e_2 s_1, a geometric series
+    free = 1 - c**2
+    redundant = free <= noise
+    other = -(qn + c * jnp.flip(qn)) / jnp.where(redundant, 1.0, free)
+    decay = jnp.where(both < 1, 1 - both, 1.0)
+    series_j, series_k = (1 + e_j) * s_1 / decay, (1 + e_k) * s_2 / decay
+    chosen = jnp.arange(2, dtype=jnp.int32) == first
+    p = jnp.where(redundant, jnp.where(chosen, series_j, series_k), other)
+    return endless & ~(redundant & (both >= 1)), p

@@ -1,0 +1,1 @@
+"""Numerical methods: derivatives, steps, complementarity, friction, linear systems."""

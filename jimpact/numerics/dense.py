@@ -1,0 +1,508 @@
+"""Small dense systems: elimination, singular matrices, and how redundant contacts share forces.
+
+LAYOUT   Flows keep the batch in the last axis: matrices (n, n, B), vectors (n, B). The functions
+`solve_definite`, `solve_mass_matrix`, `solve_by_pivots`, `singular_values`, `eigenvectors`,
+`null_projector`, `solve_symmetric` and `determinants` have no batch.
+
+LAPACK   Its kernels go through a batch one by one. So they factor single matrices; in batches,
+loops of our own do, up to `_BY_LOOP` rows.
+
+COMPILING   Elimination of more than two rows is a loop over the pivots, and products of more than
+`COLUMNS_WRITTEN_OUT` columns are reductions: programs do not grow with the number of contacts.
+
+SINGULAR MATRICES   Where contacts are redundant, many forces give the same motion. Velocities never
+depend on the choice; it decides which contact reaches its friction cone first:
+
+    sticking contacts, in the plane   in proportion to mu F: `load_shares` weight a `regularized`
+                                      system. They break loose together.
+    sticking contacts, in space       least sum of squares: `pseudoinverse`, taken once a step,
+                                      when the normal forces of its stages are not known yet
+    normal forces and impulses        least sum of squares, in the scaling with unit diagonal
+"""
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact.tools.compiling import full_precision
+from jimpact.tools.loops import cond, fori_loop, while_loop
+from jimpact.tools.precision import precision
+
+# Rows up to which a loop of our own factors a matrix, not LAPACK: in a batch that is three to six
+# times as fast for 4 rows. With ten times more the cubic cost of many contacts would not be
+# blocked.
+_BY_LOOP = 16
+# Rows up to which a loop of our own eliminates block by block: as many again take eight times as
+# long, which LAPACK does in half of that.
+_BLOCKS = 64
+# Columns up to which products are written out: a reduction does not fuse with what follows it, and
+# is no vector operation: four times as long for the 12 of four contacts with friction in space. Ten
+# times more would make large programs of long chains.
+COLUMNS_WRITTEN_OUT = 12
+# Parts of a matrix below this multiple of sqrt(eps) of its largest entry are none in its
+# pseudoinverse. Ten times more would drop small, regular parts.
+_NEGLIGIBLE_PART = 4.0
+_JACOBI_SWEEPS = 12  # over all pairs of up to 16 columns; 10 are enough, more only cost time
+_NEWTON_SCHULZ = 3  # iterations, each of which squares the error; ten times more only cost time
+
+
+# ---- products
+
+
+def unit(matrix: jax.Array) -> jax.Array:
+    """The unit matrix (n, n, 1) to be added to a matrix (n, n, B)."""
+    return jnp.eye(len(matrix), dtype=matrix.dtype).reshape(
+        *matrix.shape[:2], *[1] * (matrix.ndim - 2)
+    )
+
+
+def times(matrix: jax.Array, vector: jax.Array) -> jax.Array:
+    """`matrix @ vector` (a, B) of (a, b, B) and (b, B), or of one matrix (a, b) for all columns."""
+    if matrix.ndim == 2:
+        return matrix @ vector
+    if matrix.shape[1] > COLUMNS_WRITTEN_OUT:
+        return jnp.sum(matrix * vector[None], axis=1)
+    columns = [matrix[:, j] * vector[j : j + 1] for j in range(matrix.shape[1])]
+    return functools.reduce(jnp.add, columns)
+
+
+def product(a: jax.Array, b: jax.Array) -> jax.Array:
+    """`a @ b` (n, l, B) of (n, k, B) and (k, l, B)."""
+    if a.shape[1] > COLUMNS_WRITTEN_OUT:
+        return jnp.sum(a[:, :, None] * b[None], axis=1)
+    return functools.reduce(jnp.add, [a[:, j, None] * b[j][None] for j in range(a.shape[1])])
+
+
+# ---- elimination
+
+
+def solve(matrix: jax.Array, right: jax.Array) -> jax.Array:
+    """`matrix^-1 right` (n, c, B) of (n, n, B) and right sides (n, c, B).
+
+    Gauss-Jordan in a loop over the pivots, which are not chosen: matrices that are similar to a
+    positive definite one do not need that.
+    """
+    n = len(matrix)
+    if n == 1:
+        return right / matrix
+    if n == 2:  # written out: the loop takes 8 % of a batch of impacts with planar friction
+        return _solve_two(matrix, right)
+    return _eliminated(matrix, right, lambda pivot: 1 / pivot)
+
+
+def _eliminated(
+    matrix: jax.Array, right: jax.Array, inverted: Callable[[jax.Array], jax.Array]
+) -> jax.Array:
+    """`solve` by the loop, with the inverses of the pivots."""
+    n = len(matrix)
+    number = jnp.arange(n).reshape(n, 1, *[1] * (matrix.ndim - 2))
+
+    def eliminate(k: jax.Array, rows: jax.Array) -> jax.Array:
+        """Rows after the pivot k."""
+        row = jax.lax.dynamic_index_in_dim(rows, k, 0)
+        row = row * inverted(jax.lax.dynamic_index_in_dim(row, k, 1))
+        factor = jax.lax.dynamic_index_in_dim(rows, k, 1)
+        return jnp.where(number == k, row, rows - factor * row)
+
+    return fori_loop(0, n, eliminate, jnp.concatenate([matrix, right], axis=1))[:, n:]
+
+
+def _solve_two(matrix: jax.Array, right: jax.Array) -> jax.Array:
+    """`solve` for two rows, by the same operations."""
+    scale, factor = 1 / matrix[0, :1], matrix[1, :1]
+    above, x = matrix[0, 1:] * scale, right[0] * scale
+    last = (right[1] - factor * x) * (1 / (matrix[1, 1:] - factor * above))
+    return jnp.stack([x - above * last, last])
+
+
+def inverse(matrix: jax.Array) -> jax.Array:
+    """The inverse (n, n, B), without pivots as in `solve`, which it replaces in place."""
+    n = len(matrix)
+    if n <= 2:
+        return solve(matrix, jnp.broadcast_to(unit(matrix), matrix.shape))
+    number = jnp.arange(n).reshape(n, 1, *[1] * (matrix.ndim - 2))
+
+    def eliminate(k: jax.Array, rows: jax.Array) -> jax.Array:
+        """Rows after the pivot k, whose column is that of the inverse now."""
+        here, there = number == k, number[:, 0][None] == k
+        column = jax.lax.dynamic_index_in_dim(rows, k, 1)
+        row = jax.lax.dynamic_index_in_dim(rows, k, 0)
+        scale = 1 / jax.lax.dynamic_index_in_dim(row, k, 1)
+        row = jnp.where(there, scale, row * scale)
+        return jnp.where(here, row, jnp.where(there, 0.0, rows) - column * row)
+
+    return fori_loop(0, n, eliminate, matrix)
+
+
+@jax.jit
+def solve_definite(g: jax.Array, right: jax.Array) -> jax.Array:
+    """`G x = right` for a symmetric positive definite G (m, m); right sides (m,) or (m, c)."""
+    if len(g) > _BY_LOOP:
+        return jnp.linalg.solve(g, right)
+    return solve(g[..., None], right.reshape(len(g), -1, 1)).reshape(right.shape)
+
+
+@jax.jit
+def solve_mass_matrix(mass: jax.Array, right: jax.Array) -> jax.Array:
+    """`M^-1 right` of M (n,), its diagonal, or (n, n); right sides (n,) or (n, c).
+
+    NaN where M (n, n) is not positive definite.
+    """
+    if mass.ndim == 1:
+        return right / mass.reshape(-1, *[1] * (right.ndim - 1))
+    if len(mass) > _BY_LOOP:
+        return jax.scipy.linalg.solve(mass, right, assume_a="pos")
+    columns = right.reshape(len(mass), -1, 1)
+    solved = _eliminated(mass[..., None], columns, lambda p: 1 / jnp.where(p > 0, p, jnp.nan))
+    return solved.reshape(right.shape)
+
+
+def block_inverse(matrix: jax.Array) -> jax.Array:
+    """Inverses of (m, b, m, b, N), block by block, b = 2 or 3, without pivots.
+
+    A singular block is perturbed by eps^(1/3), which refinements by the caller undo.
+    """
+    perturbation = precision(matrix.dtype).eps ** (1 / 3)
+    m, eye = len(matrix), jnp.eye(matrix.shape[1], dtype=matrix.dtype)[..., None]
+
+    def eliminate(i: jax.Array, inverse: jax.Array) -> jax.Array:
+        """The matrix after the block pivot i."""
+        here = (jnp.arange(m) == i)[:, None, None, None]
+        column, row = inverse[:, :, i], inverse[i]
+        block = _small_inverse(column[i], perturbation)
+        column = jnp.where(here, -eye[None], column)
+        row = jnp.where(here[:, 0][None], eye[:, None], row)
+        row = jnp.sum(block[:, :, None, None] * row[None], axis=1)
+        replaced = here[..., None] | here[None, None, :, 0]
+        spread = jnp.sum(column[:, :, :, None, None] * row[None, None], axis=2)
+        return jnp.where(replaced, 0.0, inverse) - spread
+
+    return fori_loop(0, m, eliminate, matrix)
+
+
+def block_solve(matrix: jax.Array, right: jax.Array) -> jax.Array:
+    """`matrix^-1 right` (m, b, c) of one matrix (m, b, m, b), block by block, without pivots.
+
+    Of more than `_BLOCKS` rows by LAPACK.
+    """
+    m, b = matrix.shape[:2]
+    if m * b > _BLOCKS:
+        flat = matrix.reshape(m * b, m * b), right.reshape(m * b, -1)
+        return jnp.linalg.solve(*flat).reshape(right.shape)
+    perturbation = precision(matrix.dtype).eps ** 2  # of a block that is singular
+    rows = jnp.concatenate([matrix.reshape(m, b, m * b), right], axis=2)
+
+    def eliminate(i: jax.Array, rows: jax.Array) -> jax.Array:
+        """Rows after the block pivot i."""
+        row = jax.lax.dynamic_index_in_dim(rows, i, 0, keepdims=False)
+        block = jax.lax.dynamic_slice_in_dim(row, i * b, b, axis=1)
+        row = _small_inverse(block[..., None], perturbation)[..., 0] @ row
+        column = jax.lax.dynamic_slice_in_dim(rows, i * b, b, axis=2)
+        rows = rows - jnp.einsum("jab,bk->jak", column, row)
+        return jax.lax.dynamic_update_index_in_dim(rows, row, i, 0)
+
+    return fori_loop(0, m, eliminate, rows)[..., m * b :]
+
+
+def _small_inverse(block: jax.Array, perturbation: float) -> jax.Array:
+    """Inverses of blocks (b, b, N) by cofactors, b = 2 or 3."""
+    small = jnp.abs(_small_determinant(block)) < perturbation
+    eye = jnp.eye(len(block), dtype=block.dtype)[..., None]
+    block = block + jnp.where(small, perturbation, 0.0)[None, None] * eye
+    whole = _small_determinant(block)
+    return _cofactors(block) / jnp.where(whole == 0, 1.0, whole)[None, None]
+
+
+def _small_determinant(a: jax.Array) -> jax.Array:
+    """Determinants (N,) of (b, b, N), b = 2 or 3."""
+    return jnp.sum(a[0] * _cofactors(a)[:, 0], axis=0)
+
+
+def _cofactors(a: jax.Array) -> jax.Array:
+    """Adjugates (b, b, N) of (b, b, N), b = 2 or 3."""
+    if len(a) == 2:
+        return jnp.stack([jnp.stack([a[1, 1], -a[0, 1]]), jnp.stack([-a[1, 0], a[0, 0]])])
+    sides = [jnp.cross(a[i], a[j], axis=0) for i, j in ((1, 2), (2, 0), (0, 1))]
+    return jnp.stack(sides, axis=1)
+
+
+@jax.jit
+def solve_by_pivots(matrix: jax.Array, right: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """`matrix^-1 right` (n, c) of any matrix (n, n), and its determinant ().
+
+    Gauss-Jordan with partial pivoting, in a loop over the pivots. Where the matrix is singular the
+    determinant is 0 and the solution not finite.
+    """
+    n = len(matrix)
+    number = jnp.arange(n)[:, None]
+
+    def eliminate(k: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        """Rows after the pivot k, and the product of the pivots."""
+        rows, determinant = state
+        column = jax.lax.dynamic_index_in_dim(rows, k, 1)
+        largest = jnp.argmax(jnp.where(number >= k, jnp.abs(column), -1.0), axis=0)[0]
+        own, chosen = (jax.lax.dynamic_index_in_dim(rows, i, 0) for i in (k, largest))
+        pivot = jax.lax.dynamic_index_in_dim(chosen, k, 1)
+        rows = jnp.where(number == largest, own, rows)
+        row = chosen / pivot
+        factor = jax.lax.dynamic_index_in_dim(rows, k, 1)
+        signed = jnp.where(largest == k, pivot, -pivot)[0, 0]
+        determinant = jnp.where(determinant == 0, 0.0, determinant * signed)  # NaN after 0
+        return jnp.where(number == k, row, rows - factor * row), determinant
+
+    one = jnp.ones((), matrix.dtype)
+    start = jnp.concatenate([matrix, right], axis=1), one
+    rows, determinant = fori_loop(0, n, eliminate, start)
+    return rows[:, n:], determinant
+
+
+def determinants(k: jax.Array) -> jax.Array:
+    """Of (N, n, n); those of four rows by minors of two rows, which is quicker to compile."""
+    if k.shape[-1] != 4:
+        none = jnp.zeros((k.shape[-1], 0), k.dtype)
+        return jax.vmap(lambda matrix: solve_by_pivots(matrix, none)[1])(k)
+    left, right = np.triu_indices(4, 1)
+    a, b = k[..., left], k[..., right]  # entries of each row in both columns of a minor
+    minors = a[:, ::2] * b[:, 1::2] - b[:, ::2] * a[:, 1::2]  # of rows 1 and 2, of 3 and 4
+    signs = jnp.asarray(np.where((left + right) % 2, 1, -1), k.dtype)
+    return jnp.sum(minors[:, 0] * minors[:, 1, ::-1] * signs[None], axis=-1)
+
+
+# ---- singular matrices: redundant contacts
+
+
+def load_shares(limit: jax.Array, least: float = 0.0) -> jax.Array:
+    """Weights of the contacts in the sharing of redundant forces: `limit` (m, ..) over the largest.
+
+    None is below `least`, which keeps the weights of contacts without load regular.
+    """
+    largest = jax.lax.stop_gradient(jnp.max(limit, axis=0, keepdims=True))
+    share = limit / jnp.where(largest > 0, largest, 1.0)
+    return jnp.maximum(share, least) if least > 0 else share
+
+
+def regularized(
+    matrix: jax.Array,
+    right: jax.Array,
+    ridge: jax.Array,
+    refinements: int,
+    without_null: bool = False,
+) -> jax.Array:
+    """`matrix z = right` (n, B) where it may be singular: solved with a ridge (n, B) added to it.
+
+    Matrices are (n, n, B), or one (n, n) for all right sides with a ridge (n, 1).
+    Each refinement removes what the ridge changes where the matrix is regular, and makes the
+    derivatives right in one order more: the inverse has none. In its null space the inverse is
+    large, and so is its rounding: `without_null` subtracts this part of what it gives.
+
+    The barriers keep XLA from computing what is multiplied once more for each column.
+    """
+    kept = jax.lax.optimization_barrier
+    matrix, right = kept(matrix), kept(right)  # apart: only the right side is linear in tangents
+    on_diagonal = ridge if matrix.ndim == 2 else ridge[:, None]
+    inverted = jax.lax.stop_gradient(inverse(matrix + unit(matrix) * on_diagonal))
+
+    def solved(right: jax.Array) -> jax.Array:
+        """What the inverse gives."""
+        z = times(inverted, right)
+        return z - times(inverted, ridge * z) if without_null else z
+
+    z = solved(right)
+    for _ in range(refinements):
+        z = kept(z)
+        z = z + solved(kept(right - times(matrix, z)))
+    return z
+
+
+@jax.custom_jvp
+def regularized_once(matrix: jax.Array, ridge: jax.Array, right: jax.Array) -> jax.Array:
+    """As `regularized` with one refinement; tangents solve the same equations."""
+    return regularized(matrix, right, ridge, 1)
+
+
+@regularized_once.defjvp
+@full_precision
+def _regularized_tangent(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
+    """The tangent `dz` of `matrix z = right` solves `matrix dz = dright - dmatrix z`."""
+    (matrix, ridge, right), (dmatrix, _, dright) = primals, tangents
+    z = regularized_once(matrix, ridge, right)
+    return z, regularized_once(matrix, ridge, dright - times(dmatrix, z))
+
+
+def pseudoinverse(matrix: jax.Array, held: jax.Array) -> jax.Array:
+    """Of the rows and columns `held` (n, B) of a positive semidefinite (n, n, B); 0 elsewhere.
+
+    It starts with a ridge, which Newton and Schulz's iteration `Z <- 2 Z - Z K Z` removes from what
+    K transmits, to rounding; in the null space of K, forces are the least ones to some percent.
+    """
+    both = held[:, None] & held[None]
+    k = jnp.where(both, matrix, 0.0)
+    size = jnp.max(jnp.abs(k), axis=(0, 1), keepdims=True)
+    eps = float(jnp.finfo(k.dtype).eps)
+    part = _NEGLIGIBLE_PART * math.sqrt(eps) * jnp.where(size > 0, size, 1.0)
+    damped = inverse(k + unit(k) * jnp.where(held[:, None], part, 1.0))
+    z = product(damped, product(k, damped))
+    for _ in range(_NEWTON_SCHULZ):
+        z = 2 * z - product(z, product(k, z))
+    return z
+
+
+class SingularValues(NamedTuple):
+    """`A = left diag(values) right` of a matrix (n, n), values (n,) falling; which of them are 0.
+
+    Where values are 0, vectors are an orthonormal basis of the null space.
+    """
+
+    left: jax.Array
+    values: jax.Array
+    right: jax.Array
+    null: jax.Array
+
+
+def _are_null(values: jax.Array) -> jax.Array:
+    """Which of falling singular values (n, ..) are rounding of the largest one."""
+    return values <= precision(values.dtype).singular * len(values) * values[:1]
+
+
+@jax.custom_batching.custom_vmap
+def singular_values(matrix: jax.Array) -> SingularValues:
+    """Of one matrix (n, n), without derivatives."""
+    left, values, right = jnp.linalg.svd(matrix)
+    return SingularValues(left, values, right, _are_null(values))
+
+
+@singular_values.def_vmap
+def _batch_of_singular_values(
+    size: int, batched: Any, matrices: jax.Array
+) -> tuple[SingularValues, Any]:
+    """Batches by Jacobi's rotations: A V = U diag(values). A^T has U where values are 0."""
+    all_batched: Any = SingularValues(True, True, True, True)  # type: ignore[arg-type]
+    if matrices.shape[-1] > _BY_LOOP:
+        left, values, right = jnp.linalg.svd(matrices)
+        return SingularValues(left, values, right, _are_null(values.T).T), all_batched
+    matrix = jnp.moveaxis(matrices, 0, -1)
+    images, right, values = _orthogonal(matrix)
+    null = _are_null(values)
+    left = images / jnp.where(null, 1.0, values)[None]
+    left = cond(
+        jnp.any(null),
+        lambda: jnp.where(null[None], _orthogonal(matrix.swapaxes(0, 1))[1], left),
+        lambda: left,
+    )
+    parts = SingularValues(left, values, right.swapaxes(0, 1), null)
+    return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), parts), all_batched
+
+
+@jax.custom_batching.custom_vmap
+def eigenvectors(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Eigenvalues (n,) and eigenvectors (n, n), in columns, of one positive semidefinite matrix,
+    without derivatives."""
+    values, vectors = jnp.linalg.eigh(matrix)
+    return values, vectors
+
+
+@eigenvectors.def_vmap
+def _batch_of_eigenvectors(
+    size: int, batched: Any, matrices: jax.Array
+) -> tuple[tuple[jax.Array, jax.Array], tuple[bool, bool]]:
+    """Batches by Jacobi's rotations: lengths of A V are the eigenvalues."""
+    if matrices.shape[-1] > _BY_LOOP:
+        values, vectors = jnp.linalg.eigh(matrices)
+        return (values, vectors), (True, True)
+    _, vectors, values = _orthogonal(jnp.moveaxis(matrices, 0, -1))
+    return (values.T, jnp.moveaxis(vectors, -1, 0)), (True, True)
+
+
+def _orthogonal(matrix: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """`A V` (n, n, B) with orthogonal columns, V, and their lengths (n, B), falling.
+
+    In each round, columns at the same place of two rows are rotated. Then all but the first move
+    on by one place, so that after a sweep each has met each.
+
+    Source: Hestenes, J. SIAM 6 (1958); Brent and Luk, SIAM J. Sci. Stat. Comput. 6 (1985).
+    """
+    n = len(matrix)
+    places = n + n % 2  # an odd number of columns: one of zeros, which no rotation changes
+    both = jnp.concatenate([matrix, jnp.broadcast_to(unit(matrix), matrix.shape)])
+    both = jnp.pad(both, ((0, 0), (0, places - n), (0, 0)))
+
+    class Sweep(NamedTuple):
+        """Two rows of columns, the largest square of a cosine between columns, sweeps done."""
+
+        first: jax.Array
+        second: jax.Array
+        cosine: jax.Array
+        done: jax.Array
+
+    def rotate(_: int, at: Sweep) -> Sweep:
+        """One round."""
+        x, y, largest, done = at
+        product = jnp.sum(x[:n] * y[:n], axis=0, keepdims=True)
+        squares = [jnp.sum(columns[:n] ** 2, axis=0, keepdims=True) for columns in (x, y)]
+        half = (squares[1] - squares[0]) / 2
+        real = jnp.minimum(*squares) > (rounding**2) * whole  # other columns are 0
+        angle = jnp.where(real, product**2 / jnp.where(real, squares[0] * squares[1], 1.0), 0.0)
+        root = jnp.sqrt(half**2 + product**2)
+        longer = jnp.where(half >= 0, half + root, half - root)
+        slope = product / jnp.where(longer != 0, longer, 1.0)
+        cosine = 1 / jnp.sqrt(1 + slope**2)
+        sine = slope * cosine
+        x, y = cosine * x - sine * y, sine * x + cosine * y
+        largest = jnp.maximum(largest, jnp.max(angle))
+        if places == 2:
+            return Sweep(x, y, largest, done)
+        first = jnp.concatenate([x[:, :1], y[:, :1], x[:, 1:-1]], axis=1)
+        return Sweep(first, jnp.concatenate([y[:, 1:], x[:, -1:]], axis=1), largest, done)
+
+    def sweep(at: Sweep) -> Sweep:
+        """All rounds."""
+        start = at._replace(cosine=jnp.zeros_like(at.cosine))
+        end = fori_loop(0, places - 1, rotate, start)
+        return end._replace(done=at.done + 1)
+
+    rounding = n * precision(matrix.dtype).eps
+    whole = jnp.sum(matrix**2, axis=(0, 1), keepdims=True)
+    first, second = jnp.split(both, 2, axis=1)
+    start = Sweep(first, second, jnp.ones((), matrix.dtype), jnp.int32(0))
+    end = while_loop(
+        lambda at: (at.cosine > rounding**2) & (at.done < _JACOBI_SWEEPS), sweep, start
+    )
+    both = jnp.concatenate([end.first, end.second], axis=1)[:, :n]
+    length = jnp.sqrt(jnp.sum(both[:n] ** 2, axis=0))
+    order = jnp.argsort(-length, axis=0)
+    both = jnp.take_along_axis(both, order[None], axis=1)
+    return both[:n], both[n:], jnp.take_along_axis(length, order, axis=0)
+
+
+def null_projector(g: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Orthogonal projector (m, m) on the null space of G (unit diagonal), and whether it is not 0.
+
+    Held constant in derivatives: a perturbation is taken to keep the rank.
+    """
+    values, vectors = eigenvectors(jax.lax.stop_gradient(g))
+    null = values < precision(g.dtype).singular * len(g)
+    basis = jnp.where(null[None, :], vectors, 0.0)
+    return basis @ basis.T, jnp.any(null)
+
+
+def solve_symmetric(
+    g: jax.Array, right: jax.Array, *, regular: bool = False
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """`G x = right` of least norm (m,), whether G is singular, and whether no x solves it.
+
+    `g` (m, m) is symmetric positive semidefinite with a diagonal of order 1, `regular` if that is
+    known beforehand.
+    """
+    if regular:
+        no = jnp.asarray(False)
+        return solve_definite(g, right), no, no
+    projector, singular = null_projector(g)
+    x = solve_definite(g + projector, right)
+    residual = jnp.abs(g @ x - right).max()
+    missed = residual > precision(g.dtype).root * jnp.abs(right).max()
+    return x, singular, singular & missed

@@ -1,0 +1,424 @@
+"""Lanes and derivatives of programs with loops, by JAX's public API alone.
+
+LANES   A function of arrays (.., B) has its batch in the last axis: entries of one impact would
+otherwise be neighbours in memory, and loops over two or three of them do not fill a vector unit.
+`vmap` only makes B longer. One impact is a batch of one: there is no second code path.
+
+DERIVATIVES   A loop of unknown length has no reverse mode. So a derivative is the contraction of
+the Jacobian with tangents, which JAX transposes, and the Jacobian is a function of the same form:
+both modes, every order, under jit and vmap in any nesting. A rule cannot tell which mode asks, so
+that the Jacobian in all numbers of an impact is computed for a single direction, too. Who needs one
+mode only says so: `ADJOINTS`.
+"""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.custom_batching import custom_vmap
+from jax.custom_derivatives import SymbolicZero
+
+from jimpact.numerics.tangents import TANGENT_AXIS, Dual, dual_like, is_dual, is_smooth, value_of
+from jimpact.tools.compiling import full_precision
+from jimpact.tools.loops import varying_like
+
+# Impacts that a CPU solves at a time. A chunk ends with its slowest member, and its stages should
+# stay in a core's cache: 64 are no faster, 1024 take half as long again.
+CHUNK = 256
+CHUNK_WITH_TANGENTS = 128  # of impacts with tangents, which take more room in the cache
+# Rows of a Jacobian that one run computes; further ones run it again. Ten times more: chains of
+# fifty balls take ten times the memory, and no less time.
+DIRECTIONS = 64
+# 'jacobian': both modes; 'forward': forward mode only, along the directions that are asked for;
+# 'checkpoints': reverse mode only, by running steps again from states that were kept.
+ADJOINTS = ("jacobian", "forward", "checkpoints")
+REVERSE_ONLY = (
+    "Argument `adjoint` must be 'jacobian' or 'forward' for derivatives in forward mode (jvp, "
+    "jacfwd, hessian), but has value 'checkpoints', which has the reverse mode only (grad, vjp)."
+)
+
+Arrays = tuple[jax.Array, ...]
+Function = Callable[..., Arrays]
+
+
+def in_lanes(
+    function: Function, fine: Function, *arrays: jax.Array, adjoint: str = "jacobian"
+) -> Arrays:
+    """`function(*arrays)`, where all arrays in and out have the batch in their last axis.
+
+    Results that are whole numbers have no derivatives; the others have those of `fine`, which is
+    the same at a finer tolerance, with loops of `until_over` by `checkpoints` if these are the
+    `adjoint`. Functions are hashable and equal where they do the same: each is compiled once. One
+    that `takes_duals` gets `Dual` arguments where it is differentiated. It gets the whole batch if
+    its method `queues` returns True, else chunks of it.
+    """
+    arrays = tuple(varying_like([jnp.asarray(x) for x in arrays], arrays))
+    if adjoint == "checkpoints":
+        return _reversible(function, fine)(*arrays)
+    return _differentiable_lanes(function, fine, adjoint)(*arrays)
+
+
+@contextmanager
+def naming_the_adjoint() -> Iterator[None]:
+    """Within, JAX's refusal of a forward mode names the option that forbids it."""
+    try:
+        yield
+    except TypeError as error:
+        if "custom_vjp" not in str(error):
+            raise
+        raise TypeError(REVERSE_ONLY) from error
+
+
+def by_jacobian(function: Callable[[Any], Any], argument: Any) -> Any:
+    """`function(argument)` with derivatives in both modes of every order.
+
+    Both are trees; arrays in them may have any shape. `vmap` makes it a batch of runs side by side,
+    as of any function.
+    """
+    leaves, tree = jax.tree.flatten(argument)
+    others = [None if eqx.is_array(x) else x for x in leaves]
+    trees: list[Any] = []
+
+    def of_arrays(*arrays: jax.Array) -> Arrays:
+        """The leaves of the result, from the arrays of the argument."""
+        values = iter(arrays)
+        rebuilt = [next(values) if x is None else x for x in others]
+        results, result_tree = jax.tree.flatten(function(jax.tree.unflatten(tree, rebuilt)))
+        trees[:] = [result_tree]
+        return tuple(results)
+
+    wide = _OneLane(of_arrays)
+    lanes = (x[..., None] for x, other in zip(leaves, others) if other is None)
+    results = _as_it_is(wide, wide, "jacobian")(*lanes)
+    return jax.tree.unflatten(trees[0], [x[..., 0] for x in results])
+
+
+def without_derivatives(values: Any, why: Exception) -> Any:
+    """`values` as they are; `why` is raised where one of them is differentiated."""
+
+    @jax.custom_jvp
+    def same(numbers: list[Any]) -> list[Any]:
+        """The numbers as they are."""
+        return numbers
+
+    def rule(primals: Any, tangents: Any) -> Any:
+        """Raises where a number is perturbed."""
+        rates = jax.tree.leaves(tangents, is_leaf=lambda t: isinstance(t, SymbolicZero))
+        if any(not isinstance(rate, SymbolicZero) for rate in rates):
+            raise why
+        return primals[0], tangents[0]
+
+    same.defjvp(rule, symbolic_zeros=True)
+    leaves, tree = jax.tree.flatten(values)
+    moving = [i for i, x in enumerate(leaves) if eqx.is_inexact_array(x)]
+    replaced = dict(zip(moving, same([leaves[i] for i in moving])))
+    return jax.tree.unflatten(tree, [replaced.get(i, x) for i, x in enumerate(leaves)])
+
+
+@dataclasses.dataclass(frozen=True)
+class _OneLane:
+    """A function of arrays, as one of arrays (.., 1)."""
+
+    function: Function
+
+    def __call__(self, *arrays: jax.Array) -> Arrays:
+        """Its results, with an axis behind them."""
+        return tuple(x[..., None] for x in self.function(*(x[..., 0] for x in arrays)))
+
+
+@dataclasses.dataclass(frozen=True)
+class _WithTangents:
+    """Results (.., B) of a function, then rates (.., B) of the smooth ones.
+
+    Arguments: those of the function, then tangents of those `marked`. With `many` tangents and
+    rates have an axis of directions in front.
+    """
+
+    function: Function
+    marked: tuple[bool, ...]
+    many: bool = False
+
+    def queues(self, *arrays: jax.Array) -> bool:
+        """Whether its function works through a batch of any size by itself."""
+        return _queues(self.function, arrays[: len(self.marked)])
+
+    def __call__(self, *arrays: jax.Array) -> Arrays:
+        """Results and rates."""
+        at, directions = arrays[: len(self.marked)], arrays[len(self.marked) :]
+        if not self.many:
+            directions = tuple(x[None] for x in directions)
+        push = _push_duals if getattr(self.function, "takes_duals", False) else _push
+        outs, rates = push(self.function, self.marked, at, directions)
+        return *outs, *(rates if self.many else (x[0] for x in rates))
+
+
+@dataclasses.dataclass(frozen=True)
+class _WithJacobian:
+    """Results (.., B) of a function, then rates (D, .., B) of the smooth ones.
+
+    D counts the entries of the `marked` arguments in a lane.
+    """
+
+    function: Function
+    marked: tuple[bool, ...]
+
+    def queues(self, *arrays: jax.Array) -> bool:
+        """Whether its function works through a batch of any size by itself."""
+        return _queues(self.function, arrays)
+
+    def __call__(self, *arrays: jax.Array) -> Arrays:
+        """Results and rates; those of many directions by one run after the other."""
+        push = _WithTangents(self.function, self.marked, many=True)
+        moving = [x for x, mark in zip(arrays, self.marked) if mark]
+        sizes = [math.prod(x.shape[:-1]) for x in moving]
+        count = -(-sum(sizes) // DIRECTIONS)
+        size = -(-sum(sizes) // count)
+        unit = jnp.eye(count * size, sum(sizes), dtype=moving[0].dtype)
+
+        def along(rows: jax.Array) -> tuple[Arrays, Arrays]:
+            """Results, and rates in the directions (d, D) of these rows."""
+            directions, first = [], 0
+            for x, n in zip(moving, sizes):
+                own = rows[:, first : first + n].reshape(-1, *x.shape[:-1], 1)
+                own = jnp.broadcast_to(own, (len(rows), *x.shape))
+                directions.append(varying_like(own, x))
+                first += n
+            outs = push(*arrays, *directions)
+            values = _count_of_values(outs)
+            return outs[:values], outs[values:]
+
+        if count == 1:
+            outs, rates = along(unit)
+            return *outs, *rates
+        outs, rates = jax.lax.map(along, unit.reshape(count, size, -1))
+        joined = (jnp.concatenate(x)[: sum(sizes)] for x in rates)
+        return *(x[0] for x in outs), *joined
+
+
+def _count_of_values(outs: Arrays) -> int:
+    """How many of the results with their rates are results."""
+    smooth = [is_smooth(x) for x in outs]
+    return next(n for n in range(len(outs)) if n + sum(smooth[:n]) == len(outs))
+
+
+def _push(
+    function: Function, marked: tuple[bool, ...], arrays: Arrays, directions: Arrays
+) -> tuple[Arrays, Arrays]:
+    """Results, and rates (d, .., B) of the smooth ones along directions of the `marked` arrays."""
+
+    def of_marked(*values: jax.Array) -> Arrays:
+        """`function` with the marked arguments replaced."""
+        replaced = iter(values)
+        return tuple(function(*(next(replaced) if m else x for x, m in zip(arrays, marked))))
+
+    def one(*directions: jax.Array) -> tuple[Arrays, Arrays]:
+        """In one direction."""
+        outs, rates = jax.jvp(of_marked, moving, directions)
+        return outs, tuple(rate for x, rate in zip(outs, rates) if is_smooth(x))
+
+    moving = tuple(x for x, mark in zip(arrays, marked) if mark)
+    return jax.vmap(one, out_axes=(None, 0))(*directions)
+
+
+def _push_duals(
+    function: Function, marked: tuple[bool, ...], arrays: Arrays, directions: Arrays
+) -> tuple[Arrays, Arrays]:
+    """As `_push`, of a function that takes `Dual` arguments."""
+    inner = iter(jnp.moveaxis(x, 0, TANGENT_AXIS) for x in directions)
+    duals = [Dual(x, next(inner)) if mark else x for x, mark in zip(arrays, marked)]
+    outs = tuple(function(*duals))
+    smooth = [dual_like(duals, x) for x in outs if is_dual(x) or is_smooth(x)]
+    return value_of(outs), tuple(jnp.moveaxis(x.tangents, TANGENT_AXIS, 0) for x in smooth)
+
+
+@functools.cache
+def _differentiable_lanes(function: Function, fine: Function, adjoint: str) -> Function:
+    """`_differentiable` in lanes, once for equal functions."""
+    return _differentiable(_lanes(function), fine, adjoint, _differentiable_lanes)
+
+
+def _as_it_is(function: Function, fine: Function, adjoint: str) -> Function:
+    """`_differentiable` without lanes."""
+    return _differentiable(function, fine, adjoint, _as_it_is)
+
+
+def _differentiable(
+    run: Function, fine: Function, adjoint: str, again: Callable[[Any, Any, str], Function]
+) -> Function:
+    """`run` with the derivatives of `fine`, to which `again` gives derivatives of their own."""
+
+    @jax.custom_jvp
+    def value(*arrays: jax.Array) -> Arrays:
+        """The values."""
+        return full_precision(run)(*arrays)
+
+    def derivative(kind: Any, marked: tuple[bool, ...], *arrays: jax.Array) -> tuple[Arrays, Any]:
+        """Results of `fine` and their rates, which have derivatives again."""
+        with_rates = kind(fine, marked)
+        outs = again(with_rates, with_rates, adjoint)(*arrays)
+        count = _count_of_values(outs)
+        return outs[:count], iter(outs[count:])
+
+    @full_precision
+    def rule(primals: Arrays, tangents: tuple[Any, ...]) -> tuple[Arrays, tuple[Any, ...]]:
+        """Results of `fine`, and tangents: from its Jacobian, or along the direction."""
+        marked = tuple(not isinstance(t, SymbolicZero) for t in tangents)
+        moving = [t for t, mark in zip(tangents, marked) if mark]
+        if isinstance(fine, _WithTangents):
+            return _second_order(fine, marked, primals, tuple(moving))
+        if adjoint == "forward":
+            outs, rates = derivative(_WithTangents, marked, *primals, *moving)
+        else:
+            outs, jacobian = derivative(_WithJacobian, marked, *primals)
+            direction = jnp.concatenate([t.reshape(-1, t.shape[-1]) for t in moving])
+            rates = iter([_contracted(x, direction) for x in jacobian])
+        return outs, _with_zeros(outs, rates)
+
+    value.defjvp(rule, symbolic_zeros=True)
+    return value
+
+
+def _second_order(
+    first: _WithTangents, marked: tuple[bool, ...], primals: Arrays, moving: Arrays
+) -> tuple[Arrays, tuple[Any, ...]]:
+    """Results of `first`, and their tangents: those of a product with the Jacobian."""
+
+    def by_jacobian(*values: jax.Array) -> tuple[Arrays, Arrays]:
+        """Results, and those of them with derivatives."""
+        replaced = iter(values)
+        arrays = [next(replaced) if mark else x for x, mark in zip(primals, marked)]
+        count = len(first.marked)
+        jacobian = _WithJacobian(first.function, first.marked)
+        outs = _differentiable_lanes(jacobian, jacobian, "jacobian")(*arrays[:count])
+        n = _count_of_values(outs)
+        direction = jnp.concatenate([t.reshape(-1, t.shape[-1]) for t in arrays[count:]])
+        whole = *outs[:n], *(_contracted(x, direction) for x in outs[n:])
+        return tuple(x for x in whole if is_smooth(x)), whole
+
+    values = tuple(x for x, mark in zip(primals, marked) if mark)
+    _, rates, outs = jax.jvp(by_jacobian, values, moving, has_aux=True)
+    return outs, _with_zeros(outs, iter(rates))
+
+
+def _with_zeros(outs: Arrays, rates: Iterator[jax.Array]) -> tuple[Any, ...]:
+    """Tangents of all results, from those of the smooth ones."""
+    none = (SymbolicZero(jax.typeof(x).to_tangent_aval()) for x in outs)
+    return tuple(next(rates) if is_smooth(x) else zero for x, zero in zip(outs, none))
+
+
+def _contracted(rates: jax.Array, direction: jax.Array) -> jax.Array:
+    """The tangent (.., B) of a result from its rates (D, .., B) and the direction (D, B)."""
+    return jnp.einsum("d...b,db->...b", rates, direction)
+
+
+@functools.cache
+def _reversible(function: Function, fine: Function) -> Function:
+    """`function` in lanes; for derivatives `fine` as it is, with the reverse mode of its loops."""
+
+    @jax.custom_vjp
+    def value(*arrays: jax.Array) -> Arrays:
+        """The values."""
+        return _lanes(function)(*arrays)
+
+    @full_precision
+    def forward(*arrays: jax.Array) -> tuple[Arrays, Any]:
+        """Results of `fine`, and its transposed derivative."""
+        if hasattr(fine, "only_first"):
+            arrays = fine.only_first(arrays)
+
+        def run(*arrays: jax.Array) -> tuple[Arrays, Arrays]:
+            """Results with derivatives, and all of them."""
+            outs = fine(*arrays)
+            return tuple(x for x in outs if is_smooth(x)), outs
+
+        _, back, outs = jax.vjp(run, *arrays, has_aux=True)
+        return outs, back
+
+    def backward(back: Any, cotangents: Arrays) -> Any:
+        """Cotangents of the arrays."""
+        return full_precision(back)(tuple(c for c in cotangents if is_smooth(c)))
+
+    value.defvjp(forward, backward)
+    return value
+
+
+def _queues(function: Any, arrays: Arrays) -> bool:
+    """Whether the function works through a batch of any size by itself."""
+    queues = getattr(function, "queues", None)
+    return queues is not None and queues(*arrays)
+
+
+@functools.cache
+def _lanes(function: Function) -> Function:
+    """`function` compiled; `vmap` makes the last axis of its arrays longer."""
+    compiled = jax.jit(functools.partial(_in_chunks, function))
+
+    @custom_vmap
+    def call(*arrays: jax.Array) -> Arrays:
+        """Its results."""
+        return tuple(compiled(*arrays))
+
+    @call.def_vmap
+    def wider(size: int, batched: list[bool], *arrays: jax.Array) -> tuple[Arrays, Any]:
+        """The batch of `vmap` becomes part of the last axis, or that of the directions."""
+        count = len(getattr(function, "marked", ()))
+        if isinstance(function, _WithTangents) and not function.many and not any(batched[:count]):
+            # many directions at one point: its steps are computed once
+            along = [
+                x if is_batched else jnp.broadcast_to(x, (size, *x.shape))
+                for x, is_batched in zip(arrays[count:], batched[count:])
+            ]
+            outs = _lanes(dataclasses.replace(function, many=True))(*arrays[:count], *along)
+            values = _count_of_values(outs)
+            return outs, tuple(i >= values for i in range(len(outs)))
+
+        def wide(x: jax.Array, is_batched: bool) -> jax.Array:
+            """An array with both batches in its last axis."""
+            if is_batched:
+                x = jnp.moveaxis(x, 0, -2)
+            else:
+                x = jnp.broadcast_to(x[..., None, :], (*x.shape[:-1], size, x.shape[-1]))
+            return x.reshape(*x.shape[:-2], size * x.shape[-1])
+
+        outs = call(*map(wide, arrays, batched))
+        split = [x.reshape(*x.shape[:-1], size, x.shape[-1] // size) for x in outs]
+        return tuple(jnp.moveaxis(x, -2, 0) for x in split), (True,) * len(split)
+
+    return call
+
+
+@full_precision
+def _in_chunks(function: Function, *arrays: jax.Array) -> Arrays:
+    """On a CPU piece by piece, the last one filled up; on accelerators all at once."""
+    size = arrays[0].shape[-1]
+    chunk = CHUNK_WITH_TANGENTS if isinstance(function, _WithTangents | _WithJacobian) else CHUNK
+    count = 1 if _queues(function, arrays) else -(-size // chunk)
+    if count == 1:
+        return tuple(function(*arrays))
+    width = -(-size // count)
+
+    def pieces(*whole: jax.Array) -> Arrays:
+        """All chunks, one after the other."""
+
+        def cut(x: jax.Array) -> jax.Array:
+            """Chunks (count, .., width) of (.., B), the last one filled up with its last impact."""
+            filled = jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, count * width - size)], mode="edge")
+            return jnp.moveaxis(filled.reshape(*x.shape[:-1], count, width), -2, 0)
+
+        def join(x: jax.Array) -> jax.Array:
+            """The inverse of `cut`."""
+            joined = jnp.moveaxis(x, 0, -2)
+            return joined.reshape(*joined.shape[:-2], count * width)[..., :size]
+
+        mapped = jax.lax.map(lambda piece: tuple(function(*piece)), tuple(map(cut, whole)))
+        return tuple(map(join, mapped))
+
+    return jax.lax.platform_dependent(
+        *arrays, cpu=pieces, default=lambda *whole: tuple(function(*whole))
+    )

@@ -1,0 +1,660 @@
+"""Coulomb friction: which contacts stick, which slide and where to. Planar is a disc of one row.
+
+With A = D^T M^-1 D of the normals and tangents D = [N, H] and x = (p, p_t) the question is
+
+    normal      r = a + A_n x:  r = 0 (prescribed), or  0 <= r _|_ p >= 0 (complementary)
+    tangential  s = b + A_t x,  p_t in -mu max(p, 0) Sgn(s)
+
+for impulses and velocities, or for forces and accelerations. Each contact is free (p = 0, or it
+pulls; p_t = 0), sticks (s = 0) or slides (p_t = -mu p d, d = s / |s|). These modes are found with
+derivatives switched off; linear solves on them then give values and derivatives. Where A is
+singular on the modes (both corners of a block lying flat), sticking contacts share what they hold
+in proportion to mu p, and normal impulses are the least, wherever that is allowed.
+"""
+
+import itertools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact.numerics.dense import block_inverse, block_solve, load_shares, singular_values, times
+from jimpact.numerics.interior_points import ATTEMPTS, Best, better, cones_of, within_cones
+from jimpact.numerics.lcp import gathered_rounding
+from jimpact.numerics.many_contacts import solve_many
+from jimpact.tools.compiling import full_precision
+from jimpact.tools.loops import fori_loop, while_loop
+from jimpact.tools.precision import precision
+from jimpact.tools.status import CODE
+
+ENUMERATED = 3  # contacts up to which all modes are tried: 4^3 in the plane, 6^3 in space
+_DIRECTIONS = 4  # directions of slip, evenly spread, that each sliding contact in space starts from
+_ITERATIONS = 8  # of Newton's method for the directions of slip; 4 to 6 are usual
+# Part of the largest mu p: the weight in the sharing of a contact without load. Ten times more: it
+# takes a visible share.
+_LEAST_SHARE = 1e-6
+# Projections at most, where interior points find nothing, and at most for each contact, if that is
+# more. Ten times more: jammed scenes end later.
+_PROJECTIONS, _PROJECTIONS_EACH = 5000, 20
+_POLISHES = 8  # steps of Newton's method; 1 to 3 are usual, ten times more change nothing
+# Added to the diagonal of the equations of Newton's method, which are singular where impulses are
+# free. Ten times more: another step of it.
+_RIDGE = 1e-8
+# Rows of the equations up to which free impulses are shared out, by their singular values. Ten
+# times more: a minute for an impact.
+_SHARED = 256
+# `distribute`: sweeps at most; part of the largest limit below which a sweep changes nothing; part
+# of the limit below which a force is inside its disc, or a rate is 0. Ten times more of the last
+# two: contacts on the rim of their cone stick.
+_RELAXATIONS = 200
+_SETTLED, _INSIDE = 1e-13, 1e-9
+
+
+class FrictionImpulses(NamedTuple):
+    """p (m,), p_t (m,) or (2 m,), the status code (), and columns (m + t, m + t) in which they are
+    free, p first (0: they are unique); without derivatives."""
+
+    normal: jax.Array
+    tangential: jax.Array
+    status: jax.Array
+    free: jax.Array
+
+
+class _FrictionProblem(NamedTuple):
+    """A (m, b, m, b), (a, b) (m, b), mu (m,): contact-major, b = 1 + rows, diagonal of order 1."""
+
+    matrix: jax.Array
+    rate: jax.Array
+    friction: jax.Array
+    load: jax.Array | None
+    complementary: bool
+
+    @property
+    def tolerance(self) -> float:
+        """Of what is satisfied, in parts of the size."""
+        return gathered_rounding(len(self.friction), self.matrix.dtype)
+
+
+class _Modes(NamedTuple):
+    """N modes: `taking` (m, N) has r = 0, not p = 0; `sticks` (m, N); `direction` (m, rows, N).
+
+    The direction of slip is 0 for a free contact. `turning` (m, N): see `_equations`.
+    """
+
+    taking: jax.Array
+    sticks: jax.Array
+    direction: jax.Array
+    turning: jax.Array
+
+
+@full_precision
+def solve(
+    matrix: jax.Array,
+    normal: jax.Array,
+    slip: jax.Array,
+    friction: jax.Array,
+    *,
+    complementary: bool,
+    load: jax.Array | None = None,
+    sliding: jax.Array | None = None,
+) -> FrictionImpulses:
+    """Impulses `x = (p, p_t)` of contacts with Coulomb friction.
+
+    Equation: `r = normal + A_n x` is 0, or (`complementary`) `0 <= r _|_ p >= 0`;
+    `s = slip + A_t x`, `p_t in -mu max(p, 0) Sgn(s)`.
+
+    Args:
+        matrix: A (m + t, m + t), normals first, then the t = m (planar) or 2 m tangents,
+            contact-major. A contact that takes no part has rows and columns of a unit matrix.
+        normal: (m,) what gamma+ - gamma- must make up for; the same for accelerations.
+        slip: (t,) `(1 + e_t) u-`.
+        friction: mu (m,).
+        complementary: contacts may part; otherwise they may pull (without friction).
+        load: (m,) >= 0, normal impulses in addition to p, which friction includes: it is bounded by
+            `mu (p + load)`, and acts on contacts with p = 0 too. None: 0. One below rounding counts
+            as one that begins: where p = 0 = r, derivatives are those of a contact that opens.
+        sliding: (t,) unit vectors of slip where it is known (forces of contacts that slide
+            already: s, an acceleration, does not decide), 0 where it is unknown. Not together
+            with `load`.
+
+    Returns:
+        p, p_t and a status. `several_outcomes`: with up to 3 contacts all modes are tried, and
+        consistent ones whose velocities differ were found; the one with most sticking contacts is
+        returned. In space Newton's method looks for the directions of slip from 4 starts a contact,
+        all combined: solutions that none of them reaches are missed. Above 3 contacts other modes
+        are not looked for. It is reported also where redundant contacts slide, so that how they
+        share p changes their slip (a spinning cube flat on four corners).
+        `impulse_not_unique`: only the impulses differ; of more than 256 rows no shares are
+        computed, nor whether slip depends on them. `infeasible`: no modes are consistent;
+        `max_steps`: none were found (in space, above 3 contacts).
+
+    Derivatives (up to the third, in any mode) hold the modes, which is one-sided where they are
+    about to change, and take a singular matrix to keep its rank; those of impulses that are not
+    unique hold the directions in which they are free.
+
+    Source: Anitescu and Potra, Nonlinear Dynamics 14 (1997) 231-247 (planar existence).
+
+    >>> import jax
+    >>> import jax.numpy as jnp
+    >>> from jimpact.numerics.friction import solve
+    >>> matrix, mu = jnp.diag(jnp.array([1.0, 2.0])), jnp.array([0.5])
+    >>> problem = (matrix, jnp.array([-1.0]), jnp.array([3.0]), mu)
+    >>> x = jax.jit(lambda *a: solve(*a, complementary=True))(*problem)
+    >>> [round(float(p), 6) for p in (x.normal[0], x.tangential[0])]
+    [1.0, -0.5]
+    """
+    m = len(normal)
+    rows = len(slip) // m
+    order = np.concatenate([np.arange(m)[:, None], m + np.arange(m * rows).reshape(m, rows)], 1)
+    of_contacts = matrix[order[:, :, None, None], order[None, None]]
+    squares = jnp.diagonal(jax.lax.stop_gradient(matrix))[order]
+    squares = jnp.stack([squares[:, 0], jnp.mean(squares[:, 1:], axis=1)], axis=1)
+    norm = jnp.sqrt(jnp.where(squares > 0, squares, 1.0))
+    scale = 1 / jnp.repeat(norm, np.array([1, rows]), axis=1, total_repeat_length=1 + rows)
+    rate = jnp.concatenate([normal[:, None], slip.reshape(m, rows)], axis=1) * scale
+    friction = friction * norm[:, 1] / norm[:, 0]
+    of_contacts = of_contacts * scale[:, :, None, None] * scale[None, None]
+    drag = jnp.zeros((m, rows), matrix.dtype)
+    if sliding is not None:
+        slides = jnp.any(sliding.reshape(m, rows) != 0, axis=1)
+        drag = -friction[:, None] * sliding.reshape(m, rows)
+        dragged = jnp.sum(of_contacts[..., 1:] * drag[None, None], axis=3)
+        of_contacts = of_contacts.at[..., 0].add(dragged)
+        decoupled = jnp.pad(jnp.repeat(slides[:, None], rows, axis=1), ((0, 0), (1, 0)))
+        apart = decoupled[:, :, None, None] | decoupled[None, None]
+        unit = jnp.eye(rate.size, dtype=matrix.dtype).reshape(of_contacts.shape)
+        of_contacts = jnp.where(apart, unit, of_contacts)
+        rate = jnp.where(decoupled, 0.0, rate)
+        friction = jnp.where(slides, 0.0, friction)
+    largest = jax.lax.stop_gradient(jnp.abs(rate).max())
+    size = jnp.where(largest > 0, largest, 1.0)
+    problem = _FrictionProblem(
+        of_contacts,
+        rate / size,
+        friction,
+        None if load is None else load * norm[:, 0] / size,
+        complementary,
+    )
+    fixed = _FrictionProblem(*jax.lax.stop_gradient(problem[:4]), complementary)
+    modes, decided, status = (_enumerate if m <= ENUMERATED else _search)(fixed)
+    modes, inverted = _most_at_rest(fixed, modes, decided)
+    free, code = _freedom(fixed, inverted)
+    status = jnp.maximum(status, code)
+    x = _on_modes(problem, modes, inverted, decided)
+    missed = _misfit(fixed, jax.lax.stop_gradient(x)[..., None], _size(decided[..., None]))[0]
+    wrong = ~(missed <= fixed.tolerance)
+    status = jnp.where(wrong & (status < CODE["infeasible"]), CODE["max_steps"], status)
+    x = x.at[:, 1:].add(drag * x[:, :1]) * scale * size
+    p = jnp.where(x[:, 0] < 0, 0.0, x[:, 0]) if complementary else x[:, 0]  # rounding
+    free = jax.lax.stop_gradient(scale)[..., None] * free.reshape(*scale.shape, -1)
+    both = [free[:, 0], free[:, 1:].reshape(m * rows, -1)]
+    return FrictionImpulses(p, x[:, 1:].reshape(-1), status, jnp.concatenate(both))
+
+
+# ------------------------------------------------------------------- the equations of modes
+
+
+def _rates(problem: _FrictionProblem, x: jax.Array) -> jax.Array:
+    """(r, s) (m, b, N) of impulses (m, b, N)."""
+    if len(x) <= ENUMERATED:
+        return problem.rate[..., None] + _times(problem.matrix[..., None], x)
+    return problem.rate[..., None] + jnp.tensordot(problem.matrix, x, 2)  # never computed twice
+
+
+def _times(matrix: jax.Array, x: jax.Array) -> jax.Array:
+    """(m, b, N) of matrices (m, b, m, b, N) and (m, b, N)."""
+    return jnp.sum(matrix * x[None, None], axis=(2, 3))
+
+
+def _length(vectors: jax.Array) -> jax.Array:
+    """(m, N) of vectors (m, rows, N); its derivative is 0 at 0."""
+    squares = jnp.sum(vectors**2, axis=1)
+    return jnp.where(squares > 0, jnp.sqrt(jnp.where(squares > 0, squares, 1.0)), 0.0)
+
+
+def _over(vectors: jax.Array, length: jax.Array) -> jax.Array:
+    """Vectors (m, rows, N) over (m, N), 0 over 0."""
+    return jnp.where(length > 0, 1 / jnp.where(length > 0, length, 1.0), 0.0)[:, None] * vectors
+
+
+def in_disc(side: jax.Array, radius: jax.Array) -> jax.Array:
+    """The points of discs (m, N) next to `side` (m, rows, N)."""
+    length = _length(side)
+    return jnp.where((length > radius)[:, None], _over(side, length) * radius[:, None], side)
+
+
+def _bound(problem: _FrictionProblem, x: jax.Array) -> jax.Array:
+    """mu (p + load) (m, N)."""
+    p = jnp.maximum(x[:, 0], 0.0)
+    return problem.friction[:, None] * (p if problem.load is None else p + problem.load[:, None])
+
+
+def _rubs(problem: _FrictionProblem) -> jax.Array:
+    """Which contacts (m, 1) have friction: without it none sticks, also where it does not slip."""
+    return problem.friction[:, None] > 0
+
+
+def _size(x: jax.Array) -> jax.Array:
+    """(N,) of (m, b, N); the rates without impulses have size 1."""
+    return 1 + jnp.abs(x).max(axis=(0, 1))
+
+
+def _misfit(problem: _FrictionProblem, x: jax.Array, size: jax.Array | None = None) -> jax.Array:
+    """How far x (m, b, N) is from what the law makes of it (N,), in parts of its size.
+
+    Or of another size (N,): impulses that follow from x must not hide their errors by growing.
+    """
+    rate = _rates(problem, x)
+    p, r, side = x[:, 0], rate[:, 0], x[:, 1:]
+    normal = jnp.minimum(p, r) if problem.complementary else r
+    wrong = side - in_disc(side - rate[:, 1:], _bound(problem, x))
+    most = jnp.maximum(jnp.abs(normal).max(axis=0), jnp.abs(wrong).max(axis=(0, 1)))
+    return most / (_size(x) if size is None else size)
+
+
+def _equations(problem: _FrictionProblem, modes: _Modes) -> tuple[jax.Array, jax.Array]:
+    """Linear equations (m, b, m, b, N), (m, b, N) of modes: r = 0 or p = 0, and
+
+        Q s + (1 - Q) p_t + mu (p + load) d = 0
+
+    with Q = 1 where a contact sticks and Q = 0 where it is free or slides along a fixed direction.
+    With Q = beta e e^T, e orthogonal to d, beta = mu p / (mu p + |s|), this is Newton's method for
+    the direction of slip.
+    """
+    m, rows = modes.direction.shape[:2]
+    dtype = problem.matrix.dtype
+    q = modes.sticks[:, None, None].astype(dtype) * jnp.eye(rows, dtype=dtype)[None, ..., None]
+    if rows == 2:
+        e = jnp.stack([-modes.direction[:, 1], modes.direction[:, 0]], axis=1)
+        q = q + modes.turning[:, None, None] * e[:, :, None] * e[:, None]
+    q = jnp.pad(q, ((0, 0), (1, 0), (1, 0), (0, 0))).at[:, 0, 0].set(modes.taking.astype(dtype))
+    unit = jnp.eye(m * (1 + rows), dtype=dtype).reshape(problem.matrix.shape)
+    own = jnp.eye(m, dtype=dtype)[:, None, :, None, None]
+    first = jnp.eye(1 + rows, dtype=dtype)[0][None, None, None, :, None]
+    friction_direction = jnp.pad(
+        modes.direction * problem.friction[:, None, None], ((0, 0), (1, 0), (0, 0))
+    )
+    pressed = friction_direction[:, :, None, None] * own * first
+    # term by term: in single precision XLA may crash on sums within batches of so many axes
+    apart = (problem.matrix - unit)[..., None]
+    moved = sum(q[:, :, k, None, None] * apart[:, None, k] for k in range(1 + rows))
+    right = -jnp.sum(q * problem.rate[:, None, :, None], axis=2)
+    if problem.load is not None:
+        right = right - friction_direction * problem.load[:, None, None]
+    return moved + pressed + unit[..., None], right
+
+
+def _turned(problem: _FrictionProblem, modes: _Modes, x: jax.Array) -> _Modes:
+    """The modes with the directions of slip that x (m, b, N) has, in space."""
+    if modes.direction.shape[1] == 1:
+        return modes
+    slip = _rates(problem, x)[:, 1:]
+    pull = slip - x[:, 1:]  # along d where a contact slides, and where it only reaches its cone
+    length, bound = _length(pull), _bound(problem, x)
+    slides = (_length(modes.direction) > 0) & (length > 0)
+    direction = jnp.where(slides[:, None], _over(pull, length), modes.direction)
+    whole = bound + _length(slip)
+    turning = jnp.where(slides & (whole > 0), bound / jnp.where(whole > 0, whole, 1.0), 0.0)
+    return modes._replace(direction=direction, turning=turning)
+
+
+def _solved(problem: _FrictionProblem, modes: _Modes) -> jax.Array:
+    """x (m, b, N) on modes, contact by contact; wrong where their equations are singular.
+
+    Refinements undo what `block_inverse` perturbs.
+    """
+    matrix, right = _equations(problem, modes)
+    inverse = block_inverse(matrix)
+
+    def refine(_: int, x: jax.Array) -> jax.Array:
+        """One refinement by the approximate inverse."""
+        return x + _times(inverse, right - _times(matrix, x))
+
+    return fori_loop(0, 3, refine, jnp.zeros_like(right))
+
+
+# ------------------------------------------------------------------- the decision
+
+
+def _table(contacts: int, rows: int, loaded: bool) -> tuple[np.ndarray, np.ndarray]:
+    """All modes (m, N), sticking before sliding before free: 0 sticks, 1 is free, 2... slide.
+
+    And which take part: all that are not free, but with a load any other with p = 0 as well.
+    """
+    slides = 2 if rows == 1 else _DIRECTIONS
+    if not loaded:
+        kinds = itertools.product(range(2 + slides), repeat=contacts)
+        table = np.array(sorted(kinds, key=lambda k: (np.count_nonzero(k), k.count(1)))).T
+        return table, table != 1
+    each = [(kind, taking) for kind in (0, *range(2, 2 + slides)) for taking in (True, False)]
+    both = itertools.product(each, repeat=contacts)
+    table = np.array(sorted(both, key=lambda k: sum((kind > 0) for kind, _ in k))).T
+    return table[0], table[1] == 1
+
+
+def _enumerate(problem: _FrictionProblem) -> tuple[_Modes, jax.Array, jax.Array]:
+    """The consistent modes (N = 1) that stick most, their x (m, b), and the status."""
+    m, rows = len(problem.friction), problem.rate.shape[1] - 1
+    dtype = problem.matrix.dtype
+    kinds, taking = _table(m, rows, problem.load is not None)
+    angle = 2 * np.pi * (kinds - 2) / (2 if rows == 1 else _DIRECTIONS)
+    turned = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    turn = jnp.asarray(np.where(kinds > 1, turned, 0.0)[:rows, :rows], dtype)
+    begin = jnp.ones((m, 1, 1), dtype)
+    if rows == 2:  # the slip without impulses, if there is some
+        begin = problem.rate[:, 1:, None] + 0.0
+        begin = jnp.where(_length(begin)[:, None] > 0, begin, 1.0)
+        begin = _over(begin, _length(begin))
+    modes = _Modes(
+        jnp.asarray(taking | (not problem.complementary)),
+        jnp.asarray(kinds == 0),
+        jnp.sum(turn * begin.swapaxes(0, 1)[None], axis=1).swapaxes(0, 1),
+        jnp.zeros(kinds.shape, dtype),
+    )
+    modes, x = _newton(problem, modes)
+    misfit, root = _misfit(problem, x), precision(dtype).root
+    # larger impulses are the rounding of a singular matrix
+    good = (misfit <= problem.tolerance) & (_size(x) < 1 / root)
+    best = jnp.where(jnp.any(good), jnp.argmax(good), jnp.nanargmin(misfit))
+
+    def differ(values: jax.Array) -> jax.Array:
+        """Whether consistent modes differ in these values from the chosen ones."""
+        apart = jnp.abs(values - values[..., best][..., None]).max(axis=(0, 1))
+        return jnp.any(good & (apart > root * _size(x[..., best])))
+
+    status = jnp.where(differ(x), CODE["impulse_not_unique"], CODE["ok"])
+    status = jnp.where(differ(_rates(problem, x)), CODE["several_outcomes"], status)
+    none = CODE["infeasible" if rows == 1 else "max_steps"]
+    chosen = jax.tree.map(lambda leaf: leaf[..., best][..., None], modes)
+    return chosen, x[..., best], jnp.where(jnp.any(good), status, none)
+
+
+def _newton(problem: _FrictionProblem, modes: _Modes) -> tuple[_Modes, jax.Array]:
+    """x (m, b, N) of modes, in space with the directions of slip that they lead to."""
+    none = jnp.zeros((*problem.rate.shape, modes.taking.shape[1]), problem.matrix.dtype)
+    if modes.direction.shape[1] == 1:
+        return modes, _solved(problem, modes)
+
+    def step(_: int, state: tuple[_Modes, jax.Array]) -> tuple[_Modes, jax.Array]:
+        """Impulses, and the directions of slip that follow from them."""
+        x = _solved(problem, state[0])
+        return _turned(problem, state[0], x), x
+
+    return fori_loop(0, _ITERATIONS, step, (modes, none))
+
+
+def _at_rest(problem: _FrictionProblem, x: jax.Array, margin: jax.Array) -> _Modes:
+    """The modes (N = 1) that x (m, b) has: contacts stick that slip by less than `margin`."""
+    rate = _rates(problem, x[..., None])
+    margin = (margin * _size(x[..., None]))[None]
+    taking = rate[:, 0] <= margin if problem.complementary else jnp.ones(rate[:, 0].shape, bool)
+    if problem.load is not None:
+        begins = (problem.load > 0) & (problem.load < precision(x.dtype).eps)
+        taking = taking & ~(begins[:, None] & (x[:, :1] <= margin))
+    pushes = taking & (x[:, :1] >= -margin)
+    if problem.load is not None:
+        pushes = pushes | (problem.load[:, None] > 0)
+    speed = _length(rate[:, 1:])
+    slides = pushes & (speed > margin)
+    sticks = pushes & ~slides & _rubs(problem)
+    direction = jnp.where(slides[:, None], _over(rate[:, 1:], speed), 0.0)
+    modes = _Modes(taking, sticks, direction, jnp.zeros(speed.shape, x.dtype))
+    return _turned(problem, modes, x[..., None])
+
+
+class _Inverted(NamedTuple):
+    """Of the equations E of modes, with the weights D of the sharing and no derivatives.
+
+    B = E D = U S V^T: `inverse` (n, n) of B + U_0 V_0^T, `pairs` U_0 V_0^T of its null vectors,
+    and D (m, b). `held`: free contacts remain free, as the least is not allowed. Of more than
+    `_SHARED` rows the inverse is that of B with a ridge, and the pairs are 0.
+    """
+
+    inverse: jax.Array
+    pairs: jax.Array
+    weight: jax.Array
+    held: jax.Array
+
+
+def _inverted(problem: _FrictionProblem, modes: _Modes, x: jax.Array) -> _Inverted:
+    """The equations of modes, inverted; see the class."""
+    n = x.size
+    matrix, _ = _equations(problem, _turned(problem, modes, x[..., None]))
+    weight = 1 / jnp.sqrt(_weights(problem, x))
+    scaled = (matrix[..., 0] * weight[None, None]).reshape(n, n)
+    if n > _SHARED:
+        eye = jnp.eye(n, dtype=x.dtype)
+        return _Inverted(jnp.linalg.inv(scaled + _RIDGE * eye), 0 * eye, weight, jnp.asarray(True))
+    left, values, right, null = singular_values(scaled)
+    inverse = (right.T / jnp.where(null, 1.0, values)[None]) @ left.T
+    return _Inverted(inverse, jnp.where(null[None], left, 0.0) @ right, weight, jnp.asarray(True))
+
+
+def _weights(problem: _FrictionProblem, x: jax.Array) -> jax.Array:
+    """(m, b) of the squares of impulses in what is least where they are shared."""
+    share = load_shares(_bound(problem, x[..., None]), _LEAST_SHARE)
+    return jnp.concatenate([jnp.ones_like(share), jnp.repeat(1 / share, x.shape[1] - 1, 1)], 1)
+
+
+def _most_at_rest(
+    problem: _FrictionProblem, modes: _Modes, x: jax.Array
+) -> tuple[_Modes, _Inverted]:
+    """Modes with the velocities of x where all sticks that can, if its shared impulses are allowed.
+
+    Otherwise, and of more than `_SHARED` rows, the modes as they are.
+    """
+    if x.size > _SHARED:
+        return modes, _inverted(problem, modes, x)
+    rest = _at_rest(problem, x, jnp.asarray(problem.tolerance, x.dtype))
+    modes = modes._replace(taking=modes.taking & rest.taking)  # loads that begin open contacts
+    both = jax.tree.map(lambda *leaf: jnp.stack(leaf), rest, modes)
+    inverted = jax.lax.map(lambda modes: _inverted(problem, modes, x), both)
+    inverted = inverted._replace(held=jnp.array([False, True]))
+    first = jax.tree.map(lambda leaf: leaf[0], inverted)
+    shared = _on_modes(problem, rest, first, x)
+    missed = _misfit(problem, shared[..., None], _size(x[..., None]))[0]
+    allowed = missed <= problem.tolerance
+    return jax.tree.map(lambda leaf: jnp.where(allowed, *leaf), (both, inverted))
+
+
+def _freedom(problem: _FrictionProblem, inverted: _Inverted) -> tuple[jax.Array, jax.Array]:
+    """Columns (n, n) in which impulses are free, and a status that says what they change."""
+    free = inverted.weight.reshape(-1, 1) * inverted.pairs.T
+    if len(free) > _SHARED:  # there the inverse is large where impulses are free
+        not_unique = jnp.max(jnp.abs(inverted.inverse)) > _RIDGE**-0.5
+        return free, jnp.where(not_unique, CODE["impulse_not_unique"], CODE["ok"])
+    # contacts that slide may share p so that slip changes
+    moves = jnp.abs(problem.matrix.reshape(free.shape) @ free)
+    root = precision(free.dtype).root
+    code = jnp.where(jnp.any(free != 0), CODE["impulse_not_unique"], CODE["ok"])
+    return free, jnp.where(jnp.any(moves > root), CODE["several_outcomes"], code)
+
+
+def _on_modes(
+    problem: _FrictionProblem, modes: _Modes, inverted: _Inverted, x: jax.Array
+) -> jax.Array:
+    """x (m, b) on its modes, with derivatives up to the third, by as many chord steps.
+
+    With y = x / D it solves `B y = f` and `V_0^T (D W D) y = 0`, or holds `V_0^T y`.
+    """
+    shape, n = x.shape, x.size
+    weight = inverted.weight.reshape(n)
+    start = x.reshape(n) / weight
+
+    def step(_: int, y: jax.Array) -> jax.Array:
+        """One chord step."""
+        x = (weight * y).reshape(shape)
+        matrix, right = _equations(problem, _turned(problem, modes, x[..., None]))
+        shared = weight**2 * _weights(problem, x).reshape(n) * y
+        free = inverted.pairs @ jnp.where(inverted.held, y - start, shared)
+        missed = matrix.reshape(n, n) @ x.reshape(n) - right.reshape(n) + free
+        return y - inverted.inverse @ missed
+
+    return (weight * fori_loop(0, 3, step, start)).reshape(shape)
+
+
+# ------------------------------------------------------------------- many contacts
+
+
+def _modes_at(problem: _FrictionProblem, x: jax.Array) -> _Modes:
+    """The modes (N = 1) to which x (m, b) is closest, by which Newton's method goes on."""
+    x = x[..., None]
+    rate, p = _rates(problem, x), x[:, 0]
+    taking = p > rate[:, 0] if problem.complementary else jnp.ones(p.shape, bool)
+    pull, bound = rate[:, 1:] - x[:, 1:], _bound(problem, x)
+    length = _length(pull)
+    sticks = (length <= bound) & _rubs(problem)
+    slides = ~sticks & (bound > 0)
+    direction = jnp.where(slides[:, None], _over(pull, length), 0.0)
+    return _turned(problem, _Modes(taking, sticks, direction, jnp.zeros_like(p)), x)
+
+
+def _search(problem: _FrictionProblem) -> tuple[_Modes, jax.Array, jax.Array]:
+    """Modes, x (m, b) and status of many contacts.
+
+    By attempts of interior points, the last one by projections where contacts may part, each
+    with Newton's method on the modes that it leads to.
+    """
+
+    def misfit(x: jax.Array) -> jax.Array:
+        """How far x is from the law."""
+        return _misfit(problem, x[..., None])[0]
+
+    def polish(x: jax.Array) -> jax.Array:
+        """A step of Newton's method on the modes of x; what is free in them stays as it is."""
+        matrix, right = (y[..., 0] for y in _equations(problem, _modes_at(problem, x)))
+        missed = (right - jnp.sum(matrix * x[None, None], axis=(2, 3)))[..., None]
+        return x + block_solve(matrix + _RIDGE * unit, missed)[..., 0]
+
+    def newton(state: tuple[jax.Array, Best, jax.Array]) -> tuple[jax.Array, Best, jax.Array]:
+        """One step, which may lead away for once."""
+        x = polish(state[0])
+        return x, better(misfit, state[1], x), state[2] + 1
+
+    def wrong(best: Best) -> jax.Array:
+        """Whether the law is not satisfied; also NaN."""
+        return ~(best.misfit <= problem.tolerance)
+
+    def attempt(state: tuple[Best, jax.Array]) -> tuple[Best, jax.Array]:
+        """The best so far, or what another attempt leads to."""
+        best, number = state
+        tried = within_cones(cones, misfit, number, problem.tolerance)
+        if problem.complementary:
+            last = number == ATTEMPTS
+            swept = _projected(problem, best.impulse, last)
+            tried = better(misfit, tried, jnp.where(last, swept, tried.impulse))
+        _, tried, _ = while_loop(
+            lambda s: wrong(s[1]) & (s[2] < _POLISHES),
+            newton,
+            (tried.impulse, tried, jnp.asarray(0)),
+        )
+        less = tried.misfit < best.misfit
+        return jax.tree.map(lambda a, b: jnp.where(less, a, b), tried, best), number + 1
+
+    unit = jnp.eye(problem.rate.size, dtype=problem.rate.dtype).reshape(problem.matrix.shape)
+    cones, none = cones_of(*problem), jnp.zeros_like(problem.rate)
+    start = Best(none, jnp.inf + 0 * jnp.sum(problem.rate)), jnp.asarray(0)
+    most = ATTEMPTS + 1 if problem.complementary else ATTEMPTS
+    best, _ = while_loop(lambda s: wrong(s[0]) & (s[1] < most), attempt, start)
+    status = jnp.where(wrong(best), CODE["max_steps"], CODE["ok"])
+    return _modes_at(problem, best.impulse), best.impulse, status
+
+
+def _projected(problem: _FrictionProblem, x: jax.Array, needed: jax.Array) -> jax.Array:
+    """What projections make of x (m, b), if they are `needed` ()."""
+    return solve_many(
+        lambda x: jnp.sum(problem.matrix * x[None, None], axis=(2, 3)),
+        jnp.ones_like(problem.rate),
+        problem.rate,
+        problem.friction,
+        x,
+        jnp.ones((), x.dtype),
+        problem.tolerance,
+        jnp.where(needed, max(_PROJECTIONS, _PROJECTIONS_EACH * len(x)), 0),
+        problem.load,
+    ).impulse
+
+
+# ------------------------------------------------------------------- known normal forces
+
+
+def distribute(
+    matrix: jax.Array, rate: jax.Array, limit: jax.Array, candidates: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Which `candidates` stick, and where the others slide to; normal forces are known.
+
+    Equation: `u' = rate + K lambda`, lambda in the discs |lambda_j| <= limit_j,
+    `lambda_j in -limit_j Sgn(u_j')`. This is a convex problem: u' is unique. A decision, without
+    derivatives: forces follow from the modes, to rounding.
+
+    Args:
+        matrix: K (t, t, B), positive semidefinite, t = m (planar) or 2 m, contact-major.
+        rate: (t, B) u' without the forces of these contacts.
+        limit: mu F (m, B).
+        candidates: (m, B); other contacts have no force here.
+
+    Returns:
+        Which contacts stick (m, B), and the directions (t, B) of slip of the others. A contact in
+        space that others hold on the rim of its disc counts as sliding, at speed 0, against its
+        force. Contacts are relaxed in turn, 200 times at most: of strongly coupled ones near the
+        rim (of random pairs with nearly equal tangents 3 %) the last to settle may be wrong.
+
+    >>> import jax
+    >>> import jax.numpy as jnp
+    >>> from jimpact.numerics.friction import distribute
+    >>> k, candidates = jnp.ones((2, 2, 1)), jnp.ones((2, 1), bool)  # both corners of a block
+    >>> problem = (k, jnp.full((2, 1), 1.5), jnp.array([[0.4], [0.6]]), candidates)
+    >>> stick, slip = jax.jit(distribute)(*problem)
+    >>> stick[:, 0].tolist(), jnp.sign(slip[:, 0]).tolist()
+    ([False, False], [1.0, 1.0])
+    """
+    matrix, rate, limit = jax.lax.stop_gradient((matrix, rate, limit))
+    rows = len(matrix) // len(limit)
+    limit = jnp.where(candidates, limit, 0.0)
+    each = jnp.repeat(candidates, rows, axis=0)
+    matrix = jnp.where(each[:, None] & each[None], matrix, 0.0)
+    rate = jnp.where(each, rate, 0.0)
+    force = _relaxed(matrix, rate, limit)
+    slip = rate + times(matrix, force)
+    stick = _lengths(force, rows) < (1 - _INSIDE) * limit
+    if rows == 1:
+        scale = jnp.max(jnp.abs(rate), axis=0, keepdims=True)
+        stick = stick | (jnp.abs(slip) <= _INSIDE * scale)
+    pushed = jnp.repeat(_lengths(force, rows) > 0, rows, axis=0)
+    return candidates & stick, jnp.where(pushed, -force, slip)
+
+
+def _lengths(force: jax.Array, rows: int) -> jax.Array:
+    """|lambda_j| (m, B) of tangential rows (t, B)."""
+    return jnp.sqrt(jnp.sum(force.reshape(-1, rows, *force.shape[1:]) ** 2, axis=1))
+
+
+def _relaxed(matrix: jax.Array, rate: jax.Array, limit: jax.Array) -> jax.Array:
+    """lambda (t, B) by projected Gauss-Seidel sweeps."""
+    m, (t, *batch) = len(limit), rate.shape
+    rows = t // m
+    least = _SETTLED * jnp.max(limit, axis=0, keepdims=True)
+    of_contacts = matrix.reshape(m, rows, t, *batch)
+    own = matrix[np.arange(t), np.arange(t)].reshape(m, rows, *batch)
+    stiffness = own[:, 0] if rows == 1 else own[:, 0] + own[:, 1]
+    stiffness = jnp.where(stiffness > 0, stiffness, 1.0)[:, None]  # no step is too long
+    State = tuple[jax.Array, jax.Array, jax.Array]
+
+    def relax(j: jax.Array, force: jax.Array) -> jax.Array:
+        """The force of contact j after a projected step."""
+        here = jax.lax.dynamic_slice_in_dim(force, rows * j, rows)
+        change = jax.lax.dynamic_slice_in_dim(rate, rows * j, rows) + times(of_contacts[j], force)
+        tried, most = here - change / stiffness[j], limit[j][None]
+        length = _lengths(tried, rows)
+        shrink = jnp.where(length > most, most / jnp.where(length > 0, length, 1.0), 1.0)
+        return jax.lax.dynamic_update_slice_in_dim(force, tried * shrink, rows * j, 0)
+
+    def sweep(state: State) -> State:
+        """All contacts once."""
+        before, _, count = state
+        force = fori_loop(0, m, relax, before)
+        return force, jnp.any(jnp.abs(force - before) > least), count + 1
+
+    start = (jnp.zeros_like(rate), jnp.any(limit > 0), jnp.asarray(0))
+    return while_loop(lambda s: s[1] & (s[2] < _RELAXATIONS), sweep, start)[0]

@@ -1,0 +1,245 @@
+"""Contacts with friction, in the plane and in space: interior points.
+
+With p = g a, p_t = h y, h / g = mu the disc |p_t| <= mu (p + load) is the cone |y| <= a + load.
+With the rates scaled alike, nu = g r and s -> h s, contact with friction is
+
+    a nu = 0                      a, nu >= 0                           (complementary)
+    Y o K = (Y . K, Y_0 K_t + K_0 Y_t) = 0,   Y = (a + load, y) and K = (kappa, s) in the cone
+
+where kappa = |s|. For `nu = g r + |s| - kappa` with a known |s| this would be a convex problem,
+which Mehrotra's predictor and corrector solve in a few iterations, however redundant the contacts
+and wherever slip turns to. |s| is that of the iteration before as long as contacts might still
+stick, and changes with s where they slide. Where r = 0 is prescribed, a contact that pulls has
+p = g (a - nu), a nu = 0. Interior points converge slowly where p = r = 0, so Newton's method on the
+modes ends it.
+
+Source: Acary, Cadoux, Lemarechal and Malick, ZAMM 91 (2011) 155-175, for the convex problem.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact.numerics.dense import block_solve
+from jimpact.tools.compiling import full_precision
+from jimpact.tools.loops import fori_loop, while_loop
+from jimpact.tools.precision import precision
+
+# Iterations of an attempt; 10 to 15 are usual. Ten times more: what diverges takes longer.
+_MOST = 25
+# Of the attempts: a contact counts as sliding whose |s|^2 is above this multiple of the mean of
+# a nu and Y . K. Ten times more: slower where contacts slide; ten times less: contacts that nearly
+# stick turn their slip in each iteration. 4 of 1 000 scenes of 4 to 12 contacts need the last one.
+_SLIDES = np.array([100.0, 1.0, 1e-4])
+ATTEMPTS = len(_SLIDES)
+# Misfit, as a part of the tolerance, at which Newton's method takes over after the first attempt
+# (which ends at the root of rounding). Ten times more: the modes are not yet right; ten times less:
+# contacts with p = r = 0 take all iterations.
+_CLOSER = 1e-2
+# Of the way to the boundary of the cones, what an iteration goes at most. Closer to 1: those that
+# follow have no room.
+_WITHIN = 0.99
+# Part of the mean of a nu and Y . K at least that an iteration aims at. Ten times more: slower; ten
+# times less: the last digits are those of rounding.
+_LEAST_AIM = 1e-6
+
+
+class Cones(NamedTuple):
+    """b = 1 + rows columns a contact; rates `constant + coupling x`, impulses `scale` x."""
+
+    coupling: jax.Array  # (m, b, m, b)
+    constant: jax.Array  # (m, b)
+    scale: jax.Array  # (m, b)
+    load: jax.Array  # (m,)
+    complementary: bool
+
+
+class _Inside(NamedTuple):
+    """A point inside the cones: a and nu (m,), y and s (m, rows), kappa (m,)."""
+
+    push: jax.Array
+    normal: jax.Array
+    side: jax.Array
+    bound: jax.Array
+    slip: jax.Array
+
+
+class Best(NamedTuple):
+    """The impulses (m, b) of the least misfit () so far."""
+
+    impulse: jax.Array
+    misfit: jax.Array
+
+
+def cones_of(
+    matrix: jax.Array,
+    rate: jax.Array,
+    friction: jax.Array,
+    load: jax.Array | None,
+    complementary: bool,
+) -> Cones:
+    """The scaled problem of A (m, b, m, b), rates (m, b), mu and load (m,)."""
+    large = jnp.maximum(friction, 1.0)
+    sides = jnp.repeat((friction / large)[:, None], rate.shape[1] - 1, axis=1)
+    scale = jnp.concatenate([1 / large[:, None], sides], axis=1)
+    coupling = matrix * scale[:, :, None, None] * scale[None, None]
+    pressed = jnp.zeros_like(friction) if load is None else load * large
+    return Cones(coupling, rate * scale, scale, pressed, complementary)
+
+
+@full_precision
+def within_cones(
+    cones: Cones, misfit: Callable[[jax.Array], jax.Array], attempt: jax.Array, tolerance: float
+) -> Best:
+    """Impulses x = (p, p_t) (m, b) of contacts with friction, by interior points.
+
+    Args:
+        cones: the problem, with a diagonal and rates of order 1.
+        misfit: how far x (m, b) is from the law ().
+        attempt: () number of the attempt; from ATTEMPTS on nothing is done.
+        tolerance: of the misfit.
+
+    Returns:
+        The x of the least misfit: that of the first attempt is close, others are closer.
+    """
+    first_close = precision(cones.constant.dtype).root
+    unit, none = jnp.ones_like(cones.load), jnp.zeros_like(cones.constant[:, 1:])
+    nan = 0 * jnp.sum(cones.constant)  # NaN where a rate is not finite
+    middle = _Inside(unit + nan, unit, none, unit, none)
+    slides = jnp.asarray(_SLIDES, unit.dtype)[attempt]
+    close = jnp.where(attempt == 0, first_close, _CLOSER * tolerance)
+    most = jnp.where(attempt < ATTEMPTS, _MOST, 0)
+
+    def iterate(state: tuple[_Inside, Best, jax.Array]) -> tuple[_Inside, Best, jax.Array]:
+        """One iteration."""
+        at = _corrected(cones, state[0], slides)
+        return at, better(misfit, state[1], _impulse(cones, at)), state[2] + 1
+
+    first = Best(_impulse(cones, middle), jnp.asarray(jnp.inf, unit.dtype) + nan)
+    start = middle, first, jnp.asarray(0)
+    return while_loop(lambda s: ~(s[1].misfit <= close) & (s[2] < most), iterate, start)[1]
+
+
+def better(misfit: Callable[[jax.Array], jax.Array], best: Best, x: jax.Array) -> Best:
+    """The impulses of less misfit."""
+    wrong = misfit(x)
+    less = wrong < best.misfit
+    return Best(jnp.where(less, x, best.impulse), jnp.where(less, wrong, best.misfit))
+
+
+def _impulse(cones: Cones, at: _Inside) -> jax.Array:
+    """x (m, b) in the units of the problem."""
+    return cones.scale * jnp.concatenate([_normal(cones, at)[:, None], at.side], axis=1)
+
+
+def _normal(cones: Cones, at: _Inside) -> jax.Array:
+    """Normal impulses (m,), that may pull where rates are prescribed."""
+    return at.push if cones.complementary else at.push - at.normal
+
+
+def _mean(cones: Cones, at: _Inside) -> jax.Array:
+    """The mean () of a nu and Y . K."""
+    cone = (at.push + cones.load) * at.bound + jnp.sum(at.side * at.slip, axis=1)
+    return jnp.mean(at.push * at.normal + cone) / 2
+
+
+def _corrected(cones: Cones, at: _Inside, slides: jax.Array) -> _Inside:
+    """The next point: a predictor shows how small a nu and Y . K may become at once.
+
+    Changes are affine in those of (p, y) and in the aim: arrays (.., n + 2) of the n coefficients,
+    what is constant, and the factor of the aim.
+    """
+    m, b = cones.constant.shape
+    n, mean = m * b, _mean(cones, at)
+    change, matrix, right = _linearized(cones, at, slides)
+    moves = block_solve(matrix, right).reshape(n, 2)
+
+    def ahead(aim: jax.Array) -> _Inside:
+        """The next point, if products shall be `aim` (), as far as the cones allow."""
+        way = jnp.concatenate([moves[:, 0] + aim * moves[:, 1], jnp.stack([1.0 + 0 * aim, aim])])
+        way = jax.tree.map(lambda form: jnp.tensordot(form, way, axes=1), change)
+        room = jnp.minimum(_room_in_cone(cones, at, way), _room_of_normals(at, way))
+        part = jnp.minimum(1.0, _WITHIN * room)
+        return jax.tree.map(lambda x, dx: x + part * dx, at, way)
+
+    def look(_: int, state: tuple[_Inside, jax.Array]) -> tuple[_Inside, jax.Array]:
+        """The point ahead with the aim of the state, and the aim that follows from it."""
+        point = ahead(state[1])
+        share = jnp.maximum(jnp.minimum(_mean(cones, point) / mean, 1.0) ** 2, _LEAST_AIM)
+        return point, share * mean
+
+    return fori_loop(0, 2, look, (at, jnp.zeros_like(mean)))[0]
+
+
+def _linearized(
+    cones: Cones, at: _Inside, slides: jax.Array
+) -> tuple[_Inside, jax.Array, jax.Array]:
+    """Changes of a point as affine forms, and their equations: a matrix (m, b, m, b), right sides
+    (m, b, 2) of what is constant and of the aim."""
+    m, b = cones.constant.shape
+    n = m * b
+    eye = jnp.eye(n + 2, dtype=cones.constant.dtype)
+    x, constant, aim = eye[:n].reshape(m, b, n + 2), eye[n][None], eye[n + 1][None]
+    rates = jnp.pad(cones.coupling.reshape(m, b, n), ((0, 0), (0, 0), (0, 2)))
+    own = jnp.concatenate([_normal(cones, at)[:, None], at.side], axis=1).reshape(n)
+    missed = cones.constant + jnp.tensordot(cones.coupling.reshape(m, b, n), own, axes=1)
+    speed = jnp.sqrt(jnp.sum(at.slip**2, axis=1))
+    turns = (speed / (speed**2 + slides * _mean(cones, at)))[:, None] * at.slip
+
+    def dot(values: jax.Array, forms: jax.Array) -> jax.Array:
+        """Sums over the tangents of a contact (m, n + 2)."""
+        return jnp.sum(values[..., None] * forms, axis=1)
+
+    side = x[:, 1:]
+    slip = rates[:, 1:] + (missed[:, 1:] - at.slip)[..., None] * constant[None]
+    product = aim - (at.push * at.normal)[:, None] * constant
+    if cones.complementary:
+        push = x[:, 0]
+    else:
+        both = (at.push + at.normal)[:, None]
+        push = (product + at.push[:, None] * x[:, 0]) / both
+    radius = at.push + cones.load
+    inner = radius * at.bound + jnp.sum(at.side * at.slip, axis=1)
+    bound = aim - inner[:, None] * constant - at.bound[:, None] * push
+    bound = (bound - dot(at.side, slip) - dot(at.slip, side)) / radius[:, None]
+    normal = rates[:, 0] + missed[:, 0, None] * constant
+    if cones.complementary:
+        off = speed - at.bound - at.normal
+        normal = normal + off[:, None] * constant + dot(turns, slip) - bound
+        first = at.push[:, None] * normal + at.normal[:, None] * push - product
+    else:
+        first, normal = normal, push - x[:, 0]
+    outer = radius[:, None] * at.slip + at.bound[:, None] * at.side
+    sides = radius[:, None, None] * slip + at.bound[:, None, None] * side
+    sides = sides + at.side[..., None] * bound[:, None] + at.slip[..., None] * push[:, None]
+    sides = sides + outer[..., None] * constant[None]
+    equations = jnp.concatenate([first[:, None], sides], axis=1)
+    matrix = equations[..., :n].reshape(m, b, m, b)
+    return _Inside(push, normal, side, bound, slip), matrix, -equations[..., n:]
+
+
+def _room_of_normals(at: _Inside, way: _Inside) -> jax.Array:
+    """How many times the change () can be added before an a or nu is 0."""
+    value = jnp.concatenate([at.push, at.normal])
+    falls = jnp.concatenate([way.push, way.normal]) / value
+    return jnp.min(jnp.where(falls < 0, -1 / jnp.where(falls < 0, falls, 1.0), jnp.inf))
+
+
+def _room_in_cone(cones: Cones, at: _Inside, way: _Inside) -> jax.Array:
+    """How many times the change () can be added before a Y or K leaves the cone.
+
+    With it turned into the middle of the cone, by a hyperbolic rotation.
+    """
+    first = jnp.concatenate([at.push + cones.load, at.bound])
+    side, change = (jnp.concatenate([x.side, x.slip]) for x in (at, way))
+    grows = jnp.concatenate([way.push, way.bound])
+    square = first**2 - jnp.sum(side**2, axis=1)
+    root = jnp.sqrt(jnp.maximum(square, precision(first.dtype).tiny))
+    first, side = first / root, side / root[:, None]
+    along = first * grows - jnp.sum(side * change, axis=1)
+    across = change - ((along + grows) / (1 + first))[:, None] * side
+    out = jnp.max((jnp.sqrt(jnp.sum(across**2, axis=1)) - along) / root)
+    return jnp.where(out > 0, 1 / jnp.where(out > 0, out, 1.0), jnp.inf)

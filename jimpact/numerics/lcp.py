@@ -1,0 +1,247 @@
+"""Linear complementarity: `0 <= z  _|_  A z + q >= 0`, differentiable, batched, singular A too.
+
+Lemke's method finds which z are positive, with derivatives switched off; one linear solve on that
+support then gives values and derivatives of any order. At a kink (a contact about to take an
+impulse or to give one up) the derivatives are those of one side.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jimpact.numerics.dense import null_projector, solve_by_pivots, solve_definite
+from jimpact.numerics.many_contacts import solve_many
+from jimpact.numerics.sparse import Sparse, conjugate_gradients
+from jimpact.numerics.tridiagonal import Symmetric, as_matrix, is_regular
+from jimpact.tools.compiling import full_precision
+from jimpact.tools.loops import while_loop
+from jimpact.tools.precision import precision
+from jimpact.tools.status import CODE
+
+# The matrix is scaled to a diagonal of 1 and q to a largest entry of 1. Entries below this times
+# eps m are rounding, and no pivots. Ten times more: small pivots of very light bodies are missed;
+# ten times less: pivots at the level of rounding spoil one in a thousand degenerate problems.
+_ROUNDING = 640.0
+_POWER = 2 / 3  # of eps: see `gathered_rounding`
+_PIVOTS = 10  # pivots allowed per unknown; 1 or 2 are usual
+
+# A sparse problem is solved by descent until it moves less than this many roundings, relative to
+# the largest q. Ten times more: velocities lose a digit.
+_DESCENT_ROUNDINGS = 256
+_DESCENTS = 100_000  # steps of descent at most; packings of 3000 spheres take some thousand
+
+
+class LCP(NamedTuple):
+    """`z` (m,) and `w = A z + q` (m,); `code`: ok, impulse_not_unique, infeasible, max_steps."""
+
+    z: jax.Array
+    w: jax.Array
+    code: jax.Array
+
+
+class _Tableau(NamedTuple):
+    rows: jax.Array  # (m, 2 m + 2): columns of w, z, the artificial variable, right-hand side
+    basis: jax.Array  # (m,) number of the variable that each row stands for
+    entering: jax.Array
+    ray: jax.Array
+    pivots: jax.Array
+
+
+@full_precision
+def solve_lcp(
+    matrix: Symmetric, q: jax.Array, *, symmetric: bool = True, regular: bool | None = None
+) -> LCP:
+    """Solve `0 <= z _|_ A z + q >= 0`.
+
+    Args:
+        matrix: A (m, m): symmetric positive semidefinite, stored in any way, or not symmetric
+            (`symmetric=False`) and such that Lemke's method applies (positive semidefinite,
+            copositive plus, P).
+        q: (m,).
+        symmetric: w is then unique; where z is not, the z of least norm (in the scaling that
+            makes the diagonal 1) is returned, with the code `impulse_not_unique`.
+        regular: A is known to be regular, which saves the search for its null space; None: as its
+            structure says.
+
+    Source: Lemke (1965); Cottle, Pang and Stone, The Linear Complementarity Problem (2009), 4.4.
+
+    >>> import jax.numpy as jnp
+    >>> from jimpact.numerics.lcp import solve_lcp
+    >>> solution = solve_lcp(jnp.array([[2.0, -1.0], [-1.0, 2.0]]), jnp.array([-1.0, 3.0]))
+    >>> [round(float(z), 6) for z in solution.z]
+    [0.5, 0.0]
+    """
+    if isinstance(matrix, Sparse):
+        return _solve_sparse(matrix, q)
+    regular = is_regular(matrix) if regular is None else regular
+    matrix = as_matrix(matrix)
+    diagonal = jax.lax.stop_gradient(jnp.diagonal(matrix))
+    scale = jnp.where(diagonal > 0, 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0)), 1.0)
+    a, b = matrix * scale[:, None] * scale[None, :], q * scale
+    largest = jax.lax.stop_gradient(jnp.abs(b).max())
+    size = jnp.where(largest > 0, largest, 1.0)
+    b = b / size
+    still = jax.lax.stop_gradient((a, b))
+    support, code = _support(*still)
+    z = _solve_on(support, a, -b, symmetric)
+    wrong = _wrong(*still, support, jax.lax.stop_gradient(z))
+    code = jnp.where((code == CODE["ok"]) & wrong, CODE["max_steps"], code)
+    if symmetric and not regular:
+        z, singular = _least_norm(a, b, z)
+        code = jnp.where(singular, jnp.maximum(code, CODE["impulse_not_unique"]), code)
+    z = jnp.where(z < 0, 0.0, z)  # only rounding is negative
+    w = jnp.where(support, 0.0, a @ z + b)
+    return LCP(z * scale * size, w / scale * size, code)
+
+
+def _solve_sparse(matrix: Sparse, q: jax.Array) -> LCP:
+    """As `solve_lcp` by products `A z` only, for A symmetric positive semidefinite.
+
+    Which of several z is returned is left to the descent. Values are those of the descent, and
+    derivatives those of the linear system on its support: where A is singular there, they are
+    right for `A z`, and NaN where not even that has any.
+    """
+    still, rate = jax.lax.stop_gradient((matrix, q))
+    tolerance = _DESCENT_ROUNDINGS * precision(q.dtype).eps
+    columns = still.diagonal[:, None], rate[:, None]
+    found = solve_many(
+        lambda z: (still @ z[:, 0])[:, None],
+        *columns,
+        friction=jnp.zeros_like(rate),
+        start=jnp.zeros_like(columns[1]),
+        inverse_step_size=jnp.ones_like(rate[0]),
+        tolerance=tolerance,
+        most=_DESCENTS,
+    )
+    z = jax.lax.stop_gradient(found.impulse[:, 0])
+    support = z > 0
+    scale = 1 / jnp.sqrt(still.diagonal)
+    a = matrix.scaled(scale).within(support)
+    solved = scale * conjugate_gradients(lambda x: a @ x, jnp.where(support, -q * scale, 0.0))
+    z = z + (solved - jax.lax.stop_gradient(solved))
+    # a vector that A makes nothing of, if there is one, has a part in nearly all others
+    other = jnp.where(support, jnp.cos(jnp.arange(1.0, len(q) + 1, dtype=q.dtype) ** 2), 0.0)
+    still_a = jax.lax.stop_gradient(a)
+    singular = jnp.any(jnp.isnan(conjugate_gradients(lambda x: still_a @ x, other)))
+    code = jnp.where(singular, CODE["impulse_not_unique"], CODE["ok"])
+    code = jnp.where(found.misfit > tolerance, CODE["max_steps"], code)
+    return LCP(z, jnp.where(support, 0.0, matrix @ z + q), code)
+
+
+def gathered_rounding(unknowns: int, dtype: Any) -> float:
+    """Rounding m eps^(2/3) that a whole run may gather.
+
+    A larger artificial variable left at its end means that there is no solution; a larger w means
+    that the contact is open.
+    """
+    return unknowns * precision(dtype).eps ** _POWER
+
+
+def _solve_on(
+    support: jax.Array, a: jax.Array, right: jax.Array, symmetric: bool = True
+) -> jax.Array:
+    """Solve `A_SS z_S = right_S`, z = 0 elsewhere."""
+    both = support[:, None] & support[None, :]
+    masked = jnp.where(both, a, jnp.eye(a.shape[0], dtype=a.dtype))
+    right = jnp.where(support, right, 0.0)
+    if symmetric:
+        return solve_definite(masked, right)
+    return solve_by_pivots(masked, right[:, None])[0][:, 0]
+
+
+def _least_norm(a: jax.Array, b: jax.Array, z: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The solution of least norm among those with the w of `z`, and whether there are several.
+
+    With P the projector on the null space of A where w = 0, they are `r + P y >= 0`, r = z - P z;
+    the least has `y >= 0`, complementary to r + P y: one more such problem.
+    """
+    m = b.shape[0]
+    w = jax.lax.stop_gradient(a @ z + b)
+    tight = w <= gathered_rounding(len(b), b.dtype)
+    both = tight[:, None] & tight[None, :]
+    projector, singular = null_projector(jnp.where(both, a, jnp.eye(m, dtype=b.dtype)))
+    rest = z - projector @ z
+    # rounding of `rest` at zero must not start pivots
+    noise = jnp.abs(rest) <= gathered_rounding(len(b), b.dtype) * jnp.abs(z).max()
+    support, _ = _support(projector, jnp.where(noise, 0.0, jax.lax.stop_gradient(rest)))
+    y = _solve_on(support, projector, -rest)
+    return jnp.where(singular, rest + projector @ y, z), singular
+
+
+def _rounding(unknowns: int, dtype: Any) -> float:
+    """Rounding in a tableau of Lemke's method."""
+    return _ROUNDING * precision(dtype).eps * unknowns
+
+
+def _wrong(a: jax.Array, b: jax.Array, support: jax.Array, z: jax.Array) -> jax.Array:
+    """Whether z or w has a wrong sign, or z is so large that the rounding of A z hides q."""
+    size, gathered = jnp.max(jnp.abs(z)), gathered_rounding(len(b), b.dtype)
+    noise = _rounding(len(b), b.dtype) * size  # of A z, where the largest q is 1
+    w = jnp.where(support, 0.0, a @ z + b)
+    signs = (z >= -gathered * jnp.maximum(1.0, size)) & (w >= -gathered - noise)
+    return ~(jnp.all(signs) & (noise < 1))  # True where z is NaN
+
+
+def _support(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Lemke's method: which z are basic at the end, and the status code."""
+    m, dtype = b.shape[0], b.dtype
+    tolerance = _rounding(m, dtype)
+    ones = jnp.ones((m, 1), dtype)
+    rows = jnp.concatenate([jnp.eye(m, dtype=dtype), -a, -ones, b[:, None]], axis=1)
+    artificial = 2 * m
+    start = _Tableau(
+        rows, jnp.arange(m), jnp.asarray(artificial), jnp.asarray(False), jnp.asarray(0)
+    )
+    # z = 0 solves it; else the artificial variable enters at the most negative row
+    needed = jnp.min(b) < -tolerance
+    first = _pivot(start, jnp.argmin(b))
+    limit = _PIVOTS * (m + 1)
+
+    def going(state: _Tableau) -> jax.Array:
+        """Whether the artificial variable is still basic."""
+        inside = jnp.any(state.basis == artificial)
+        return needed & inside & ~state.ray & (state.pivots < limit)
+
+    def one(state: _Tableau) -> _Tableau:
+        """One pivot, unless a ray shows that there is no solution."""
+        row, ray = _leaving(state, tolerance)
+        moved = _pivot(state, row)
+        chosen = jax.tree.map(lambda new, old: jnp.where(ray, old, new), moved, state)
+        return chosen._replace(ray=ray)
+
+    end = while_loop(going, one, first)
+    number = jnp.arange(m)
+    support = needed & jnp.any(end.basis[:, None] == (m + number)[None, :], axis=0)
+    left = jnp.max(jnp.where(end.basis == artificial, end.rows[:, -1], 0.0))
+    stuck = needed & (left > gathered_rounding(len(b), b.dtype))
+    reason = jnp.where(end.ray, CODE["infeasible"], CODE["max_steps"])
+    return support, jnp.where(stuck, reason, CODE["ok"])
+
+
+def _leaving(state: _Tableau, tolerance: float) -> tuple[jax.Array, jax.Array]:
+    """Row of the least ratio, and whether there is none.
+
+    No order among ties (lexicographic, say) changed any of over 80 000 degenerate problems; a cycle
+    would end as `max_steps`.
+    """
+    m = state.basis.shape[0]
+    column = state.rows @ (jnp.arange(2 * m + 2) == state.entering).astype(state.rows.dtype)
+    candidates = column > tolerance
+    ratio = jnp.where(candidates, state.rows[:, -1] / jnp.where(candidates, column, 1.0), jnp.inf)
+    return jnp.argmin(ratio), ~jnp.any(candidates)
+
+
+def _pivot(state: _Tableau, row: jax.Array) -> _Tableau:
+    """Exchange the entering variable with that of `row`; its complement enters next."""
+    m, dtype = state.basis.shape[0], state.rows.dtype
+    column = state.rows @ (jnp.arange(2 * m + 2) == state.entering).astype(dtype)
+    chosen = jnp.arange(m) == row
+    pivot_row = chosen.astype(dtype) @ state.rows
+    pivot_row = pivot_row / jnp.sum(jnp.where(chosen, column, 0.0))
+    eliminated = state.rows - column[:, None] * pivot_row[None, :]
+    rows = jnp.where(chosen[:, None], pivot_row[None, :], eliminated)
+    leaving = jnp.sum(jnp.where(chosen, state.basis, 0))
+    basis = jnp.where(chosen, state.entering, state.basis)
+    entering = jnp.where(leaving < m, leaving + m, leaving - m)
+    return _Tableau(rows, basis, entering, state.ray, state.pivots + 1)

@@ -1,0 +1,163 @@
+"""Unilateral contacts with friction by accelerated projections: only products `A x` are needed.
+
+The problem is that of `friction.solve`, complementary,
+
+    0 <= r _|_ p >= 0,    p_t in -mu p Sgn(s),    (r, s) = (a, b) + A x,   x = (p, p_t),
+
+for thousands of contacts, to a tolerance, without derivatives and without the search for further
+solutions. One iteration is a step against (r, s) and a projection onto p >= 0 and onto the discs
+|p_t| <= mu p; Nesterov's momentum, given up where it points uphill, makes some hundred of them
+enough for a pile.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact.tools.compiling import full_precision
+from jimpact.tools.loops import while_loop
+
+# Factors of the inverse step size, the estimate of the largest eigenvalue: where a step shows that
+# it is too small, and at the beginning of the next problem. Further from 1: short steps, or steps
+# taken back.
+STEEPER, RELAX = 1.5, 0.9
+# Discs grow and shrink with p: full momentum may go round and round among them. So there is less
+# of it in each quarter of the iterations.
+MOMENTUM = np.array([1.0, 0.9, 0.7, 0.5])
+
+
+class Many(NamedTuple):
+    """Impulses x (m, b), their misfit, iterations, the inverse step size at the end."""
+
+    impulse: jax.Array
+    misfit: jax.Array  # () over the largest rate, both scaled to a diagonal of 1
+    residual_velocity: jax.Array  # () [m/s] at most
+    iterations: jax.Array
+    inverse_step_size: jax.Array
+
+
+class _At(NamedTuple):
+    """An iteration."""
+
+    x: jax.Array
+    ax: jax.Array
+    y: jax.Array  # x with momentum
+    ay: jax.Array
+    weight: jax.Array
+    inverse_step_size: jax.Array
+    best: jax.Array  # x of the least misfit so far
+    misfit: jax.Array  # of `best`
+    tries: jax.Array
+
+
+@full_precision
+def solve_many(
+    product: Callable[[jax.Array], jax.Array],
+    diagonal: jax.Array,
+    rate: jax.Array,
+    friction: jax.Array,
+    start: jax.Array,
+    inverse_step_size: jax.Array,
+    tolerance: float,
+    most: Any,
+    load: jax.Array | None = None,
+) -> Many:
+    """Impulses x (m, b) of contacts with Coulomb friction, normals first (b = 1, 2, 3).
+
+    Args:
+        product: x -> A x (m, b); rows of contacts that take no part are 0.
+        diagonal: of A (m, b).
+        rate: (a, b) (m, b) [m/s].
+        friction: mu () or (m,).
+        start: x (m, b) to begin with.
+        inverse_step_size: estimate of the largest eigenvalue of A, scaled to a diagonal of 1.
+        tolerance: misfit at which it ends, of the largest of `rate`.
+        most: iterations, an int or ().
+        load: (m,) normal impulses in addition to p, which friction includes; None: 0.
+
+    Source: Nesterov (1983), O'Donoghue and Candes (2015) for the restart; Mazhar, Heyn, Negrut and
+    Tasora, ACM Trans. Graph. 34 (2015) for granular media (there the cone is convexified, which
+    opens contacts that slide; here it is not).
+
+    >>> import jax.numpy as jnp
+    >>> from jimpact.numerics.many_contacts import solve_many
+    >>> one = jnp.ones((1, 2))
+    >>> problem = (jnp.array([[-1.0, 3.0]]), jnp.array(0.5), 0 * one, jnp.array(1.0), 1e-6, 100)
+    >>> [round(float(x), 5) for x in solve_many(lambda x: x, one, *problem).impulse[0]]
+    [1.0, -0.5]
+    """
+    scale = _scale(diagonal)
+    # discs stay discs: all tangents of a contact have one scale
+    slope = friction * scale[:, 0] / scale[:, -1]
+    goal = rate * scale
+    carried = None if load is None else load / scale[:, 0]
+    size = jnp.max(jnp.abs(goal))
+
+    def times(x: jax.Array) -> jax.Array:
+        """A x, scaled."""
+        return scale * product(scale * x)
+
+    def going(at: _At) -> jax.Array:
+        """Whether the misfit is too large and iterations are left."""
+        return (at.misfit > tolerance * size) & (at.tries < most)
+
+    def iterate(at: _At) -> _At:
+        """One step against the rates, projected, and the momentum of the next one."""
+        x = _projected(at.y - (at.ay + goal) / at.inverse_step_size, slope, carried)
+        return _with_momentum(at, x, times(x), most)
+
+    x = _projected(start / scale, slope, carried) + 0 * size  # NaN where a rate is not finite
+    ax = times(x)
+    unit = jnp.ones((), x.dtype)
+    inverse_step_size = jnp.maximum(RELAX * inverse_step_size, unit)
+    begin = _At(x, ax, x, ax, unit, inverse_step_size, x, jnp.inf * unit, jnp.int32(0))
+    end = while_loop(going, iterate, begin)
+    relative = end.misfit / jnp.where(size > 0, size, 1.0)
+    residual = end.misfit * jnp.sqrt(jnp.max(diagonal))
+    return Many(end.best * scale, relative, residual, end.tries, end.inverse_step_size)
+
+
+def _scale(diagonal: jax.Array) -> jax.Array:
+    """Scale (m, b) of the impulses: one of each normal, one of the tangents of each contact."""
+    squares = jnp.concatenate(
+        [diagonal[:, :1], jnp.mean(diagonal[:, 1:], axis=1, keepdims=True)], axis=1
+    )
+    squares = jnp.where(squares > 0, squares, 1.0)
+    return 1 / jnp.sqrt(squares[:, jnp.minimum(jnp.arange(diagonal.shape[1]), 1)])
+
+
+def _projected(x: jax.Array, slope: jax.Array, load: jax.Array | None) -> jax.Array:
+    """The nearest normal impulses >= 0, and tangential ones (m, b - 1) in their discs."""
+    p = jnp.maximum(x[:, :1], 0.0)
+    side, bound = x[:, 1:], slope[:, None] * (p if load is None else p + load[:, None])
+    length = jnp.sqrt(jnp.sum(side**2, axis=1, keepdims=True))
+    shrink = jnp.where(length <= bound, 1.0, bound / jnp.where(length > 0, length, 1.0))
+    return jnp.concatenate([p, side * shrink], axis=1)
+
+
+def _with_momentum(at: _At, x: jax.Array, ax: jax.Array, most: Any) -> _At:
+    """The iteration after a projected step to x; a step that overshoots is taken back."""
+    step, bent = x - at.y, ax - at.ay
+    square = jnp.vdot(step, step)
+    long = jnp.vdot(step, bent) > at.inverse_step_size * square * (1 + 1e-9)
+    back = long | (jnp.vdot(step, x - at.x) < 0)
+    weight = (1 + jnp.sqrt(1 + 4 * at.weight**2)) / 2
+    allowed = jnp.asarray(MOMENTUM, x.dtype)[len(MOMENTUM) * at.tries // jnp.maximum(most, 1)]
+    gain = jnp.where(back, 0.0, jnp.minimum((at.weight - 1) / weight, allowed))
+    x, ax = jnp.where(long, at.x, x), jnp.where(long, at.ax, ax)
+    misfit = jnp.where(long, jnp.inf, at.inverse_step_size * jnp.max(jnp.abs(step)))
+    better = ~(misfit >= at.misfit)  # also NaN, which is then the result
+    return _At(
+        x,
+        ax,
+        x + gain * (x - at.x),
+        ax + gain * (ax - at.ax),
+        jnp.where(back, 1.0, weight),
+        jnp.where(long, STEEPER, 1.0) * at.inverse_step_size,
+        jnp.where(better, x, at.best),
+        jnp.where(better, misfit, at.misfit),
+        at.tries + 1,
+    )

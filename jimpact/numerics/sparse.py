@@ -1,0 +1,144 @@
+"""A symmetric matrix with few entries in each row, such as the Delassus matrix of a packing."""
+
+from collections.abc import Callable
+from functools import cached_property
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact.tools.compiling import full_precision
+from jimpact.tools.loops import while_loop
+from jimpact.tools.precision import precision
+
+# Residual over the right side at which conjugate gradients end, in roundings, and the one from
+# which on the system counts as having no solution, as a power of eps. Ten times more: derivatives
+# lose a digit; systems without a solution pass.
+_CONVERGED, _NO_SOLUTION = 1e3, 0.25
+# Iterations per unknown that conjugate gradients take at most; a packing of 3000 spheres takes .1.
+# Ten times more: a singular system takes ten times longer to be found.
+_MOST = 2
+
+
+class Neighbours:
+    """Contacts (m, 2) between two bodies each, and which contacts have a common body.
+
+    Body -1 is none (a wall). It is part of the structure of a program, not of its data, so it is
+    compared by its numbers.
+    """
+
+    def __init__(self, bodies: Any, count: int):
+        self.bodies = np.ascontiguousarray(bodies, np.int32)
+        self.count = count
+        self._key = self.bodies.tobytes(), count
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Neighbours) and self._key == other._key
+
+    @cached_property
+    def of_contacts(self) -> np.ndarray:
+        """Neighbours (m, K) of each contact, itself where it has fewer than K."""
+        of_body: list[list[int]] = [[] for _ in range(self.count)]
+        for contact, pair in enumerate(self.bodies):
+            for body in pair[pair >= 0]:
+                of_body[body].append(contact)
+        rows = [
+            sorted({other for body in pair[pair >= 0] for other in of_body[body]} - {contact})
+            for contact, pair in enumerate(self.bodies)
+        ]
+        table = np.tile(np.arange(len(rows))[:, None], (1, max(1, *map(len, rows))))
+        for row, others in zip(table, rows):
+            row[: len(others)] = others
+        return table
+
+    @cached_property
+    def shared(self) -> np.ndarray:
+        """Whether (m, K, 2, 2) body s of a contact is body t of its neighbour."""
+        own, other = self.bodies[:, None, :, None], self.bodies[self.of_contacts][:, :, None, :]
+        real = self.of_contacts != np.arange(len(self.bodies))[:, None]
+        return (own == other) & (own >= 0) & real[:, :, None, None]
+
+
+class Sparse(eqx.Module):
+    """Symmetric matrix: `diagonal` (m,), and entries (m, K) at the neighbours of each row."""
+
+    diagonal: jax.Array
+    entries: jax.Array
+    neighbours: Neighbours = eqx.field(static=True)
+
+    def __matmul__(self, vector: jax.Array) -> jax.Array:
+        """Product with a vector (m,)."""
+        return self.diagonal * vector + neighbour_sum(self.entries, vector, self.neighbours)
+
+    def __abs__(self) -> "Sparse":
+        """|A|, entry by entry."""
+        return Sparse(jnp.abs(self.diagonal), jnp.abs(self.entries), self.neighbours)
+
+    def as_matrix(self) -> jax.Array:
+        """The dense (m, m) matrix."""
+        rows = np.arange(len(self.diagonal))
+        dense = jnp.diag(self.diagonal)
+        return dense.at[rows[:, None], self.neighbours.of_contacts].add(self.entries)
+
+    def scaled(self, scale: jax.Array) -> "Sparse":
+        """`diag(scale) A diag(scale)`."""
+        entries = self.entries * scale[:, None] * scale[self.neighbours.of_contacts]
+        return Sparse(self.diagonal * scale**2, entries, self.neighbours)
+
+    def within(self, part: jax.Array) -> "Sparse":
+        """The matrix whose rows and columns outside `part` (m,) hold their diagonal only."""
+        both = part[:, None] & part[self.neighbours.of_contacts]
+        return Sparse(self.diagonal, jnp.where(both, self.entries, 0.0), self.neighbours)
+
+
+def neighbour_sum(entries: jax.Array, vector: jax.Array, neighbours: Neighbours) -> jax.Array:
+    """`sum_k a_jk x_n(j, k)` (m, ..) of entries (m, K, ..) and a vector (m, ..)."""
+    return jnp.sum(entries * vector[neighbours.of_contacts], axis=1)
+
+
+@full_precision
+def conjugate_gradients(product: Callable[[jax.Array], jax.Array], right: jax.Array) -> jax.Array:
+    """`A^-1 right` (m,) by products with A symmetric, positive semidefinite, of diagonal 1.
+
+    The solution of least norm where A is singular, NaN where there is none. Differentiable.
+    Source: Hestenes and Stiefel (1952).
+
+    >>> import jax.numpy as jnp
+    >>> from jimpact.numerics.sparse import conjugate_gradients
+    >>> halves = lambda x: 0.5 * x
+    >>> conjugate_gradients(halves, jnp.array([1.0, 2.0])).tolist()
+    [2.0, 4.0]
+    """
+    return jax.lax.custom_linear_solve(product, right, _iterated, symmetric=True)
+
+
+def _iterated(product: Callable[[jax.Array], jax.Array], right: jax.Array) -> jax.Array:
+    """As `conjugate_gradients`, without derivatives."""
+    eps = precision(right.dtype).eps
+    size = jnp.vdot(right, right)
+
+    def going(state: Any) -> jax.Array:
+        """Whether the residual is too large and iterations are left."""
+        _, _, _, square, done = state
+        return (square > (_CONVERGED * eps) ** 2 * size) & (done < _MOST * len(right) + 10)
+
+    def iterate(state: Any) -> Any:
+        """One step along a conjugate direction."""
+        x, residual, way, square, done = state
+        image = product(way)
+        curvature = jnp.vdot(way, image)
+        step = jnp.where(curvature > 0, square / jnp.where(curvature > 0, curvature, 1.0), 0.0)
+        residual = residual - step * image
+        new = jnp.vdot(residual, residual)
+        # a direction without curvature: A is singular, and no step reduces what is left
+        done = jnp.where(curvature > 0, done + 1, _MOST * len(right) + 10)
+        return x + step * way, residual, residual + new / square * way, new, done
+
+    start = jnp.zeros_like(right), right, right, size, jnp.int32(0)
+    x, _, _, square, _ = while_loop(going, iterate, start)
+    return jnp.where(square <= eps ** (2 * _NO_SOLUTION) * size, x, jnp.nan)

@@ -1,0 +1,662 @@
+"""One event-aligned stepper for every flow with modes: no step straddles a change of mode.
+
+LAYOUT   Rows first, batch last: state y (n, B), margins (k, B), modes (m, B) whole numbers;
+per-impact scalars have shape (1, B). One impact is a batch of one.
+
+PROTOCOL   A flow is a pytree of parameters (arrays (.., B)): see `Flow`. It defines `field`,
+`margins`, `switch`, `over` and a tolerance, and overrides the defaults that do not fit.
+
+ONE FORMULA FOR A STEP   Steps advance in xi with dt/dxi = N(xi) / R,
+
+    N = 2 xi where xi is a root, else 1;   R = dc_k/dt on landings, else 1.
+
+A landing on margin k runs from xi = c_k (or its root) to exactly 0 (M. Henon, On the numerical
+computation of Poincare maps, Physica D 5, 1982): no root is searched for, and the length of the
+step has derivatives. An event where a step begins is a landing of length 0; an
+explicit Runge-Kutta step of length 0 has the right derivatives up to its order, so there are no
+jump rules, also where events coincide.
+
+WHAT COMES NEXT   Each margin gets an intention (SHORTEN, LAND, AHEAD) and a distance in units of
+the step just tried; the most urgent one decides (`advance`).
+
+DERIVATIVES   In forward mode the state carries tangents (`tangents.py`); step sizes and events
+depend on values, not on tangents. `step_again` is an accepted step once more, with all decisions
+fixed.
+
+COMPILING costs some 20 ms a kernel, and a kernel starts at every shared root or quotient, every
+reduction, every array that a loop carries. So the field occurs once (a 13th stage with the weights
+b gives margins and their rates at the end of a step), and per-impact scalars are rows of two
+arrays, `Step.clock` and `StepperState.progress`.
+"""
+
+import abc
+import enum
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact.numerics.tableaux import DOP853
+from jimpact.numerics.tangents import Dual, dual_like, is_dual, pushforward, value_of
+from jimpact.tools.loops import cond, scan
+from jimpact.tools.precision import precision
+
+# Step-size control: a step is at most GROWTH times and at least SHRINK times the one before it, and
+# SAFETY times what its error allows. More growth or less safety: more rejected steps.
+GROWTH, SHRINK, SAFETY = 6.0, 0.2, 0.8
+# First step, in the time of the fastest contact, which cannot turn around so soon. Ten times more
+# could step over its first event.
+FIRST = 0.05
+# First rooted step after a contact has closed, as a part of the step before; ten times more:
+# rejected.
+RESTART = 0.1
+# Part of the way to an event that a step is shortened to where it cannot land on it. At 1 it ends
+# at the event and may step over it again.
+CUT = 0.7
+# A flow with `near` lands where the event is at most this many times `near` ahead, in steps. Such a
+# landing evaluates costly margins in each stage; ten times more makes it longer.
+REACH = 5
+# Part of a step's change of slope by which its minimum may lie lower than its cubic. Ten times
+# more: steps are shortened for margins that do not dip.
+DOUBT = 0.01
+# Step that cannot be distinguished from none, in the flow's own time; ten times more gives up
+# earlier.
+SHORTEST = 1e-13
+# Part of a step within which events are simultaneous, and are taken in the order of their rows. Ten
+# times more is still far below the tolerance.
+TIE = 1e-13
+# Passes per contact at the full local tolerance, which ordinary impacts end within. Then it falls
+# with the number of passes, or the errors of N steps would add up to N tolerances.
+FULL = 30
+# Newton steps to a root of the cubic of a step: from the chord they leave about 1e-3.
+POLISH = 2
+# The error is no less than this part of the third-order estimate squared. Ten times more: steps
+# half as long.
+COARSE = 0.3
+
+
+STAGES = len(DOP853.c)
+_TABLE = np.array([[*row, *[0.0] * (STAGES - len(row))] for row in (*DOP853.a, DOP853.b)])
+_NODES = np.array([*DOP853.c, 1.0])
+_WEIGHTS = np.array([DOP853.b, DOP853.error_high, DOP853.error_low])
+
+
+class Flow(abc.ABC):
+    """What the stepper integrates: a state y and modes whose changes are events."""
+
+    tolerance: jax.Array  # (1, B) error of a step
+    taking_part: jax.Array | int  # (1, B) contacts, without those that are open for good
+    longest: Any  # the longest step in the flow's own time that is stable, or inf
+
+    near: float = 0.0  # share of a step from which landings start, 0: from anywhere
+    # whether some impacts of a batch take many times the passes of others, and none pauses
+    queues: bool = False
+
+    @property
+    def driving(self) -> tuple[int, ...]:
+        """Sizes of the blocks of rows that the field depends on; () is one block."""
+        return ()
+
+    @property
+    def adding(self) -> tuple[int, ...]:
+        """Sizes of the blocks of rows that only add up; they come last."""
+        return ()
+
+    @property
+    @abc.abstractmethod
+    def zero_margin(self) -> jax.Array:
+        """Margins closer to 0 than this (1, B) count as 0."""
+
+    @abc.abstractmethod
+    def field(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
+        """Rates dy (n, B) in the flow's own time."""
+
+    @abc.abstractmethod
+    def margins(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
+        """Margins (k, B): each is >= 0 while its mode lasts."""
+
+    def margins_with_rates(
+        self, const: Any, modes: jax.Array, y: jax.Array, dy: jax.Array, target: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Margins and their rates (k, B) while y changes at the rates dy.
+
+        Those of the `target` of a landing have to be exact, others are looked at to predict events.
+        """
+        return jax.jvp(lambda z: self.margins(const, modes, z), (y,), (dy,))
+
+    @abc.abstractmethod
+    def switch(
+        self, modes: jax.Array, y: jax.Array, which: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Modes and state after the events `which` (k, B), one-hot."""
+
+    @abc.abstractmethod
+    def over(self, modes: jax.Array, y: jax.Array, passes: jax.Array) -> jax.Array:
+        """Whether (1, B) nothing is left to integrate."""
+
+    def constants(self, modes: jax.Array) -> Any:
+        """The parts of the field that do not change while the modes last."""
+        return None
+
+    def allowance(self, modes: jax.Array, y: jax.Array) -> jax.Array | float:
+        """Allowed error (n, B) of each row, in tolerances."""
+        return 1.0
+
+    def rooted(self, modes: jax.Array) -> jax.Array:
+        """Margins (k, B) whose root is the variable of a landing: by default none."""
+        return jnp.zeros((1, 1), bool)
+
+    def begins(self, before: jax.Array, after: jax.Array) -> jax.Array:
+        """Whether (1, B) forces start as a power of time: steps then advance in its root."""
+        return jnp.zeros((1, 1), bool)
+
+    def coasts(self, modes: jax.Array) -> jax.Array | None:
+        """Whether (1, B) the field is constant, so that steps of any length are exact; None: no."""
+        return None
+
+    def pauses(self, before: jax.Array, after: jax.Array, passes: jax.Array) -> jax.Array | None:
+        """Whether (1, B) the caller has to inspect the state after this pass; None: never."""
+        return None
+
+    def finish(self, modes: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Modes and state at the end of the impact, where `over` is True."""
+        return modes, y
+
+
+def total(x: jax.Array) -> jax.Array:
+    """Sum over the rows."""
+    return jnp.sum(x, axis=0, keepdims=True)
+
+
+def any_of(x: jax.Array) -> jax.Array:
+    """Whether any row."""
+    return jnp.any(x, axis=0, keepdims=True)
+
+
+def _rows(x: jax.Array) -> list[jax.Array]:
+    """The rows (1, B) of an array."""
+    return [x[i : i + 1] for i in range(len(x))]
+
+
+def put(buffer: jax.Array, value: jax.Array, index: jax.Array) -> jax.Array:
+    """The buffer with `value` in the row `index`."""
+    return jax.lax.dynamic_update_slice_in_dim(
+        buffer, value[None], index, 0, allow_negative_indices=False
+    )
+
+
+class Step(NamedTuple):
+    """A step without its state: enough to repeat it."""
+
+    modes: jax.Array  # (m, B)
+    target: jax.Array  # (k, B) one-hot: the margin it lands on; none: a step in time
+    clock: jax.Array  # (4, B): xi at the beginning, length, whether xi is a root, whether it lands
+
+
+class _StepVariable(NamedTuple):
+    """The variable xi of a step, (1, B) each."""
+
+    start: Any  # xi at the beginning
+    length: Any  # of the step in xi
+    rooted: Any  # whether xi is a root
+    zero_length: Any  # whether it is a landing on a margin that is 0
+
+
+def _frame(flow: Flow, s: Step, y: jax.Array) -> tuple[Any, jax.Array, _StepVariable]:
+    """Constants of the flow, margins (k, B) at the beginning, and the variable of the step."""
+    begun, h, in_root, lands = _rows(s.clock)
+    const = flow.constants(s.modes)
+    c0 = flow.margins(const, s.modes, y)
+    # a landing from a margin that is already 0 has length 0, and no root
+    root = flow.rooted(s.modes) & (c0 > flow.zero_margin)
+    xi0 = jnp.where(root, jnp.sqrt(jnp.where(root, c0, 1.0)), c0)
+    xi0 = total(jnp.where(s.target, xi0, 0.0))
+    rooted = total(jnp.where(s.target, root.astype(y.dtype), 0.0)) + in_root
+    start = jnp.where(lands > 0, xi0, begun)
+    # a margin that counts as 0 takes no time, however slow it is; its derivatives remain
+    zero_length = (lands > 0) & (jnp.abs(xi0) <= flow.zero_margin)
+    length = jnp.where(zero_length, jax.lax.stop_gradient(xi0) - xi0, jnp.where(lands > 0, -xi0, h))
+    return const, jax.lax.stop_gradient(c0), _StepVariable(start, length, rooted, zero_length)
+
+
+def _slopes(
+    flow: Flow,
+    const: Any,
+    frame: _StepVariable,
+    s: Step,
+    y: jax.Array,
+    stage: Any,
+    ends: np.ndarray,
+) -> tuple[list[jax.Array], tuple[jax.Array, jax.Array]]:
+    """dy/dxi in blocks of rows that end at `ends`, dt/dxi, margins and their rates, in a stage.
+
+    The stage is its number, its node, and the sum of slopes that leads to its state.
+    """
+    i, node, change = stage
+    lands = s.clock[3:4]
+    xi = frame.start + node * frame.length
+    now = y[: len(change)] + frame.length * change
+    dy = flow.field(const, s.modes, now)
+
+    def rates_of_margins() -> tuple[jax.Array, jax.Array]:
+        """Margins and their rates in the flow's own time."""
+        return flow.margins_with_rates(const, s.modes, now, dy[: len(now)], s.target)
+
+    if flow.near:  # of costly margins: steps in time need them at their ends only
+        needed = jnp.any(lands > 0) | (i == 0) | (i == STAGES)
+        none = jnp.zeros_like(s.target, now.dtype)
+        value, dc = cond(needed, rates_of_margins, lambda: (none, none))
+    else:
+        value, dc = rates_of_margins()
+    rate = total(jnp.where(s.target, dc, 0.0)) + (1 - lands)
+    rate = jnp.where(frame.zero_length & (rate == 0), jnp.inf, rate)
+    dt = (1 + frame.rooted * (2 * xi - 1)) / rate
+    rows = [dy[first:last] * dt for first, last in pairwise(ends)]
+    return [*rows, dt], jax.lax.stop_gradient((value, dc))
+
+
+def _stages(flow: Any, s: Step, y: Any, ends: bool) -> tuple[Any, ...]:
+    """Change of y and of time (n + 1, B); both estimates of its error (2, n, B); margins (k, B) at
+    the beginning, and where it `ends`: rates at the beginning, margins and rates at the end.
+
+    Where `flow` or y has tangents (see `tangents.py`) the change has some, too.
+    """
+    plain, state = value_of((flow, y))
+    n, dtype, batch = state.shape[0], state.dtype, state.shape[1:]
+    const, c0, frame = pushforward(lambda flow, y: _frame(flow, s, y), flow, y)
+    count = STAGES + 1 if ends else STAGES  # the 13th evaluation, that of the end, has no weight
+    adds = sum(plain.adding)
+    blocks = plain.driving or (n - adds,)
+    ends_of = np.cumsum([0, *blocks, *plain.adding])
+
+    def evaluate(i: jax.Array, node: jax.Array, change: Any) -> Any:
+        """New rows of both tables of slopes; margins and their rates."""
+        new, margins = pushforward(
+            lambda flow, const, frame, y, change: _slopes(
+                flow, const, frame, s, y, (i, node, change), ends_of
+            ),
+            *(flow, const, frame, y, change),
+        )
+        return (new[: len(blocks)], new[len(blocks) :]), margins
+
+    row = [dual_like((flow, y), jnp.zeros((1, k, *batch), dtype)) for k in (n - adds, adds + 1)]
+    stages = _scanned if jax.default_backend() == "cpu" else _written_out
+    tables, margins = stages(evaluate, row, count, jnp.zeros_like(s.target, dtype))
+    weights = jnp.asarray(np.pad(_WEIGHTS, ((0, 0), (0, count - STAGES))), dtype)
+    change, errors = _weighted(tables, weights, frame.length)
+    return change, errors[:, :n], c0, margins
+
+
+def _scanned(evaluate: Any, row: list[Any], count: int, none: jax.Array) -> tuple[Any, Any]:
+    """Slopes of all stages (count, k, B), two tables, from empty rows (1, k, B) of them; rates of
+    margins (k, B) in the first stage, margins and rates in the last, from `none`.
+
+    One kernel for all stages: it compiles quickly.
+    """
+    dtype = none.dtype
+    table = jnp.asarray(np.pad(_TABLE[:count], ((0, 0), (0, count - STAGES))), dtype)
+
+    def stage(carry: Any, at: Any) -> tuple[Any, None]:
+        """One evaluation of the field."""
+        slopes, added, first, *_ = carry
+        i, weights, node = at
+        change = jax.tree.map(lambda k: jnp.tensordot(weights, k, axes=1), slopes)
+        (new, new_added), (value, dc) = evaluate(i, node, change)
+        slopes, added = _with_row(slopes, new, i), _with_row(added, new_added, i)
+        return (slopes, added, jnp.where(i == 0, dc, first), value, dc), None
+
+    tables = jax.tree.map(lambda x: jnp.zeros((count, *x.shape[1:]), dtype), row)
+    each = (jnp.arange(count, dtype=jnp.uint32), table, jnp.asarray(_NODES[:count], dtype))
+    (slopes, added, *margins), _ = scan(stage, (*tables, none, none, none), each)
+    return [slopes, added], margins
+
+
+def _written_out(evaluate: Any, row: list[Any], count: int, none: jax.Array) -> tuple[Any, Any]:
+    """As `_scanned`, each stage with kernels of its own.
+
+    On a GPU the tables that a scan carries pass through memory in every stage, for twice the time
+    of an impact. On a CPU this is no faster, and compiles for two to four times as long.
+    """
+    tables: list[list[Any]] = [[], []]
+    margins = []
+    for i in range(count):
+        used = np.flatnonzero(_TABLE[i, :i])
+        change = jax.tree.map(lambda x: x[0], row[0])
+        if used.size:
+            change = jax.tree.map(
+                lambda *k, i=i, used=used: sum(float(_TABLE[i, j]) * x[0] for j, x in zip(used, k)),
+                *(tables[0][j] for j in used),
+            )
+        node = jnp.asarray(_NODES[i], none.dtype)
+        new, margin = evaluate(jnp.asarray(i, jnp.uint32), node, change)
+        for table, empty, part in zip(tables, row, new):
+            table.append(_with_row(empty, part, jnp.zeros((), jnp.uint32)))
+        margins.append(margin)
+    whole = [jax.tree.map(lambda *x: jnp.concatenate(x), *table) for table in tables]
+    return whole, (margins[0][1], *margins[-1])
+
+
+def _weighted(tables: list[Any], weights: jax.Array, length: Any) -> tuple[Any, jax.Array]:
+    """Change over a step (n + 1, B), and estimates of its error (2, n + 1, B), from all slopes."""
+    sums = [jnp.tensordot(weights, value_of(k), axes=1) for k in tables]
+    inner, outer = (
+        Dual(x[0], jnp.tensordot(weights[0], k.tangents, axes=1)) if is_dual(k) else x[0]
+        for x, k in zip(sums, tables)
+    )
+    change = pushforward(lambda h, *k: h * jnp.concatenate(k), length, inner, outer)
+    return change, value_of(length)[None] * jnp.concatenate([x[1:] for x in sums], axis=1)
+
+
+def _with_row(table: Any, new: list[Any], i: jax.Array) -> Any:
+    """The table with a new row of slopes, in blocks.
+
+    Each block of tangents is a kernel: one for all would compute them entry by entry.
+    """
+    value = value_of(table)
+    value = put(value, jnp.concatenate(value_of(new)), i)
+    if not is_dual(table):
+        return value
+    tangents, first, none = table.tangents, 0, jnp.zeros((), i.dtype)
+    for block in new:
+        if is_dual(block):  # else its tangents are 0
+            at = (i, jnp.asarray(first, i.dtype), none, none)
+            tangents = jax.lax.dynamic_update_slice(
+                tangents, block.tangents[None], at, allow_negative_indices=False
+            )
+        first += len(value_of(block))
+    return Dual(value, tangents)
+
+
+class Mark(enum.IntEnum):
+    """State of an impact: it goes on, is over, or waits until the caller has inspected it."""
+
+    GOES_ON = 0
+    OVER = 1
+    PAUSED = 2
+
+
+class Intention(enum.IntEnum):
+    """What the next step does about a margin, the most urgent first, and what its distance means.
+
+    The numbers leave a gap for distances from 0 to 1 between them: their sum is the order of
+    urgency.
+    """
+
+    SHORTEN = -2  # it dips, or cannot be landed on from here: at this part of the step
+    LAND = 0  # it vanishes at this part of the step: repeat the step as a landing on it
+    AHEAD = 1  # expected to vanish this many steps ahead: land on it if the next step reaches it
+
+
+class StepperState(NamedTuple):
+    """The state after a pass, and the step to try in the next one."""
+
+    y: Any  # (n, B), which may be `Dual`
+    step: Step  # the one to try
+    # (4, B): time it is expected to take; whether a landing already had to aim at another event;
+    # `Mark`; number of passes
+    progress: jax.Array
+
+
+def begin(flow: Any, modes: jax.Array, start: Any) -> StepperState:
+    """The state before the first pass.
+
+    The first step is short and advances in the root of time, as forces start as a power of it.
+    """
+    start = dual_like((flow, start), start)
+    flow, y = value_of((flow, start))
+    one = jnp.ones_like(y[:1])
+    clock = jnp.concatenate([0 * one, FIRST**0.5 * one, one, 0 * one])
+    targets = jax.eval_shape(lambda: flow.margins(flow.constants(modes), modes, y)).shape
+    step = Step(modes, jnp.zeros(targets, bool), clock)
+    over = flow.over(modes, y, 0 * one)
+    state = jnp.where(over, Mark.OVER, Mark.GOES_ON).astype(y.dtype)
+    return StepperState(start, step, jnp.concatenate([FIRST * one, 0 * one, state, 0 * one]))
+
+
+def goes_on(carry: StepperState, most: int) -> jax.Array:
+    """Impacts (1, B) that are neither over nor given up nor paused."""
+    return (carry.progress[2:3] == Mark.GOES_ON) & (carry.progress[3:4] < most)
+
+
+def advance(flow: Flow, state: StepperState, most: int) -> tuple[StepperState, jax.Array]:
+    """Try one step; accept it, or shorten it, or repeat it so that it ends at an event.
+
+    Returns the state for the next pass, and whether (1, B) the step was accepted.
+    """
+    duals, start, s = flow, state.y, state.step
+    flow, y = value_of((flow, start))
+    n = y.shape[0]
+    expected, aimed_twice, mark, passes = _rows(state.progress)
+    _, h, _, lands = _rows(s.clock)
+    change, errors, c0, (d0, c1, d1) = _stages(duals, s, start, ends=True)
+    error2 = _squared_error(flow, s, y, errors, passes)
+    ok = error2 <= 1
+    elapsed = value_of(change)[n:]  # the last row is time
+    duration = jnp.where(ok & (elapsed > 0), elapsed, expected)
+    slopes = d0 * duration, d1 * duration
+    urgent = _most_urgent(*_intentions(flow, s, aimed_twice, (c0, c1), slopes))
+    active = goes_on(state, most)
+    accept = ok & (urgent.intention == Intention.AHEAD) & active
+    landed = accept & (lands > 0)
+    events = s.target & landed  # one-hot
+    # the field has no value, however short the step: given up, and the status reports it
+    broken = active & ~(lands > 0) & ~(error2 < jnp.inf) & (h < SHORTEST)
+
+    def after(flow: Flow, y: jax.Array, change: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Modes and state after the step, where it is accepted."""
+        modes, end = flow.switch(s.modes, y + change[:n], events)
+        return modes, jnp.where(accept, end, jnp.where(broken, jnp.nan, y))
+
+    modes, end = pushforward(after, duals, start, change)
+    end = dual_like(start, end)
+    step, next_duration = _next_step(flow, s, modes, urgent, accept, error2, duration)
+    passes = passes + active.astype(y.dtype)
+    pauses = flow.pauses(s.modes, modes, passes)
+    mark = mark if pauses is None else jnp.where(active & pauses, Mark.PAUSED, mark)
+    over = flow.over(modes, value_of(end), passes) | broken
+    aimed_twice = (step.clock[3:4] > 0) & (lands > 0) & (urgent.intention < Intention.AHEAD)
+    mark = jnp.where(over, Mark.OVER, mark)
+    progress = jnp.concatenate([next_duration, aimed_twice.astype(y.dtype), mark, passes])
+    return StepperState(end, *jax.lax.stop_gradient((step, progress))), accept
+
+
+def _squared_error(
+    flow: Flow, s: Step, y: jax.Array, errors: jax.Array, passes: jax.Array
+) -> jax.Array:
+    """Hairer's error (1, B) of a step, squared, in tolerances."""
+    zero = precision(y.dtype)
+    full = FULL * flow.taking_part
+    local = jnp.maximum(flow.tolerance * (full / jnp.maximum(passes, full)), zero.noise)
+    scale = local * flow.allowance(s.modes, y) + zero.accumulated * jnp.abs(y)
+    fifth, third = (x[None] for x in jnp.max(jnp.abs(errors) / scale[None], axis=1))
+    # 0.01 is Hairer's; `tiny`: a landing of length 0 has no errors
+    error2 = fifth**4 / (fifth**2 + 0.01 * third**2 + zero.tiny)
+    # small by chance where the fifth order is: a landing from a maximum, a step of half a period
+    return jnp.maximum(error2, (COARSE * third**2 * local) ** 2)
+
+
+def _intentions(
+    flow: Flow,
+    s: Step,
+    aimed_twice: jax.Array,
+    values: tuple[jax.Array, jax.Array],
+    slopes: tuple[jax.Array, jax.Array],
+) -> tuple[jax.Array, jax.Array]:
+    """Intention and distance of each margin (k, B), from values and slopes at both ends of a step.
+
+    In units of the step, with v = 1 - u, a margin within the step is Hermite's cubic
+
+        c(u) = (c0 (1 + 2 u) + d0 u) v^2 + (c1 (1 + 2 v) - d1 v) u^2,
+
+    and at the distance w behind its end the parabola c1 + d1 w + (d1 - d0) w^2 / 2.
+    """
+    (c0, c1), (d0, d1) = values, slopes
+    zero, lands = flow.zero_margin, s.clock[3:4] > 0
+    free = ~s.target
+    crossed, turns = free & (c1 < -zero), free & (d0 < 0) & (d1 > 0) & (c0 > zero)
+    u = _place_within(flow, crossed, values, slopes)
+    v = 1 - u
+    minimum = (c0 * (1 + 2 * u) + d0 * u) * v * v + (c1 * (1 + 2 * v) - d1 * v) * u * u
+    dipped = turns & (minimum < DOUBT * (d1 - d0) - zero)
+    at_once = (c0 <= zero) & (d0 <= 0)
+    direct = at_once if flow.near else at_once | ((d0 < 0) & (c0 > zero))
+    direct = direct & (aimed_twice == 0)
+    # the parabola has no root where a margin only creeps towards 0
+    discriminant = d1 * d1 - 2 * (d1 - d0) * c1
+    ahead = free & ~turns & (d1 < 0) & (c1 > zero) & (discriminant > 0) & ~lands
+    w = 2 * c1 / (jnp.sqrt(jnp.where(ahead, discriminant, 1.0)) - jnp.where(ahead, d1, 0.0))
+    w = jnp.where(ahead, w, jnp.inf)
+    intention = jnp.where(dipped, Intention.SHORTEN, Intention.AHEAD)
+    intention = jnp.where(crossed, jnp.where(direct, Intention.LAND, Intention.SHORTEN), intention)
+    u = jnp.where(crossed & direct & at_once, 0.0, u)
+    return intention, jnp.where(crossed | dipped, u, w)
+
+
+def _place_within(
+    flow: Flow,
+    crossed: jax.Array,
+    values: tuple[jax.Array, jax.Array],
+    slopes: tuple[jax.Array, jax.Array],
+) -> jax.Array:
+    """Where u (k, B) in a step margins vanish if they have `crossed` 0, otherwise turn."""
+    (c0, c1), (d0, d1) = values, slopes
+    # the root of the chord c0 + (c1 - c0) u, or of the slope d0 + (d1 - d0) u
+    above = jnp.maximum(c0, 0.0)
+    part = jnp.where(crossed, above, -d0)
+    whole = jnp.where(crossed, c0 - c1, d1 - d0)
+    u = part / jnp.where(whole > 0, whole, jnp.inf)
+    # a margin that rises and falls back: the root of the parabola c0 + d0 u + (c1 - c0 - d0) u^2
+    rises = crossed & (d0 > 0)
+    bend = jnp.where(rises, above + d0 - c1, 1.0)
+    root = jnp.sqrt(jnp.where(rises, d0 * d0 + 4 * bend * above, 1.0))
+    u = jnp.where(rises, (d0 + root) / (2 * bend), u)
+    if flow.near:
+        # a step in time precedes the landing: dt/dxi is singular at the top of a parabola
+        u = jnp.where(crossed, _root_of_cubic(u, c0, d0, c1, d1), u)
+    return u
+
+
+class _Urgent(NamedTuple):
+    """The margin that decides about the next step."""
+
+    intention: jax.Array  # (1, B)
+    distance: jax.Array  # (1, B)
+    target: jax.Array  # (k, B) one-hot
+
+
+def _most_urgent(intention: jax.Array, distance: jax.Array) -> _Urgent:
+    """The least intention and, of equal ones, the least distance; ties go by the row."""
+    order = intention + distance + TIE * jnp.arange(len(distance), dtype=distance.dtype)[:, None]
+    first = jnp.min(order, axis=0, keepdims=True)
+    not_before = jnp.where(first <= Intention.AHEAD, Intention.LAND, Intention.AHEAD)
+    chosen = jnp.where(first < Intention.LAND, Intention.SHORTEN, not_before)
+    return _Urgent(chosen, first - chosen, order == first)
+
+
+def _next_step(
+    flow: Flow,
+    s: Step,
+    modes: jax.Array,
+    urgent: _Urgent,
+    accept: jax.Array,
+    error2: jax.Array,
+    duration: jax.Array,
+) -> tuple[Step, jax.Array]:
+    """The step to try after `s`, and the time it is expected to take (1, B).
+
+    `duration` is the time that `s` takes, `error2` its error in tolerances, squared.
+    """
+    start, length, in_root, lands = _rows(s.clock)
+    ok, event, lands = error2 <= 1, urgent.intention < Intention.AHEAD, lands > 0
+    in_root = (in_root > 0) & ~lands
+    start = jnp.where(in_root, start + jnp.where(accept, length, 0.0), 0.0)
+    shorter = _shorter_length(flow, s, in_root, urgent, ok, duration)
+    at_event = jnp.where(urgent.intention == Intention.SHORTEN, shorter, length)
+    after_landing = jnp.where(ok, length, shorter)
+    proposed = jnp.where(lands, after_landing, _length_from_error(length, error2))
+    proposed = jnp.where(ok & event, at_event, proposed)
+    closed = accept & flow.begins(s.modes, modes)
+    in_root, start = in_root | closed, jnp.where(closed, 0.0, start)
+    proposed = _restart_in_root(closed, duration, proposed)
+    proposed = jnp.where(in_root, proposed, jnp.minimum(proposed, flow.longest))
+    # xi is the root of time: from `start` on a step takes this long
+    expected = jnp.where(in_root, (start + proposed) ** 2 - start**2, proposed)
+    reached = _reaches_event(flow, s.modes, urgent.distance, duration, expected)
+    aim = ok & jnp.where(event, urgent.intention == Intention.LAND, ~lands & reached)
+    proposed = jnp.where(aim & in_root, expected, proposed)
+    in_root = in_root & ~aim
+    flags = [x.astype(length.dtype) for x in (in_root, aim)]
+    step = Step(modes, aim & urgent.target, jnp.concatenate([start, proposed, *flags]))
+    return step, jnp.where(aim, urgent.distance * duration, expected)
+
+
+def _length_from_error(length: jax.Array, error2: jax.Array) -> jax.Array:
+    """The length (1, B) at which the error would be SAFETY^8 tolerances, as error ~ length^8."""
+    # four roots: error^(1/8) = error2^(1/16); 1e-20 keeps it from 0, far beyond GROWTH
+    eighth_root = jnp.sqrt(jnp.sqrt(jnp.sqrt(jnp.sqrt(error2 + 1e-20))))
+    factor = jnp.clip(SAFETY / eighth_root, SHRINK, GROWTH)
+    return jnp.where(error2 < jnp.inf, factor, SHRINK) * length
+
+
+def _shorter_length(
+    flow: Flow, s: Step, in_root: jax.Array, urgent: _Urgent, ok: jax.Array, duration: jax.Array
+) -> jax.Array:
+    """The length (1, B) that ends before an event, or half of the time of a failed landing."""
+    part = 1 - flow.near if flow.near else CUT
+    cut = jnp.where(ok & (urgent.intention == Intention.SHORTEN), part * urgent.distance, 0.5)
+    length, lands = s.clock[1:2], s.clock[3:4] > 0
+    # a landing is not in time: the shorter step is
+    return jnp.where(in_root, jnp.sqrt(cut) * length, cut * jnp.where(lands, duration, length))
+
+
+def _restart_in_root(closed: jax.Array, duration: jax.Array, length: jax.Array) -> jax.Array:
+    """The length (1, B), but of the first step after a contact has `closed` in the root of time."""
+    restart = jnp.sqrt(jnp.minimum(RESTART * duration, FIRST))
+    return jnp.where(closed & (restart > 0), restart, length)
+
+
+def _reaches_event(
+    flow: Flow, modes: jax.Array, distance: jax.Array, duration: jax.Array, expected: jax.Array
+) -> jax.Array:
+    """Whether (1, B) the next step, of this expected time, shall land on the event ahead."""
+    reached = distance * duration < expected
+    coasts = flow.coasts(modes)
+    if coasts is not None:
+        reached = reached | (coasts & (distance < jnp.inf))
+    return reached & (distance < REACH * flow.near) if flow.near else reached
+
+
+def _root_of_cubic(
+    u: jax.Array, c0: jax.Array, d0: jax.Array, c1: jax.Array, d1: jax.Array
+) -> jax.Array:
+    """The root in [0, 1] near u of the cubic with values c and slopes d at 0 and 1."""
+    rise = c1 - c0
+    a, b = d0 - rise, rise - d1
+    for _ in range(POLISH):
+        v = 1 - u
+        bend = v * a + u * b
+        value = v * c0 + u * c1 + u * v * bend
+        slope = rise + (v - u) * bend + u * v * (b - a)
+        u = jnp.clip(u - value / jnp.where(slope < 0, slope, -jnp.inf), 0.0, 1.0)
+    return u
+
+
+def between(flow: Flow, s: Step, y: jax.Array, ahead: jax.Array) -> jax.Array:
+    """The state within the step from y at `ahead` (1, B) after it, in the flow's own time."""
+    begun, in_root, lands = s.clock[:1], s.clock[2:3], s.clock[3:4]
+    in_root = in_root * (1 - lands)
+    begun = begun * in_root
+    reached = begun**2 + ahead
+    positive = reached > 0
+    root = jnp.where(positive, jnp.sqrt(jnp.where(positive, reached, 1.0)), 0.0)
+    h = jnp.where(in_root > 0, root - begun, ahead)
+    clock = jnp.concatenate([begun, h, in_root, jnp.zeros_like(h)])
+    return step_again(flow, Step(s.modes, jnp.zeros_like(s.target), clock), y)
+
+
+def step_again(flow: Flow, s: Step, y: jax.Array) -> jax.Array:
+    """The state after an accepted step, as a smooth function of `flow` and `y`."""
+    change, *_ = _stages(flow, s, y, ends=False)
+    return y + change[:-1]

@@ -1,0 +1,97 @@
+"""Dual numbers with many tangents: all directions D of a derivative at one point.
+
+`vmap` over the directions would put their axis first, before the stages of a step, and every sum
+over stages would transpose the whole table of slopes. Here values are (.., B) and their tangents
+(.., D, B). A loop is written once, for values alone or with tangents; its body calls `pushforward`.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.custom_derivatives import SymbolicZero
+
+from jimpact.tools.loops import varying_like
+
+TANGENT_AXIS = -2  # the axis of the directions
+
+
+class Dual(NamedTuple):
+    """A value (.., B) with its tangents (.., D, B)."""
+
+    value: jax.Array
+    tangents: jax.Array
+
+
+def is_dual(x: Any) -> bool:
+    """Whether x has tangents."""
+    return isinstance(x, Dual)
+
+
+def value_of(tree: Any) -> Any:
+    """The tree with each `Dual` replaced by its value."""
+    return jax.tree.map(lambda x: x.value if is_dual(x) else x, tree, is_leaf=is_dual)
+
+
+def pushforward(function: Callable[..., Any], *args: Any) -> Any:
+    """`function(*args)`; results that depend on a leaf that is a `Dual` are `Dual`, too."""
+    leaves, tree = jax.tree.flatten(args, is_leaf=is_dual)
+    duals = [i for i, x in enumerate(leaves) if is_dual(x)]
+    if not duals:
+        return function(*args)
+    depends: list[bool] = []  # of each result, whether it depends on a dual
+    trees: list[Any] = []  # the tree of the results
+
+    @jax.custom_jvp
+    def observed(results: list[jax.Array]) -> list[jax.Array]:
+        """The results as they are; its rule notes which of them have tangents."""
+        return results
+
+    def note(results: Any, tangents: Any) -> tuple[Any, Any]:
+        """A tangent that is known to be 0 is symbolic."""
+        depends[:] = [
+            is_smooth(x) and not isinstance(t, SymbolicZero)
+            for x, t in zip(results[0], tangents[0])
+        ]
+        return results[0], tangents[0]
+
+    observed.defjvp(note, symbolic_zeros=True)
+
+    def of_values(*values: jax.Array) -> list[Any]:
+        """Leaves of the results, from the values of the duals."""
+        replaced = dict(zip(duals, values))
+        args = jax.tree.unflatten(tree, [replaced.get(i, x) for i, x in enumerate(leaves)])
+        results, result_tree = jax.tree.flatten(function(*args))
+        trees[:] = [result_tree]
+        depends[:] = [False] * len(results)
+        return observed([jnp.asarray(x) for x in results])
+
+    values = tuple(leaves[i].value for i in duals)
+
+    def push(*tangents: jax.Array) -> tuple[list[jax.Array], list[jax.Array]]:
+        """Results, and tangents of those that depend on a dual, in one direction."""
+        results, rates = jax.jvp(of_values, values, tangents)
+        return results, [rate for rate, needed in zip(rates, depends) if needed]
+
+    directions = (leaves[i].tangents for i in duals)
+    results, found = jax.vmap(push, TANGENT_AXIS, (None, TANGENT_AXIS))(*directions)
+    rates = iter(found)
+    return jax.tree.unflatten(
+        trees[0], [Dual(x, next(rates)) if needed else x for x, needed in zip(results, depends)]
+    )
+
+
+def is_smooth(x: Any) -> bool:
+    """Whether x is an array, or a shape, of floating-point numbers: it may have tangents."""
+    return bool(jnp.issubdtype(x.dtype, jnp.floating))
+
+
+def dual_like(tree: Any, x: jax.Array | Dual) -> Any:
+    """x with tangents of 0 if a leaf of the tree is a `Dual`, otherwise x."""
+    duals = [leaf for leaf in jax.tree.leaves(tree, is_leaf=is_dual) if is_dual(leaf)]
+    if not duals or isinstance(x, Dual):
+        return x
+    directions = duals[0].tangents.shape[TANGENT_AXIS]
+    none = jnp.zeros((*x.shape[:-1], directions, x.shape[-1]), x.dtype)
+    return Dual(x, varying_like(none, duals))

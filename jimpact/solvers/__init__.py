@@ -1,1 +1,0 @@
-"""Solvers of contact problems: complementarity, friction, linear systems."""

@@ -1,0 +1,1 @@
+"""Tools that know no mechanics: checks of arguments, compiling, tables, progress, statuses."""

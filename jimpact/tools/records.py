@@ -1,0 +1,263 @@
+"""Results as data for a JSON file, and as tables: in text, CSV and pandas."""
+
+import csv
+import dataclasses
+import io
+import shutil
+import textwrap
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from jimpact.tools.checks import needed
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure  # which takes long to import
+
+_LEAST_WIDTH = 20  # characters of a column whose text is wrapped; narrower ones are not readable
+
+
+def as_data(value: Any) -> Any:
+    """Records, arrays and mappings as what a JSON file can hold; numbers not finite are None.
+
+    >>> import numpy as np
+    >>> from jimpact.tools.records import as_data
+    >>> as_data({"velocity": np.array([1.0, np.nan]), "bodies": (1, 2)})
+    {'velocity': [1.0, None], 'bodies': [1, 2]}
+    """
+    if hasattr(value, "to_dict"):
+        return value.to_dict()
+    if hasattr(value, "_asdict"):
+        value = value._asdict()
+    elif dataclasses.is_dataclass(value):
+        value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    elif hasattr(value, "__array__"):
+        value = np.asarray(value).tolist()
+    if isinstance(value, Mapping):
+        return {key: as_data(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [as_data(each) for each in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def fields_as_data(record: Any, *left_out: str) -> dict[str, Any]:
+    """The fields of a record but for those left out, see `as_data`."""
+    return {name: as_data(x) for name, x in vars(record).items() if name not in left_out}
+
+
+def number(value: float | None, form: str) -> str:
+    """The number in this format, '' for None and NaN.
+
+    >>> from jimpact.tools.records import number
+    >>> number(0.25, ".1f"), number(float("nan"), ".1f"), number(None, ".1f")
+    ('0.2', '', '')
+    """
+    return "" if value is None or np.isnan(value) else format(value, form)
+
+
+def microseconds(time: float | None) -> str:
+    """A time [s] in microseconds, '' for None.
+
+    >>> from jimpact.tools.records import microseconds
+    >>> microseconds(1.234e-5)
+    '12.3'
+    """
+    return number(None if time is None else 1e6 * time, ".3g")
+
+
+def listed(labels: Sequence[str], most: int = 6) -> str:
+    """The first labels of a list, and whether there are more.
+
+    >>> from jimpact.tools.records import listed
+    >>> listed(["1", "2"]), listed("abcd", 3)
+    ('1, 2', 'a, b, c, ...')
+    """
+    return ", ".join([*labels[:most], *(["..."] if len(labels) > most else [])])
+
+
+def readable_unit(unit: str, largest: float) -> tuple[str, float]:
+    """The multiple of an SI unit in which a quantity has 1 to 3 digits before the point, its size.
+
+    >>> from jimpact.tools.records import readable_unit
+    >>> readable_unit("m", 3e-5), readable_unit("s", 2.0)
+    (('µm', 1e-06), ('s', 1.0))
+    """
+    sizes = {unit: 1.0, f"m{unit}": 1e-3, f"µ{unit}": 1e-6, f"n{unit}": 1e-9}
+    return next((row for row in sizes.items() if largest >= row[1]), (f"n{unit}", 1e-9))
+
+
+def with_error(value: float, error: float) -> str:
+    """A value and its standard error, to the digits that count.
+
+    >>> from jimpact.tools.records import with_error
+    >>> with_error(0.99123, 0.0042), with_error(131.7, 18.2), with_error(0.4, 0.0)
+    ('0.991 ± 0.004', '132 ± 18', '0.4 ± 0')
+    """
+    if not 1e-9 * abs(value) < error < np.inf:
+        return f"{value:.6g} ± {error:.2g}"
+    power = int(np.floor(np.log10(error)))
+    digits = max(0, -power + (error < 2 * 10.0**power))  # two digits of an error that begins with 1
+    return f"{value:.{digits}f} ± {error:.{digits}f}"
+
+
+def table(
+    heads: Sequence[str], rows: Iterable[Sequence[str]], left: Sequence[str] = (), keys: int = 1
+) -> list[str]:
+    """Lines of a table; the first column and those with a head in `left` are text, others numbers.
+
+    On a terminal that is too narrow the columns are split into several tables, one below the other,
+    each with the first `keys` columns; text at the end of a line is wrapped.
+
+    >>> from jimpact.tools.records import table
+    >>> table(["law", "e", "status"], [["newton", "0.5", "ok"]], left=["status"])
+    ['law       e  status', 'newton  0.5  ok']
+    """
+    whole = [list(heads), *map(list, rows)]
+    widths = [max(map(len, column)) for column in zip(*whole)]
+    is_text = [i == 0 or head in left for i, head in enumerate(heads)]
+    room = shutil.get_terminal_size((sum(widths) + 2 * len(widths), 0)).columns  # no terminal: all
+    lines: list[str] = []
+    for part in _parts(widths, keys, room):
+        lines += [""] if lines else []
+        before = sum(widths[i] + 2 for i in part[:-1])
+        for row in whole:
+            cells = (
+                row[i].ljust(widths[i]) if is_text[i] else row[i].rjust(widths[i]) for i in part
+            )
+            line = "  ".join(cells).rstrip()
+            wrapped = is_text[part[-1]] and len(line) > room > before + _LEAST_WIDTH
+            lines += (
+                textwrap.wrap(line, room, subsequent_indent=" " * before) if wrapped else [line]
+            )
+    return lines
+
+
+class Column(NamedTuple):
+    """A column: its name in data and CSV, head and unit in print, and the form of its numbers.
+
+    `form`: as of `format`, or a function of the value. Text stands on the left.
+    """
+
+    name: str
+    form: str | Callable[[Any], str] = ""
+    head: str = ""
+    unit: str = ""
+
+    @property
+    def title(self) -> str:
+        """The head with its unit."""
+        return (self.head or self.name) + (f" [{self.unit}]" if self.unit else "")
+
+    def cell(self, value: Any) -> str:
+        """A value as it is printed; '' for None and NaN, unless `form` is a function."""
+        if callable(self.form):
+            return self.form(value)
+        return "" if value is None or value != value else format(value, self.form)
+
+
+@dataclasses.dataclass(frozen=True)
+class Table:
+    """Rows of values under columns; `print` leaves out columns that are empty.
+
+    Attributes:
+        columns: the columns.
+        rows: a value for each column; None or NaN: an empty cell.
+        head: lines above.
+        notes: lines below.
+        keys: how many columns are repeated where a terminal is too narrow for one table.
+
+    >>> from jimpact.tools.records import Column, Table
+    >>> columns = Column("law"), Column("e", ".2f"), Column("time_s", "g", "time", "s")
+    >>> print(Table(columns, [("newton", 0.5, None)], notes=["One law."]))
+    law        e
+    newton  0.50
+    One law.
+    """
+
+    columns: Sequence[Column]
+    rows: Sequence[Sequence[Any]]
+    head: Sequence[str] = ()
+    notes: Sequence[str] = ()
+    keys: int = 1
+
+    def __str__(self) -> str:
+        """The table with its head and notes."""
+        cells = [[c.cell(x) for c, x in zip(self.columns, row)] for row in self.rows]
+        used = [i for i in range(len(self.columns)) if any(row[i] for row in cells)]
+        text = [any(isinstance(x, str) for x in column) for column in zip(*self.rows)]
+        left = [c.title for c, is_text in zip(self.columns, text) if is_text]
+        titles = [self.columns[i].title for i in used]
+        rows = [[row[i] for i in used] for row in cells]
+        lines = table(titles, rows, left, self.keys) if rows else []
+        return "\n".join([*self.head, *lines, *self.notes])
+
+    def to_dict(self) -> list[dict[str, Any]]:
+        """A mapping by column for each row, as a JSON file can hold it."""
+        return [as_data({c.name: x for c, x in zip(self.columns, row)}) for row in self.rows]
+
+    def to_csv(self, path: str | Path | None = None) -> str:
+        """Lines of a CSV file, also written to the path; what is None or NaN is an empty cell."""
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow([c.name for c in self.columns])
+        writer.writerows([[None if x != x else x for x in row] for row in self.rows])
+        if path is not None:
+            Path(path).write_text(text.getvalue(), encoding="utf-8")
+        return text.getvalue().rstrip("\n")
+
+    def to_pandas(self) -> Any:
+        """A pandas `DataFrame`."""
+        pandas = needed("pandas", "pip install pandas")
+        return pandas.DataFrame(list(self.rows), columns=[c.name for c in self.columns])
+
+
+class Tabular:
+    """A result whose main part is a table: it prints, exports and draws itself."""
+
+    picture = ""  # its function in `ji.plot`
+
+    @property
+    def table(self) -> Table:
+        """The result as a `Table`."""
+        raise NotImplementedError
+
+    def __str__(self) -> str:
+        """The table."""
+        return str(self.table)
+
+    def to_csv(self, path: str | Path | None = None) -> str:
+        """The table as CSV, see `Table`."""
+        return self.table.to_csv(path)
+
+    def to_pandas(self) -> Any:
+        """The table as a pandas `DataFrame`."""
+        return self.table.to_pandas()
+
+    def plot(self, title: str = "") -> "Figure":
+        """The result's picture of `ji.plot`."""
+        if not self.picture:
+            raise TypeError(f"{type(self).__name__} has no picture, only a `table`.")
+        import jimpact.plot  # late: matplotlib takes long to import
+
+        return getattr(jimpact.plot, self.picture)(self, title=title)
+
+
+def _parts(widths: Sequence[int], keys: int, room: int) -> list[list[int]]:
+    """Columns of tables side by side that fit the room, each with the first `keys`.
+
+    >>> from jimpact.tools.records import _parts
+    >>> _parts([6, 6, 6, 6], 1, 22), _parts([6, 60], 1, 22)
+    ([[0, 1, 2], [0, 3]], [[0, 1]])
+    """
+    first = list(range(keys))
+    parts = [list(first)]
+    for i in range(keys, len(widths)):
+        longer = [*parts[-1], i]
+        fits = sum(widths[j] + 2 for j in longer) - 2 <= room
+        if not fits and parts[-1] != first:
+            parts.append([*first, i])
+        else:
+            parts[-1] = longer
+    return parts
