@@ -4,8 +4,7 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
-from jimpact.fits.report import load_fit
-from jimpact.fits.uncertainty import Fit
+from jimpact.fits.report import Fit, load_fit
 from jimpact.motion.record import Motion, read_motion
 
 

@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import jimpact as ji
+from jimpact.fits.report import Fit
 from jimpact.fits.search import FitMinimum
-from jimpact.fits.uncertainty import Fit
 from jimpact.laws.histories import History
 from jimpact.motion.record import KIND_CODE, Motion, no_events, with_row
 

@@ -1,6 +1,6 @@
 """The closed contacts of many bodies: a grid finds those that are near each other."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -15,13 +15,10 @@ from jimpact.bodies.closed_pairs import (
 )
 from jimpact.bodies.distances import any_pair, round_on_round
 from jimpact.bodies.neighbours import Candidates, all_pairs, crowd_of, near_pairs
-from jimpact.bodies.rigid import ContactPoints, tangents_of
+from jimpact.bodies.rigid import ContactPoints, Placed, Shape, tangents_of
 from jimpact.bodies.shapes import inner_radii
 from jimpact.tools.checks import is_traced
 from jimpact.tools.compiling import full_precision
-
-if TYPE_CHECKING:
-    from jimpact.bodies.assembly import Bodies
 
 # Pairs of each body whose circles around them meet, of polygons. Ten times more takes ten times the
 # memory.
@@ -33,23 +30,75 @@ NEAR = 8
 MARGIN = 0.5
 
 
-def slots(bodies: "Bodies") -> int:
+class Pile(Protocol):
+    """What the grid asks of `Bodies`, see there and `RigidBodies`: b bodies, w planes."""
+
+    @property
+    def points(self) -> jax.Array:
+        """(b, P, d) [m]."""
+
+    @property
+    def rims(self) -> jax.Array:
+        """(b,) [m] radii about the points."""
+
+    @property
+    def planes(self) -> jax.Array:
+        """(w, d + 1) unit normal, distance [m]."""
+
+    @property
+    def shapes(self) -> tuple[Shape, ...]:
+        """One of each kind of body."""
+
+    @property
+    def room(self) -> int:
+        """Contacts that may be closed at once."""
+
+    @property
+    def crowd(self) -> int:
+        """Bodies in a cell at most."""
+
+    @property
+    def count(self) -> int:
+        """Number of bodies b."""
+
+    @property
+    def dimension(self) -> int:
+        """2 or 3."""
+
+    @property
+    def angular(self) -> int:
+        """Angular velocities of a body."""
+
+    def of_bodies(self, q: jax.Array) -> jax.Array:
+        """q (n,) by body (b, ..)."""
+
+    def placed(self, q: jax.Array) -> Placed:
+        """Turns and points in space."""
+
+    def placed_at(self, at: jax.Array, points: jax.Array) -> Placed:
+        """The same of some bodies."""
+
+    def speeds(self, at: jax.Array, point: jax.Array, ways: jax.Array) -> jax.Array:
+        """Rows of velocities of points along directions."""
+
+
+def slots(bodies: Pile) -> int:
     """Contacts of a pair: at both ends of the sides of polygons that face each other."""
     return min(2, bodies.points.shape[1])
 
 
-def stride(bodies: "Bodies") -> int:
+def stride(bodies: Pile) -> int:
     """Partners of a body: the others, and each plane once for each corner."""
     return bodies.count + len(bodies.planes) * bodies.points.shape[1]
 
 
-def outer_radii(bodies: "Bodies") -> jax.Array:
+def outer_radii(bodies: Pile) -> jax.Array:
     """Radii (b,) of discs or balls about the centres of mass, around the bodies."""
     far = jnp.sqrt(jnp.max(jnp.sum(bodies.points**2, axis=2), axis=1))
     return far + bodies.rims
 
 
-def least_radius(bodies: "Bodies") -> jax.Array:
+def least_radius(bodies: Pile) -> jax.Array:
     """The least radius () of a disc or ball about a centre of mass, within its body."""
     far = jnp.sqrt(jnp.sum(bodies.points[:, 0] ** 2, axis=1))
     if slots(bodies) == 1:
@@ -58,7 +107,7 @@ def least_radius(bodies: "Bodies") -> jax.Array:
     return jnp.min(jnp.minimum(of_round, inner_radii(bodies.points)))
 
 
-def crowd_of_cells(bodies: "Bodies") -> int:
+def crowd_of_cells(bodies: Pile) -> int:
     """How many bodies a row of cells may hold; 0 where looking at every pair is less work."""
     if is_traced((bodies.points, bodies.rims)):
         return 0
@@ -68,7 +117,7 @@ def crowd_of_cells(bodies: "Bodies") -> int:
     return crowd if 2 * rows * crowd < bodies.count else 0
 
 
-def _circle_gaps(bodies: "Bodies", q: jax.Array, i: Any, j: Any) -> jax.Array:
+def _circle_gaps(bodies: Pile, q: jax.Array, i: Any, j: Any) -> jax.Array:
     """Gaps (C,) of the discs or balls around these bodies."""
     columns = bodies.of_bodies(q)[:, : bodies.dimension].T  # one by one: five times faster
     squares = sum((x[i] - x[j]) ** 2 for x in columns)
@@ -77,7 +126,7 @@ def _circle_gaps(bodies: "Bodies", q: jax.Array, i: Any, j: Any) -> jax.Array:
 
 
 @full_precision
-def _plane_gaps(bodies: "Bodies", q: jax.Array) -> jax.Array:
+def _plane_gaps(bodies: Pile, q: jax.Array) -> jax.Array:
     """Gaps (b, w, P) of all corners; infinite of those that only fill a row."""
     n, offset = bodies.planes[:, :-1], bodies.planes[:, -1]
     height = jnp.sum(bodies.placed(q).points[:, None] * n[None, :, None], axis=3)
@@ -87,7 +136,7 @@ def _plane_gaps(bodies: "Bodies", q: jax.Array) -> jax.Array:
     return jnp.where(unused[:, None], jnp.inf, gap)
 
 
-def _candidates(bodies: "Bodies", q: jax.Array, margin: jax.Array) -> Candidates:
+def _candidates(bodies: Pile, q: jax.Array, margin: jax.Array) -> Candidates:
     """Pairs of bodies, all those with gaps up to `margin` among them."""
     if bodies.crowd == 0:
         return all_pairs(bodies.count)
@@ -95,7 +144,7 @@ def _candidates(bodies: "Bodies", q: jax.Array, margin: jax.Array) -> Candidates
     return near_pairs(bodies.of_bodies(q)[:, : bodies.dimension], distance, bodies.crowd)
 
 
-def _of_pairs(bodies: "Bodies", at: jax.Array, i: Any, j: Any) -> ContactPoints:
+def _of_pairs(bodies: Pile, at: jax.Array, i: Any, j: Any) -> ContactPoints:
     """Contacts of pairs (g,): gaps (g, slots), points (g, slots, d), normals towards i."""
     a, b = (bodies.placed_at(at[x], bodies.points[x]).points for x in (i, j))
     r, s = bodies.rims[i], bodies.rims[j]
@@ -104,7 +153,7 @@ def _of_pairs(bodies: "Bodies", at: jax.Array, i: Any, j: Any) -> ContactPoints:
     return ContactPoints(*(x[:, None] for x in round_on_round(a[:, 0], b[:, 0], r, s)))
 
 
-def least_gap(bodies: "Bodies", q: jax.Array) -> jax.Array:
+def least_gap(bodies: Pile, q: jax.Array) -> jax.Array:
     """The least gap () [m]; of bodies that are near each other if there are any."""
     others = jnp.asarray(np.arange(bodies.count, dtype=np.int32))
     to_planes = jnp.min(_plane_gaps(bodies, q), initial=jnp.inf)
@@ -129,7 +178,7 @@ def least_gap(bodies: "Bodies", q: jax.Array) -> jax.Array:
 
 
 def _near_gaps(
-    bodies: "Bodies", q: jax.Array, later: jax.Array, below: jax.Array
+    bodies: Pile, q: jax.Array, later: jax.Array, below: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """Bodies i and j (C,), the least gaps (C, slots) at q or `later`, and whether some miss.
 
@@ -163,7 +212,7 @@ def _near_gaps(
 
 
 def _closed(
-    bodies: "Bodies", q: jax.Array, later: jax.Array, below: jax.Array
+    bodies: Pile, q: jax.Array, later: jax.Array, below: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Numbers of contacts (C,), which of them are closed, and whether some are missing.
 
@@ -181,7 +230,7 @@ def _closed(
     return numbers, jnp.concatenate([gaps.reshape(-1), to_planes]) <= below, overflows
 
 
-def active_pairs(bodies: "Bodies", q: jax.Array, later: jax.Array, below: jax.Array) -> ActivePairs:
+def active_pairs(bodies: Pile, q: jax.Array, later: jax.Array, below: jax.Array) -> ActivePairs:
     """The contacts, at q, with gaps up to `below` at q or `later`."""
     numbers, closed, overflows = _closed(bodies, q, later, below)
     rows = -(-bodies.room // BLOCK) * BLOCK
@@ -219,7 +268,7 @@ def active_pairs(bodies: "Bodies", q: jax.Array, later: jax.Array, below: jax.Ar
 
 
 def _of_contacts(
-    bodies: "Bodies", q: jax.Array, number: jax.Array
+    bodies: Pile, q: jax.Array, number: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Bodies i and j (K,) of contacts of these numbers, j = `count` for planes; directions."""
     pair, slot = jnp.divmod(number, jnp.int32(slots(bodies)))

@@ -44,8 +44,6 @@ class StaticNumbers(tuple[float, ...]):
 
 
 if TYPE_CHECKING:
-    from jimpact.events.impact_dynamics import Dynamics
-
     # What a parameter takes and what it is read as; type checkers see both in such a descriptor.
     Numbers = jax.typing.ArrayLike | Sequence[Any]
     Taken = TypeVar("Taken", contravariant=True)
@@ -356,6 +354,27 @@ def with_parameter(module: Any, name: str, value: Any) -> Any:
     return eqx.tree_at(operator.attrgetter(parameters_of(module)[name].path), module, value)
 
 
+def value_of(law: "Law", field: str) -> Any:
+    """A parameter of a law, or of its parts (the force of a compliant one); None if it has none."""
+    return getattr(parameters_of(law).get(field), "value", None)
+
+
+def entries(law: "Law", fields: tuple[str, ...]) -> np.ndarray:
+    """All entries (Q,) of these fields of a law."""
+    return np.concatenate([np.ravel(np.asarray(value_of(law, f), float)) for f in fields])
+
+
+def with_entries(law: AnyLaw, fields: tuple[str, ...], values: Any) -> AnyLaw:
+    """The law with these entries (Q,)."""
+    start = 0
+    for field in fields:
+        old = value_of(law, field)
+        new = values[start : start + old.size].reshape(old.shape).astype(old.dtype)
+        law = with_parameter(law, field, jnp.asarray(new))
+        start += old.size
+    return law
+
+
 def within_domains(law: eqx.Module) -> jax.Array:
     """Whether () all parameters are finite and in their domains, on the device."""
     holds = [x.domain.holds(x.value) for x in free_parameters_of(law).values()]
@@ -448,8 +467,8 @@ class Law(Declared):
     def check(self, scene: Scene, dtype: jnp.dtype) -> None:
         """To override: raise where the law does not fit the scene, or the precision `dtype`."""
 
-    def dynamics(self, contact: Contact) -> "Dynamics":
-        """To override where `has_history`: the impact dynamics at what `contact` holds."""
+    def dynamics(self, contact: Contact) -> Any:
+        """To override where `has_history`: the impact dynamics at `contact` (`jimpact.events`)."""
         raise NotImplementedError
 
     @property

@@ -16,6 +16,7 @@ from jimpact.fits.observables import COARSE_RTOL
 from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw
 from jimpact.fits.problem import FitProblem, of_shots
 from jimpact.fits.profiles import LEVEL, PROFILE_STARTS, needs_profiles, profiles_of
+from jimpact.fits.report import Fit, check_squares
 from jimpact.fits.search import (
     DEFAULT_SEARCH,
     LOSSES,
@@ -37,13 +38,7 @@ from jimpact.fits.solve import (
     Solver,
     step_limit,
 )
-from jimpact.fits.uncertainty import (
-    Fit,
-    Profile,
-    check_level,
-    check_squares,
-    uncertainty,
-)
+from jimpact.fits.uncertainty import Profile, check_level, uncertainty
 from jimpact.tools.checks import as_whole, check_choice, check_kind, check_values
 from jimpact.tools.progress import progress_bar
 from jimpact.tools.records import listed

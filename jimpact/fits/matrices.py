@@ -6,7 +6,7 @@ and then to the admissible matrix of the least sum of squares.
 """
 
 from itertools import product
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import equinox as eqx
 import jax
@@ -21,9 +21,6 @@ from jimpact.numerics.lcp import solve_lcp
 from jimpact.numerics.tridiagonal import as_matrix, scaled
 from jimpact.tools.compiling import full_precision, quick_jit
 from jimpact.tools.status import CODE
-
-if TYPE_CHECKING:
-    from jimpact.fits.problem import FitProblem
 
 # A point drawn back stops short of the boundary by this share of the way, times eps.
 _SHORT = 16.0
@@ -212,7 +209,46 @@ def _square(a: jax.Array, x: jax.Array) -> jax.Array:
     return jnp.einsum("sfi,sij,sfj->sf", x, a, x)
 
 
-def matrix_region(problem: "FitProblem", scenes: list[Scene]) -> AdmissibleMatrices | None:
+class SearchedMatrix(Protocol):
+    """What is asked of a fit: an entry of the law is `fixed`, or `scale` times y of its `owner`."""
+
+    @property
+    def law(self) -> Law:
+        """At its start."""
+
+    @property
+    def low(self) -> jax.Array:
+        """Lowest y (Q,)."""
+
+    @property
+    def high(self) -> jax.Array:
+        """Highest y (Q,)."""
+
+    @property
+    def owner(self) -> np.ndarray:
+        """Which parameter each entry is, -1: none."""
+
+    @property
+    def scale(self) -> np.ndarray:
+        """By how much an entry changes with y."""
+
+    @property
+    def fixed(self) -> np.ndarray:
+        """Values of entries that are not free."""
+
+    @property
+    def start(self) -> np.ndarray:
+        """Parameters at the start (P,)."""
+
+    @property
+    def ties(self) -> Any:
+        """Entries that are functions of parameters, each with its `field`."""
+
+    def point(self, x: np.ndarray) -> np.ndarray:
+        """y (Q,) of the parameters x (P,)."""
+
+
+def matrix_region(problem: SearchedMatrix, scenes: list[Scene]) -> AdmissibleMatrices | None:
     """The y whose (m, m) `RestitutionMatrix` is admissible in each scene; None for other laws.
 
     Raises:

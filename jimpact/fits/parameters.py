@@ -3,7 +3,7 @@
 import dataclasses
 import re
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -12,22 +12,24 @@ import numpy as np
 
 from jimpact.core.contact import Contact
 from jimpact.core.law import (
+    AnyLaw,
     Domain,
     Impulses,
     Law,
     OptionalValues,
     declarations_of,
+    entries,
     forwards_to_law,
     free_parameters_of,
     parameter,
     parameters_of,
+    value_of,
     with_parameter,
 )
 from jimpact.core.scene import Scene, with_gaps
 from jimpact.laws.kinematic import RestitutionMatrix
 from jimpact.tools.checks import ABBREVIATIONS, check_kind, suggestion
 
-AnyLaw = TypeVar("AnyLaw", bound=Law)  # what goes in as LZB comes out as LZB
 Limits = tuple[np.ndarray, np.ndarray]  # lowest and highest values (P,)
 DEFAULT_FREE = ("restitution", "stiffness")  # or a matrix, or what else a law has
 OF_SPEED = ("speed_exponent", "yield_speed")  # a law has them only if requested
@@ -74,30 +76,9 @@ def places(argument: str, name: str, shape: tuple[int, ...]) -> list[int]:
     return [int(np.ravel_multi_index(index, shape)) for index in members]
 
 
-def value_of(law: Law, field: str) -> Any:
-    """A parameter of a law, or of its parts (the force of a compliant one); None if it has none."""
-    return getattr(parameters_of(law).get(field), "value", None)
-
-
 def domain_of(law: Law, field: str) -> Domain:
     """What values a parameter may have."""
     return parameters_of(law)[field].domain
-
-
-def entries(law: Law, fields: tuple[str, ...]) -> np.ndarray:
-    """All entries (Q,) of these fields of a law."""
-    return np.concatenate([np.ravel(np.asarray(value_of(law, f), float)) for f in fields])
-
-
-def with_entries(law: AnyLaw, fields: tuple[str, ...], values: Any) -> AnyLaw:
-    """The law with these entries (Q,)."""
-    start = 0
-    for field in fields:
-        old = value_of(law, field)
-        new = values[start : start + old.size].reshape(old.shape).astype(old.dtype)
-        law = with_parameter(law, field, jnp.asarray(new))
-        start += old.size
-    return law
 
 
 def scaled(x: Any, scale: Any, log: Any, xp: Any = np) -> Any:

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.core.law import Law, forward_only
+from jimpact.core.law import Law, entries, forward_only, with_entries
 from jimpact.core.scene import Scene, dense_mass, stackable
 from jimpact.fits.data import Experiments, kept_by_corrections
 from jimpact.fits.matrices import AdmissibleMatrices, matrix_region
@@ -36,7 +36,6 @@ from jimpact.fits.parameters import (
     Ties,
     bounds_of,
     checked_ties,
-    entries,
     free_parameters,
     limits_with_scene,
     plain_law,
@@ -44,7 +43,6 @@ from jimpact.fits.parameters import (
     scaled,
     tied,
     unscaled,
-    with_entries,
     with_parts_of_scene,
 )
 from jimpact.fits.solve import EXACT, outcome_at

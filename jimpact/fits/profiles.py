@@ -14,9 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jimpact.fits.parameters import as_names, scaled, unscaled
+from jimpact.fits.report import Fit
 from jimpact.fits.search import SAME_VALUE, START_SCALES, FitMinimum, find_minima, solution
 from jimpact.fits.solve import RANK_TOLERANCE, Ends, Solver, minimize
-from jimpact.fits.uncertainty import Fit, Profile, check_level
+from jimpact.fits.uncertainty import Profile, check_level
 from jimpact.tools.checks import as_whole, check_choice, check_kind
 from jimpact.tools.progress import Show, progress_bar
 

@@ -2,25 +2,19 @@
 
 import dataclasses
 import json
-import platform
-from collections.abc import Iterable, Sequence
-from importlib import import_module
-from operator import attrgetter
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Generic
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 import jimpact
-from jimpact.core.law import StaticNumber, StaticNumbers
-from jimpact.fits.parameters import Prior, value_of
+from jimpact.core.law import AnyLaw, value_of
+from jimpact.fits.encoding import encoded, instance_of, versions
+from jimpact.fits.uncertainty import FitResult, pieces_in_words
+from jimpact.tools.checks import check_kind
 from jimpact.tools.records import as_data, with_error
 from jimpact.tools.status import STATUS
-
-if TYPE_CHECKING:
-    from jimpact.fits.uncertainty import Fit  # which imports this module
 
 _ZERO = 1e-12  # parameters in whatever unit that are printed as 0: rounding, as minima end in it
 _ROUNDING = 1e-7  # share of the largest velocity that is printed as 0: impacts are good to 1e-8
@@ -33,12 +27,6 @@ OF_A_CONTACT = ("restitution", "friction", "tangential_restitution")  # each may
 FEW_DEGREES = 8
 UNSEEN = "start value; not determined by the data"  # note on a value in brackets
 FORMAT = 1  # of the file; it changes where older files could not be read any more
-_PACKAGES = ("jimpact", "jax", "jaxlib", "equinox", "numpy", "scipy")
-_FIT = "jimpact.fits.uncertainty:Fit"  # which imports this module
-# of values in the file that are not arrays, mappings or classes with fields
-_KINDS: dict[str, Any] = {
-    kind.__name__: kind for kind in (StaticNumber, StaticNumbers, float, tuple, list)
-} | {"Prior": Prior._make}
 
 
 def joined_words(parts: Sequence[str]) -> str:
@@ -309,21 +297,6 @@ def _shots(fit: "Fit") -> list[str]:
     return lines
 
 
-def pieces_in_words(pieces: Iterable[tuple[float, float]], domain: tuple[float, float]) -> str:
-    """Pieces of an interval; an end of the domain is left out."""
-    return " or ".join(_piece(*ends, domain) for ends in pieces)
-
-
-def _piece(low: float, high: float, domain: tuple[float, float]) -> str:
-    """One piece of an interval in words."""
-    open_low, open_high = low <= domain[0], high >= domain[1]
-    if open_low and open_high:
-        return "anything"
-    if open_low or open_high:
-        return f"at most {high:.5g}" if open_low else f"at least {low:.5g}"
-    return f"{low:.5g} to {high:.5g}"
-
-
 # ---------------------------------------------------------------------------- the whole
 
 
@@ -396,7 +369,7 @@ def save_fit(fit: "Fit", path: str | Path) -> Path:
         raise ValueError("Argument `fit` must be to shots to be saved: functions cannot be.")
     if fit.problem.ties:
         raise ValueError("Argument `fit` must have no ties to be saved: functions cannot be.")
-    record = {"format": FORMAT, "versions": versions(), "result": _encoded(fit)["fields"]}
+    record = {"format": FORMAT, "versions": versions(), "result": encoded(fit)["fields"]}
     path = Path(path)
     path.write_text(json.dumps(record, allow_nan=False, indent=1) + "\n", encoding="utf-8")
     return path
@@ -438,7 +411,7 @@ def load_fit(path: str | Path) -> "Fit":
             f"{record['format']} (written by jimpact {writer}; this is {jimpact.__version__})."
         )
     try:
-        return _instance(_FIT, record["result"])
+        return instance_of(Fit, record["result"])
     except (KeyError, AttributeError, ImportError, TypeError) as error:
         raise ValueError(
             f"{path}: the fit, saved by jimpact {writer}, cannot be read: {error!r}. A law of your "
@@ -446,60 +419,85 @@ def load_fit(path: str | Path) -> "Fit":
         ) from error
 
 
-def versions() -> dict[str, str]:
-    """Versions of jimpact, of what it computes with, and of Python."""
-    found = {name: import_module(name).__version__ for name in _PACKAGES}
-    return found | {"Python": f"{platform.python_version()}, {platform.system()}"}
+# ---------------------------------------------------------------------------- the result
 
 
-def _encoded(value: Any) -> Any:
-    """What a JSON file can hold, from which `_decoded` makes the value again, bit by bit."""
-    if value is None or isinstance(value, bool | str | int):
-        return value
-    if isinstance(value, float):
-        plain = type(value) is float and np.isfinite(value)
-        return value if plain else {type(value).__name__: repr(float(value))}
-    if isinstance(value, jax.Array | np.ndarray | np.generic):
-        array = np.asarray(value)
-        entries = [_encoded(x) for x in array.ravel().tolist()]
-        kind = {"dtype": str(array.dtype), "device": isinstance(value, jax.Array)}
-        return {"array": entries, "shape": list(array.shape), **kind}
-    if dataclasses.is_dataclass(value):
-        cls = type(value)
-        fields = {f.name: _encoded(getattr(value, f.name)) for f in dataclasses.fields(value)}
-        return {"class": f"{cls.__module__}:{cls.__qualname__}", "fields": fields}
-    if isinstance(value, dict):
-        return {"dict": {key: _encoded(each) for key, each in value.items()}}
-    if isinstance(value, list | tuple):
-        return {type(value).__name__: [_encoded(each) for each in value]}
-    raise ValueError(f"Argument `fit` must hold numbers and words to be saved, but has {value!r}.")
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class Fit(FitResult[AnyLaw], Generic[AnyLaw]):
+    """The result of `fit`. `print(fit)` gives its report.
+
+    P free parameters, K shots of n velocities.
+
+    Attributes:
+        law: with the fitted parameters.
+        method: of minimizing, see `fit`.
+        names: of the parameters, contacts numbered from 1.
+        value: (P,) in the units of each parameter, as the next two.
+        standard_error: (P,); inf where the data do not determine a parameter, NaN where no degree
+            of freedom is left to estimate the noise from.
+        covariance: (P, P).
+        correlation: (P, P), in [-1, 1].
+        bounds: lowest and highest values (P,), (P,).
+        at_bound: (P,) boolean.
+        predicted: shaped like what was measured, (K, n) [m/s].
+        residual: measured less predicted (K, n) [m/s]; NaN where no value was measured.
+        rms: of the residual.
+        noise: estimated standard error of one value; NaN where no degree of freedom is left, 1
+            if `sigma` is known, or, if chi^2 shows that sigma is too small, the factor that
+            the standard errors are multiplied by.
+        degrees_of_freedom: independent measured values less `rank`.
+        rank: of the Jacobian; below P: see `identifiability`.
+        singular_values: (P,) of the scaled Jacobian.
+        identifiability: in words, what the data do not determine.
+        starts: the distinct minima, best first.
+        status: (K,) codes of `jimpact.STATUS` at the minimum.
+        converged: whether the best start did.
+        steps: iterations of the best start.
+        lost_starts: how many were given up far above the best, or did not converge.
+        stuck: whether no step lowers the sum of squares, although derivatives promise it.
+        slopes: `dv+/dv-` (K, n, n) of the shots, where errors of v- are passed on, else None.
+        warnings: what is wrong with data or fit, in words.
+        problem: what was solved.
+        jacobian: derivatives of what was measured in the parameters (K, n, P), NaN where no
+            value was measured.
+        loss: see `fit`.
+        seed: of the random starts.
+        profiles: if `fit` computed them.
+        reservations: in words, what has to be said where a value is quoted.
+    """
+
+    def __str__(self) -> str:
+        return report(self)
+
+    @property
+    def verdict(self) -> str:
+        """The result in one sentence that can be quoted: the first one of `print(fit)`.
+
+        Values with their errors, what they assume, and what speaks against them.
+        """
+        return verdict(self)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything a JSON file can hold; numbers that are not finite become None."""
+        return as_record(self)
+
+    def save(self, path: str | Path) -> Path:
+        """Write the fit to a file (JSON) that `ji.load` reads: problem, result, versions.
+
+        Args:
+            path: the file; an existing file is replaced.
+
+        Returns:
+            The path.
+
+        Raises:
+            ValueError: a fit of something else than shots, or with ties: functions cannot be saved.
+        """
+        return save_fit(self, path)
 
 
-def _decoded(data: Any) -> Any:
-    """What `_encoded` has encoded."""
-    if not isinstance(data, dict):
-        return data
-    if "class" in data:
-        return _instance(data["class"], data["fields"])
-    if "array" in data:
-        array = np.array([_decoded(x) for x in data["array"]], data["dtype"]).reshape(data["shape"])
-        return jnp.asarray(array) if data["device"] else array
-    ((kind, content),) = data.items()
-    if kind == "dict":
-        return {key: _decoded(each) for key, each in content.items()}
-    return _KINDS[kind](map(_decoded, content) if isinstance(content, list) else content)
-
-
-def _instance(place: str, fields: dict[str, Any]) -> Any:
-    """An instance of the class at a place with these fields, which are all that it has."""
-    module, _, name = place.partition(":")
-    found: Any = attrgetter(name)(import_module(module))
-    if not dataclasses.is_dataclass(found):
-        raise TypeError(f"{place} is no class of a law, scene or result")
-    known = {field.name for field in dataclasses.fields(found)}
-    if known != set(fields):
-        raise TypeError(f"{name} has the fields {sorted(known)}, the file {sorted(fields)}")
-    instance: Any = object.__new__(found)  # type: ignore[arg-type]  # as it was: its fields have been checked and converted
-    for key, value in fields.items():
-        object.__setattr__(instance, key, _decoded(value))
-    return instance
+def check_squares(name: str, fit: Any) -> None:
+    """Raise an error unless argument `name` is a fit by least squares."""
+    check_kind(name, fit, Fit)
+    if fit.loss != "squares":
+        raise ValueError(f"Argument `{name}` must be by least squares, but has loss {fit.loss!r}.")

@@ -17,9 +17,8 @@ from jimpact.fits.matrices import admissible_start
 from jimpact.fits.parameters import OF_SPEED, default_free
 from jimpact.fits.problem import FEW
 from jimpact.fits.profiles import needs_profiles, profile
-from jimpact.fits.report import named_values
+from jimpact.fits.report import check_squares, named_values
 from jimpact.fits.search import Search
-from jimpact.fits.uncertainty import check_squares
 from jimpact.laws.velocity_dependent import VelocityDependent
 from jimpact.tools.checks import check_choice, check_kind
 from jimpact.tools.progress import progress_bar

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias
 
 import equinox as eqx
 import jax
@@ -23,8 +23,6 @@ from jimpact.tools.progress import Show
 
 if TYPE_CHECKING:
     import optax  # which takes long to import
-
-    from jimpact.fits.problem import FitProblem
 
 Method: TypeAlias = "str | optax.GradientTransformation"
 
@@ -71,7 +69,28 @@ RANK_TOLERANCE = {"float64": 1e-6, "float32": 1e-3}
 SETTLED, SETTLING = 1e-5, 10  # change (natural scales) and rounds, where errors of v- are passed on
 
 
-def _free_gradient(problem: "FitProblem", y: jax.Array, gradient: jax.Array) -> jax.Array:
+class LeastSquares(Protocol):
+    """What a solver asks of a problem: its box, and residual r (R,) with Jacobian at y (Q,)."""
+
+    @property
+    def low(self) -> jax.Array:
+        """Lowest y (Q,)."""
+
+    @property
+    def high(self) -> jax.Array:
+        """Highest y (Q,)."""
+
+    def evaluate(self, y: jax.Array) -> tuple[jax.Array, jax.Array, Any]:
+        """r (R,), dr/dy (R, Q), and what else is kept of the best point."""
+
+    def program(self) -> "LeastSquares":
+        """The problem as a compiled function takes it."""
+
+    def point(self, x: np.ndarray) -> np.ndarray:
+        """y (Q,) of the parameters x (P,)."""
+
+
+def _free_gradient(problem: LeastSquares, y: jax.Array, gradient: jax.Array) -> jax.Array:
     """The gradient without variables that sit on a bound and are pushed against it."""
     pushed = ((y <= problem.low) & (gradient > 0)) | ((y >= problem.high) & (gradient < 0))
     return jnp.where(pushed, 0.0, gradient)
@@ -179,7 +198,7 @@ def advance_all(
 
 
 def _pass(
-    problem: "FitProblem", method: Method, max_steps: int, stop: jax.Array, state: SolverState
+    problem: LeastSquares, method: Method, max_steps: int, stop: jax.Array, state: SolverState
 ) -> SolverState:
     """Residual and Jacobian of the trial, and the next one."""
     residual, jacobian, aux = problem.evaluate(state.trial)
@@ -225,7 +244,7 @@ def _pass(
     )
 
 
-def _cost(problem: "FitProblem", y: jax.Array) -> jax.Array:
+def _cost(problem: LeastSquares, y: jax.Array) -> jax.Array:
     """`|r|^2 / 2` at the nearest point in the bounds, for line searches.
 
     Its derivative is taken from the Jacobian that `evaluate` gives.
@@ -291,7 +310,7 @@ class Ends(NamedTuple):
 
 
 def minimize(
-    problems: "Sequence[FitProblem]",
+    problems: Sequence[LeastSquares],
     points: np.ndarray,
     solver: Solver,
     stop: float = 0.0,
@@ -342,7 +361,7 @@ def minimize(
     )
 
 
-def outcome_at(problem: "FitProblem", x: Any) -> Ends:
+def outcome_at(problem: LeastSquares, x: Any) -> Ends:
     """Residual, derivatives and predictions at x (P,), by the program that searches."""
     point = problem.point(np.asarray(x))[None]
     once, every = Solver(max_steps=1), np.ones(point.shape, bool)
@@ -425,7 +444,7 @@ def _converged(states: SolverState, enough: float) -> np.ndarray:
     return small | (squares <= EXACT[str(states.y.dtype)]) | states.stuck
 
 
-def stacked(problems: "Sequence[FitProblem]", each: int = 1) -> Any:
+def stacked(problems: Sequence[LeastSquares], each: int = 1) -> Any:
     """The problems as compiled functions take them, side by side, each so many times."""
     filled = [problem.program() for problem in problems]
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Generic, NamedTuple
 
 import jax
@@ -16,7 +15,6 @@ from jimpact.core.scene import Scene
 from jimpact.fits.data import Experiments
 from jimpact.fits.parameters import AnyLaw, LawInScene, tied_names, tied_value
 from jimpact.fits.problem import FitProblem
-from jimpact.fits.report import as_record, pieces_in_words, report, save_fit, verdict
 from jimpact.fits.search import FitMinimum, Solution, solution
 from jimpact.fits.solve import RANK_TOLERANCE, outcome_at
 from jimpact.tools.checks import check_choice, check_kind, check_shape, check_values
@@ -130,6 +128,21 @@ def check_level(level: float) -> None:
         raise ValueError(f"Argument `level` must lie in (0, 1), but has value {level!r}.")
 
 
+def pieces_in_words(pieces: Iterable[tuple[float, float]], domain: tuple[float, float]) -> str:
+    """Pieces of an interval; an end of the domain is left out."""
+    return " or ".join(_piece(*ends, domain) for ends in pieces)
+
+
+def _piece(low: float, high: float, domain: tuple[float, float]) -> str:
+    """One piece of an interval in words."""
+    open_low, open_high = low <= domain[0], high >= domain[1]
+    if open_low and open_high:
+        return "anything"
+    if open_low or open_high:
+        return f"at most {high:.5g}" if open_low else f"at least {low:.5g}"
+    return f"{low:.5g} to {high:.5g}"
+
+
 @dataclass(frozen=True, eq=False)
 class Profile:
     """`deviance` (G,) over the `value`s (G,) of parameter `name`, and where it is below `limit`.
@@ -210,48 +223,8 @@ class Predicted(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Fit(Solution, Uncertainty, Tabular, Generic[AnyLaw]):
-    """The result of `fit`. `print(fit)` gives its report.
-
-    P free parameters, K shots of n velocities.
-
-    Attributes:
-        law: with the fitted parameters.
-        method: of minimizing, see `fit`.
-        names: of the parameters, contacts numbered from 1.
-        value: (P,) in the units of each parameter, as the next two.
-        standard_error: (P,); inf where the data do not determine a parameter, NaN where no degree
-            of freedom is left to estimate the noise from.
-        covariance: (P, P).
-        correlation: (P, P), in [-1, 1].
-        bounds: lowest and highest values (P,), (P,).
-        at_bound: (P,) boolean.
-        predicted: shaped like what was measured, (K, n) [m/s].
-        residual: measured less predicted (K, n) [m/s]; NaN where no value was measured.
-        rms: of the residual.
-        noise: estimated standard error of one value; NaN where no degree of freedom is left, 1
-            if `sigma` is known, or, if chi^2 shows that sigma is too small, the factor that
-            the standard errors are multiplied by.
-        degrees_of_freedom: independent measured values less `rank`.
-        rank: of the Jacobian; below P: see `identifiability`.
-        singular_values: (P,) of the scaled Jacobian.
-        identifiability: in words, what the data do not determine.
-        starts: the distinct minima, best first.
-        status: (K,) codes of `jimpact.STATUS` at the minimum.
-        converged: whether the best start did.
-        steps: iterations of the best start.
-        lost_starts: how many were given up far above the best, or did not converge.
-        stuck: whether no step lowers the sum of squares, although derivatives promise it.
-        slopes: `dv+/dv-` (K, n, n) of the shots, where errors of v- are passed on, else None.
-        warnings: what is wrong with data or fit, in words.
-        problem: what was solved.
-        jacobian: derivatives of what was measured in the parameters (K, n, P), NaN where no
-            value was measured.
-        loss: see `fit`.
-        seed: of the random starts.
-        profiles: if `fit` computed them.
-        reservations: in words, what has to be said where a value is quoted.
-    """
+class FitResult(Solution, Uncertainty, Tabular, Generic[AnyLaw]):
+    """What `fit` finds, in numbers: see `Fit`, which can be printed and saved."""
 
     law: AnyLaw
     method: str
@@ -268,17 +241,6 @@ class Fit(Solution, Uncertainty, Tabular, Generic[AnyLaw]):
     reservations: tuple[str, ...] = ()
     picture = "fit"
 
-    def __str__(self) -> str:
-        return report(self)
-
-    @property
-    def verdict(self) -> str:
-        """The result in one sentence that can be quoted: the first one of `print(fit)`.
-
-        Values with their errors, what they assume, and what speaks against them.
-        """
-        return verdict(self)
-
     @property
     def table(self) -> Table:
         """A row a parameter: value, standard error, ends of its 95 % interval, whether seen."""
@@ -287,24 +249,6 @@ class Fit(Solution, Uncertainty, Tabular, Generic[AnyLaw]):
         columns = (self.value, self.standard_error, *ends, self.at_bound, self.determined)
         rows = list(zip(self.names, *(column.tolist() for column in columns)))
         return Table([Column(name) for name in ("parameter", *names)], rows)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Everything a JSON file can hold; numbers that are not finite become None."""
-        return as_record(self)
-
-    def save(self, path: str | Path) -> Path:
-        """Write the fit to a file (JSON) that `ji.load` reads: problem, result, versions.
-
-        Args:
-            path: the file; an existing file is replaced.
-
-        Returns:
-            The path.
-
-        Raises:
-            ValueError: a fit of something else than shots, or with ties: functions cannot be saved.
-        """
-        return save_fit(self, path)
 
     @property
     def scene(self) -> Scene | None:
@@ -540,10 +484,3 @@ class Fit(Solution, Uncertainty, Tabular, Generic[AnyLaw]):
         low, high = self.confidence_interval().T
         at_end = (low <= self.bounds[0]) | (high >= self.bounds[1])
         return bool((wide | at_end).any()) or max(map(len, self.intervals())) > 1
-
-
-def check_squares(name: str, fit: Any) -> None:
-    """Raise an error unless argument `name` is a fit by least squares."""
-    check_kind(name, fit, Fit)
-    if fit.loss != "squares":
-        raise ValueError(f"Argument `{name}` must be by least squares, but has loss {fit.loss!r}.")

@@ -10,7 +10,6 @@ import numpy as np
 from jimpact.core.contact import delassus_matrix
 from jimpact.core.law import Law, check_law
 from jimpact.core.scene import Scene, as_velocity, gap_velocity
-from jimpact.montecarlo.result import DELTA_C
 from jimpact.numerics.tridiagonal import diagonal
 from jimpact.tools.checks import is_traced
 from jimpact.tools.records import readable_unit
@@ -18,6 +17,7 @@ from jimpact.tools.records import readable_unit
 # Gaps over delta_c that are described as touching (below) and as wide (above): the crossover
 # between the two is about 2 delta_c wide.
 NEARLY_TOUCHING, WIDE = 0.1, 2.0
+DELTA_C = "delta_c: indentation of a contact at the largest approach speed of the scene"
 
 
 class GapScale(eqx.Module):

@@ -12,10 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact.core.impacts import impact
-from jimpact.core.law import Law, check_law
+from jimpact.core.law import Law, check_law, with_entries
 from jimpact.core.registry import registered_laws
 from jimpact.core.scene import Scene, as_velocity, kinetic_energy
-from jimpact.fits.parameters import with_entries
 from jimpact.laws.lzb import LZB
 from jimpact.methods.contenders import CONTENDERS, Contender, contenders_of, solved
 from jimpact.methods.points import (

@@ -10,9 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact.core.impacts import Impact, impact
-from jimpact.core.law import Law
+from jimpact.core.law import Law, with_entries
 from jimpact.core.scene import Scene, dense_mass, with_gaps
-from jimpact.fits.parameters import with_entries
 from jimpact.tools.compiling import precise_jit
 from jimpact.tools.status import CODE, STATUS
 

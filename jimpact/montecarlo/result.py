@@ -8,6 +8,7 @@ import numpy as np
 
 from jimpact.core.law import Law
 from jimpact.core.scene import Scene
+from jimpact.laws.gap_scale import DELTA_C
 from jimpact.montecarlo.samples import Run
 from jimpact.montecarlo.statistics import (
     IN_MEMORY,
@@ -21,7 +22,6 @@ from jimpact.montecarlo.statistics import (
 from jimpact.tools.checks import as_float_array, check_values
 from jimpact.tools.records import Column, Table, Tabular, as_data, fields_as_data
 
-DELTA_C = "delta_c: indentation of a contact at the largest approach speed of the scene"
 REPORTED = (0.05, 0.5, 0.95)  # quantiles in the report
 _OUTCOMES = {row.name: row for row in OUTCOMES}
 

@@ -22,6 +22,7 @@ import numpy as np
 
 from jimpact.montecarlo.statistics import Chunk, part
 
+FORMAT = {"format": "2"}  # of a manifest: 2 names classes of jimpact without their modules
 MANIFEST = "manifest.json"
 
 
@@ -83,8 +84,9 @@ def _source(function: Any) -> Any:
 
 
 def _name(value: Any) -> str:
-    """Module and qualified name."""
-    return f"{getattr(value, '__module__', '')}.{getattr(value, '__qualname__', type(value))}"
+    """Module and qualified name; of jimpact's own the name alone, since its files may move."""
+    module, name = getattr(value, "__module__", ""), getattr(value, "__qualname__", type(value))
+    return f"{'ji' if str(module).partition('.')[0] == 'jimpact' else module}.{name}"
 
 
 class Store:
@@ -97,6 +99,7 @@ class Store:
 
     def __init__(self, folder: str | Path, identity: dict[str, str]):
         """Open the folder of the run that has this identity, or begin it."""
+        identity = identity | FORMAT
         if not isinstance(folder, str | Path):
             raise TypeError(f"Argument `folder` must be a path, but is {folder!r}.")
         self.folder, self.run = Path(folder), _run(identity)
@@ -113,6 +116,11 @@ class Store:
         other = _identity(self.folder)
         names = sorted(identity.keys() | other.keys())
         differ = [name for name in names if identity.get(name) != other.get(name)]
+        if FORMAT.items() - other.items():
+            raise ValueError(
+                f"Folder '{folder}' holds a run that an earlier build of jimpact began, which this "
+                "one cannot continue: give another folder (`read_samples` reads raw samples)."
+            )
         if differ:
             raise ValueError(
                 f"Folder '{folder}' holds another run, which differs in {', '.join(differ)}: "

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jimpact.fits.profiles import Contour
-from jimpact.fits.uncertainty import Fit
+from jimpact.fits.report import Fit
 from jimpact.plot.style import (
     COLOURS,
     GREY,

@@ -1,7 +1,7 @@
 """Outcomes against gaps: where contacts close at once, and linearized in the gaps."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import equinox as eqx
 import jax
@@ -12,7 +12,6 @@ from jimpact.core.impacts import impact
 from jimpact.core.law import Law
 from jimpact.core.scene import Scene, with_gaps
 from jimpact.laws.gap_scale import gap_scale as gap_scale
-from jimpact.montecarlo.result import MonteCarlo
 from jimpact.tools.checks import as_float_array, as_numbers, check_shape
 from jimpact.tools.status import STATUS
 
@@ -74,6 +73,26 @@ def crossover(scene: Scene, law: Law, velocity: Any, offset: Any) -> Crossover:
     return Crossover(s, out.velocity, out.status)
 
 
+class SampledGaps(Protocol):
+    """What is asked of a run of `ji.monte_carlo`: covariance of its gaps, and its outcomes (n,)."""
+
+    @property
+    def gap_covariance(self) -> np.ndarray:
+        """(m, m) [m^2]."""
+
+    @property
+    def std(self) -> np.ndarray:
+        """Standard deviations of v+ (n,) [m/s]."""
+
+    @property
+    def minimum(self) -> np.ndarray:
+        """Least v+ (n,) [m/s]."""
+
+    @property
+    def maximum(self) -> np.ndarray:
+        """Largest v+ (n,) [m/s]."""
+
+
 @dataclass(frozen=True, eq=False)
 class GapSensitivity:
     """The outcome at given gaps (m,) [m] and its derivatives in them; `print` gives a report.
@@ -89,7 +108,7 @@ class GapSensitivity:
     velocity: np.ndarray
     jacobian: np.ndarray
     status: str
-    sampled: MonteCarlo | None = None
+    sampled: SampledGaps | None = None
 
     def covariance(self, gap_covariance: Any) -> np.ndarray:
         """Linearized covariance (n, n) of velocities, `J Sigma J^T`, Sigma = `gap_covariance`."""
@@ -141,7 +160,7 @@ class GapSensitivity:
 
 
 def gap_sensitivity(
-    law: Law, scene: Scene, velocity: Any, gaps: Any, sampled: MonteCarlo | None = None
+    law: Law, scene: Scene, velocity: Any, gaps: Any, sampled: SampledGaps | None = None
 ) -> GapSensitivity:
     """Jacobian of the outcome in the gaps, and the linearized covariance next to Monte Carlo's.
 

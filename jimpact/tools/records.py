@@ -6,6 +6,7 @@ import io
 import shutil
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -239,9 +240,8 @@ class Tabular:
         """The result's picture of `ji.plot`."""
         if not self.picture:
             raise TypeError(f"{type(self).__name__} has no picture, only a `table`.")
-        import jimpact.plot  # late: matplotlib takes long to import
-
-        return getattr(jimpact.plot, self.picture)(self, title=title)
+        pictures = import_module("jimpact.plot")  # late: matplotlib takes long to import
+        return getattr(pictures, self.picture)(self, title=title)
 
 
 def _parts(widths: Sequence[int], keys: int, room: int) -> list[list[int]]:

@@ -8,8 +8,8 @@ from scipy import optimize
 
 import jimpact as ji
 from jimpact.fits.parameters import LawInScene, bounds_of, checked_ties, free_parameters, tied
+from jimpact.fits.report import Fit
 from jimpact.fits.solve import Damping
-from jimpact.fits.uncertainty import Fit
 from jimpact.tools.records import with_error
 
 

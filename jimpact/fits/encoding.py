@@ -1,0 +1,114 @@
+"""Fits in a file: values of JSON from which each is made again, bit by bit."""
+
+import dataclasses
+import platform
+from importlib import import_module
+from operator import attrgetter
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jimpact
+from jimpact.core.law import StaticNumber, StaticNumbers
+from jimpact.core.scene import PairNormals
+from jimpact.fits.matrices import AdmissibleMatrices
+from jimpact.fits.observables import Shots
+from jimpact.fits.parameters import LawInScene, Parameters, Prior
+from jimpact.fits.problem import FitProblem
+from jimpact.fits.search import FitMinimum
+from jimpact.fits.uncertainty import Profile
+from jimpact.numerics.sparse import Neighbours
+
+_PACKAGES = ("jimpact", "jax", "jaxlib", "equinox", "numpy", "scipy")
+# of values in the file that are not arrays, mappings or classes with fields
+_KINDS: dict[str, Any] = {
+    kind.__name__: kind for kind in (StaticNumber, StaticNumbers, float, tuple, list)
+} | {"Prior": Prior._make}
+# classes of a fit that have no public name, by their own
+_PARTS = {
+    kind.__name__: kind
+    for kind in (
+        *(AdmissibleMatrices, FitMinimum, FitProblem, LawInScene, Neighbours, PairNormals),
+        *(Parameters, Profile, Shots),
+    )
+}
+
+
+def versions() -> dict[str, str]:
+    """Versions of jimpact, of what it computes with, and of Python."""
+    found = {name: import_module(name).__version__ for name in _PACKAGES}
+    return found | {"Python": f"{platform.python_version()}, {platform.system()}"}
+
+
+def encoded(value: Any) -> Any:
+    """What a JSON file can hold, from which `decoded` makes the value again, bit by bit."""
+    if value is None or isinstance(value, bool | str | int):
+        return value
+    if isinstance(value, float):
+        plain = type(value) is float and np.isfinite(value)
+        return value if plain else {type(value).__name__: repr(float(value))}
+    if isinstance(value, jax.Array | np.ndarray | np.generic):
+        array = np.asarray(value)
+        entries = [encoded(x) for x in array.ravel().tolist()]
+        kind = {"dtype": str(array.dtype), "device": isinstance(value, jax.Array)}
+        return {"array": entries, "shape": list(array.shape), **kind}
+    if dataclasses.is_dataclass(value):
+        fields = {f.name: encoded(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        return {"class": _name_of(type(value)), "fields": fields}
+    if isinstance(value, dict):
+        return {"dict": {key: encoded(each) for key, each in value.items()}}
+    if isinstance(value, list | tuple):
+        return {type(value).__name__: [encoded(each) for each in value]}
+    raise ValueError(f"Argument `fit` must hold numbers and words to be saved, but has {value!r}.")
+
+
+def decoded(data: Any) -> Any:
+    """What `encoded` has encoded."""
+    if not isinstance(data, dict):
+        return data
+    if "class" in data:
+        return instance_of(_class_of(data["class"]), data["fields"])
+    if "array" in data:
+        array = np.array([decoded(x) for x in data["array"]], data["dtype"]).reshape(data["shape"])
+        return jnp.asarray(array) if data["device"] else array
+    ((kind, content),) = data.items()
+    if kind == "dict":
+        return {key: decoded(each) for key, each in content.items()}
+    return _KINDS[kind](map(decoded, content) if isinstance(content, list) else content)
+
+
+def _name_of(cls: type) -> str:
+    """`ji.LZB` of a public class, its own name of a part of a fit, else module and name."""
+    name = cls.__qualname__
+    if name in dir(jimpact) and getattr(jimpact, name) is cls:
+        return f"ji.{name}"
+    return name if _PARTS.get(name) is cls else f"{cls.__module__}:{name}"
+
+
+def _class_of(place: str) -> Any:
+    """The class of a name; those that a build before 0.2 gave to a module of jimpact, too."""
+    module, _, name = place.rpartition(":")
+    if module and module.partition(".")[0] != "jimpact":
+        return attrgetter(name)(import_module(module))
+    name = name.removeprefix("ji.")
+    if name in _PARTS:
+        return _PARTS[name]
+    if name not in dir(jimpact):
+        raise TypeError(f"{name} is no class of jimpact {jimpact.__version__}")
+    return getattr(jimpact, name)
+
+
+def instance_of(cls: Any, fields: dict[str, Any]) -> Any:
+    """An instance of a class with these fields, which are all that it has."""
+    if not dataclasses.is_dataclass(cls):
+        raise TypeError(f"{cls!r} is no class of a law, scene or result")
+    known = {field.name for field in dataclasses.fields(cls)}
+    if known != set(fields):
+        name = getattr(cls, "__name__", cls)
+        raise TypeError(f"{name} has the fields {sorted(known)}, the file {sorted(fields)}")
+    instance: Any = object.__new__(cls)  # type: ignore[arg-type]  # as it was: its fields have been checked and converted
+    for key, value in fields.items():
+        object.__setattr__(instance, key, decoded(value))
+    return instance
