@@ -1,1 +1,5 @@
-"""Bodies: gaps, tangents and mass of blocks, dimers, discs and pendulums."""
+"""Bodies: gaps, tangents and mass of what collides."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import jimpact as ji
-from jimpact.bodies import assembly, particles, pendulums, shapes
+from jimpact import bodies
 from jimpact.bodies.base import Body
 from jimpact.core.law import Law
 from jimpact.core.scene import Scene
@@ -26,12 +26,8 @@ from jimpact.tools.checks import check_word, suggestion
 
 STUDY = "study.toml"  # in a folder that `jimpact new` has made
 NO_DATA = "a study must have a [data] table to be fitted, but has none."
-BODIES = {  # classes of bodies by name, which a study writes in any case
-    name: kind
-    for module in (assembly, particles, pendulums, shapes)
-    for name, kind in vars(module).items()
-    if name in dir(ji) and isinstance(kind, type) and issubclass(kind, Body) and kind is not Body
-}
+# classes of bodies by name, which a study writes in any case
+BODIES = {name: getattr(bodies, name) for name in dir(bodies) if name in dir(ji)}
 # Units of the bodies' arguments, which a study writes behind their names. Words and directions have
 # no unit here, nor have lists of points [m] or of mixed units (`corners` of a Polygon, `planes`,
 # `at`), which the classes document.

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact.core.scene import Scene, gap_velocity, solve_mass, without_constraints
-from jimpact.numerics.sparse import Sparse
+from jimpact.numerics.sparse import Sparse, components
 from jimpact.numerics.tangential import TangentialBlock
 from jimpact.numerics.tridiagonal import (
     Structure,
@@ -450,19 +450,6 @@ def coupled_groups(scene: Scene) -> Groups | None:
     label = components(np.concatenate(touched, axis=1))[: len(members)]
     groups = [members[label == first] for first in np.unique(label)]
     return None if len(groups[0]) == m else _by_size(groups, m)
-
-
-def components(touches: np.ndarray) -> np.ndarray:
-    """For each column of a boolean matrix the first column of its connected component."""
-    count = touches.shape[1]
-    label = np.arange(count)
-    while True:
-        of_row = np.where(touches, label[None, :], count).min(axis=1)
-        least = np.where(touches, of_row[:, None], count).min(axis=0)
-        least = least[least]  # of the column it points to: long chains take few rounds
-        if (least == label).all():
-            return label
-        label = least
 
 
 def _by_size(groups: list[np.ndarray], m: int) -> Groups:

@@ -1,1 +1,5 @@
-"""Event-aligned integration."""
+"""Event-aligned integration of impact dynamics."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

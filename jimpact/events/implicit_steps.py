@@ -48,7 +48,6 @@ from jimpact.tools.precision import precision
 # The stages of friction: with 1 - 1/sqrt(2) two implicit stages are of order 2 and L-stable. No
 # other value is both.
 PART = 1 - 2**-0.5
-FORCES_A_STEP = 3  # normal forces that a step asks for: a whole one and two halves
 # First step, in units of the shortest time of loading; ten times more: it is rejected.
 FIRST = 0.02
 # The next step aims at SAFETY^3 of the error allowed, and changes by these factors at most; the

@@ -5,14 +5,25 @@ from importlib.resources import files
 from jimpact.core.registry import EVERY_PROPERTY, REGISTRY, Row, register
 from jimpact.laws.binary import Binary
 from jimpact.laws.compliant import Compliant, make_compliant
-from jimpact.laws.impulse_correlation import ImpulseCorrelation
+from jimpact.laws.gap_scale import DELTA_C, gap_scale
+from jimpact.laws.histories import History
+from jimpact.laws.impulse_correlation import ImpulseCorrelation, interval
 from jimpact.laws.kinematic import Moreau, Newton, RestitutionMatrix
-from jimpact.laws.lzb import LZB
+from jimpact.laws.lzb import LZB, default_rtol
 from jimpact.laws.poisson import Poisson
 from jimpact.laws.routh import Routh
 from jimpact.laws.velocity_dependent import VelocityDependent, make_velocity_dependent
 
-__all__ = ["REGISTRY", "Row", "register"]
+__all__ = [
+    "DELTA_C",
+    "REGISTRY",
+    "History",
+    "Row",
+    "default_rtol",
+    "gap_scale",
+    "interval",
+    "register",
+]
 
 # entries by key: each begins @kind{key,
 _BIBTEX = {

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.core.contact import components, kinetic_angles
+from jimpact.core.contact import kinetic_angles
 from jimpact.core.impacts import impact
 from jimpact.core.law import Law, check_law, free_parameters_of, options_of
 from jimpact.core.registry import ADVISED, registered_laws, simplest_first
@@ -37,6 +37,7 @@ from jimpact.methods.points import (
     in_turns,
     varied_impacts,
 )
+from jimpact.numerics.sparse import components
 from jimpact.tools.checks import as_whole, check_per_contact, check_shape, check_values
 from jimpact.tools.compiling import full_precision
 from jimpact.tools.precision import precision

@@ -34,7 +34,6 @@ import numpy as np
 from jimpact.core.scene import Scene
 from jimpact.events.contact_flow import power
 from jimpact.events.impact_dynamics import Dynamics, evaluate, first_indentation
-from jimpact.events.implicit_steps import FORCES_A_STEP
 from jimpact.laws.lzb import LZB
 from jimpact.methods.points import UNCOUNTED, Solution
 from jimpact.numerics.dense import unit
@@ -55,6 +54,9 @@ FOREVER = 1e6  # in units of the impact's time scale: a contact alone lasts abou
 
 
 Solve = Callable[[LZB, Scene, Any, Any], Solution]
+
+
+_FORCES_A_STEP = 3  # normal forces that an implicit step asks for: a whole one and two halves
 
 
 class Scaled(NamedTuple):
@@ -214,7 +216,7 @@ def implicit(law: LZB, scene: Scene, velocity: Any, setting: Any) -> Solution:
     problem = scaled(law, scene, velocity, setting)
     dynamics = problem.dynamics._replace(method="implicit")
     p, side, t, code, passes = evaluate(dynamics.program(), dynamics.columns()[0])
-    forces = FORCES_A_STEP * passes[0, 0]
+    forces = _FORCES_A_STEP * passes[0, 0]
     return problem.solution(p[:, 0], t[0, 0], forces, code[0, 0], side[:, 0])
 
 

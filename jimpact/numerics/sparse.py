@@ -142,3 +142,16 @@ def _iterated(product: Callable[[jax.Array], jax.Array], right: jax.Array) -> ja
     start = jnp.zeros_like(right), right, right, size, jnp.int32(0)
     x, _, _, square, _ = while_loop(going, iterate, start)
     return jnp.where(square <= eps ** (2 * _NO_SOLUTION) * size, x, jnp.nan)
+
+
+def components(touches: np.ndarray) -> np.ndarray:
+    """For each column of a boolean matrix the first column of its connected component."""
+    count = touches.shape[1]
+    label = np.arange(count)
+    while True:
+        of_row = np.where(touches, label[None, :], count).min(axis=1)
+        least = np.where(touches, of_row[:, None], count).min(axis=0)
+        least = least[least]  # of the column it points to: long chains take few rounds
+        if (least == label).all():
+            return label
+        label = least

@@ -165,24 +165,6 @@ def test_every_public_name_has_a_place_in_the_api(pages):
         assert re.search(rf"\| `ji.{re.escape(name)}` \| \S.* \|", index), name
 
 
-def test_rooms_import_as_the_picture_shows(pages):
-    """Every module has a room in the picture, and imports from rooms of rows below its own."""
-    rows = {name: row for row, rooms in enumerate(pages.ROOMS)
-            for _, _, names in rooms for name in names}  # fmt: skip
-    room_of = {name: room for rooms in pages.ROOMS for room, _, names in rooms for name in names}
-    package = ROOT / "jimpact"
-    for path in package.rglob("*.py"):
-        name = path.relative_to(package).parts[0].removesuffix(".py")
-        if name == "__init__":
-            continue
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("jimpact."):
-                imported = node.module.split(".")[1]
-                allowed = rows[imported] > rows[name] or room_of[imported] == room_of[name]
-                report = path.name == "page.py" and imported == "plot"  # the page of a fit
-                assert allowed or report, (path.name, node.module)
-
-
 def test_constants_are_complete_and_explained(pages, tmp_path):
     """Every number in capitals at the top of a module is in the table, with a meaning."""
     module = tmp_path / "example.py"

@@ -1,8 +1,6 @@
 """What lies between a law and a scene: rounding, no approach, redundant contacts, padded shots."""
 
-import ast
 import itertools
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -249,27 +247,3 @@ def test_derivatives_of_a_checked_outcome_are_those_of_the_plain_one():
     slopes = [jax.jit(jax.grad(lambda e, c=check: last(e, c))) for check in (False, True)]
     plain, checked = (slope(jnp.array([0.9, 0.8])) for slope in slopes)
     np.testing.assert_allclose(plain, checked, rtol=1e-9)
-
-
-# Rooms from below: a module imports those of its own floor and of the floors below.
-FLOORS = (
-    ("_checks", "status", "progress", "compiling", "precision", "loops", "tangents", "derive"),
-    ("solvers",),
-    ("scene", "contact", "quasi_space"),
-    ("events",),
-    ("law", "impacts", "audits", "registry"),
-    ("laws",),
-)
-
-
-def test_imports_go_one_way():
-    """Inside functions, too; of the rooms above the laws only that nothing below imports them."""
-    floor = {room: i for i, rooms in enumerate(FLOORS) for room in rooms}
-    root = Path(ji.__file__).parent
-    for path in root.rglob("*.py"):
-        room = path.relative_to(root).parts[0].removesuffix(".py")
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("jimpact."):
-                imported = node.module.split(".")[1]
-                above = floor.get(imported, len(FLOORS))
-                assert above <= floor.get(room, len(FLOORS)), (path.name, node.module)

@@ -1,0 +1,151 @@
+"""The house: each room imports from the storeys below it, by stated names, and can stand alone."""
+
+import ast
+import importlib.util
+import subprocess
+import sys
+from collections import defaultdict
+from pathlib import Path
+
+import pytest
+
+import jimpact as ji
+
+PACKAGE = Path(ji.__file__).parent
+ROOT = PACKAGE.parent
+
+
+def table():
+    spec = importlib.util.spec_from_file_location("pages", ROOT / "docs" / "pages.py")
+    pages = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(pages)
+    return pages
+
+
+PAGES = table()
+STOREY = {room: -row for row, rooms in enumerate(PAGES.ROOMS) for room, _ in rooms}
+
+
+def room_of(module):
+    return module.split(".")[1] if "." in module else ""
+
+
+def imports_of(path):
+    """(module, name, line) of what a file imports from the package, inside functions, too."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            rows = [(alias.name, "") for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and not node.level:
+            rows = [(node.module, alias.name) for alias in node.names]
+        else:
+            continue
+        for module, name in rows:
+            if (
+                name
+                and (PACKAGE.parent / f"{module}.{name}".replace(".", "/"))
+                .with_suffix(".py")
+                .exists()
+            ):
+                module, name = f"{module}.{name}", ""
+            if module.partition(".")[0] == "jimpact":
+                yield module, name, node.lineno
+
+
+def modules(folder=PACKAGE):
+    return {
+        ".".join(path.relative_to(folder.parent).with_suffix("").parts): path
+        for path in folder.rglob("*.py")
+        if path.name != "__init__.py"
+    }
+
+
+def wrong_imports(files, storey=STOREY):
+    """A sentence for each import that goes sideways or up."""
+    for module, path in files.items():
+        mine = room_of(module)
+        for imported, _, line in imports_of(path):
+            other = room_of(imported)
+            if other not in ("", mine) and storey[other] >= storey[mine]:
+                below = sorted(room for room in storey if storey[room] < storey[mine])
+                yield (
+                    f"{path.name}:{line}: {mine} imports {imported}, but may use only "
+                    f"{', '.join(below)}"
+                )
+
+
+def stated_names():
+    """(module, name) that the stubs of the package and of its rooms state."""
+    for stub in PACKAGE.rglob("__init__.pyi"):
+        base = ".".join(stub.parent.relative_to(PACKAGE.parent).parts)
+        for node in ast.walk(ast.parse(stub.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom):
+                module = f"{base}.{node.module}" if node.level else node.module
+                yield from ((module, alias.name) for alias in node.names)
+
+
+def test_every_module_has_a_room():
+    assert {room_of(module) for module in modules()} == set(STOREY)
+
+
+def test_imports_go_down():
+    assert not list(wrong_imports(modules()))
+
+
+def test_a_room_that_imports_sideways_is_told_where(tmp_path):
+    wrong = tmp_path / "gaps.py"
+    wrong.write_text(
+        "import numpy\nfrom jimpact.core.scene import Scene\nimport jimpact.motion.system\n"
+    )
+    (said,) = wrong_imports({"jimpact.theory.gaps": wrong})
+    assert said.startswith(
+        "gaps.py:3: theory imports jimpact.motion.system, but may use only bodies, "
+    )
+
+
+def test_rooms_above_the_laws_use_stated_names():
+    stated, above = set(stated_names()), STOREY["laws"]
+    assert stated
+    unstated = [
+        f"{path.name}:{line}: {imported}.{name}"
+        for module, path in modules().items()
+        if STOREY[room_of(module)] > above
+        for imported, name, line in imports_of(path)
+        if room_of(imported) in PAGES.STATED and (imported, name) not in stated
+    ]
+    assert not unstated
+
+
+def test_no_file_stands_on_itself():
+    uses = defaultdict(set)
+    for module, path in modules().items():
+        uses[module] = {imported for imported, _, _ in imports_of(path)}
+    for module in list(uses):
+        reached, waiting = set(), list(uses[module])
+        while waiting:
+            if (each := waiting.pop()) not in reached:
+                reached.add(each)
+                waiting += uses[each]
+        assert module not in reached
+
+
+ALONE = """
+import importlib, sys
+
+class Blocked:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[:2] in [["jimpact", room] for room in {blocked}]:
+            raise ImportError(f"{{name}} is blocked")
+
+sys.meta_path.insert(0, Blocked())
+for module in {modules}:
+    importlib.import_module(module)
+"""
+
+
+@pytest.mark.parametrize("room", sorted(STOREY))
+def test_a_room_imports_while_those_beside_and_above_it_are_blocked(room):
+    blocked = [other for other in STOREY if other != room and STOREY[other] >= STOREY[room]]
+    own = sorted(m for m in modules() if room_of(m) == room and not m.endswith("__main__"))
+    script = ALONE.format(blocked=blocked, modules=own)
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr[-600:]
