@@ -2,6 +2,7 @@
 
 import ast
 import importlib.util
+import re
 import subprocess
 import sys
 from collections import defaultdict
@@ -113,6 +114,19 @@ def test_rooms_above_the_laws_use_stated_names():
         if room_of(imported) in PAGES.STATED and (imported, name) not in stated
     ]
     assert not unstated
+
+
+def test_the_page_for_writers_of_rooms_lists_the_names_of_the_core():
+    page = (ROOT / "docs" / "own_room.md").read_text(encoding="utf-8")
+    stub = (PACKAGE / "core" / "__init__.pyi").read_text(encoding="utf-8")
+    core = {
+        alias.name
+        for node in ast.parse(stub).body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    listed = set(re.findall(r"^\|.*\| `(\w+)` \| \S", page, re.MULTILINE))
+    assert listed == core
 
 
 def test_no_file_stands_on_itself():
