@@ -24,13 +24,18 @@ GENERATED = DOCS / "generated"
 # ------------------------------------------------------------------------------------ the API
 
 API = {  # a page, and the modules whose public names it holds: the longest match decides
-    "Impacts": ("impacts", "audits", "laws.histories", "status"),
-    "Scenes": ("scene", "bodies.functions.scene_from_gaps", "bodies.mujoco_scene", "contact"),
+    "Impacts": ("core.impacts", "core.audits", "laws.histories", "tools.status"),
+    "Scenes": (
+        "core.scene",
+        "bodies.functions.scene_from_gaps",
+        "bodies.mujoco_scene",
+        "core.contact",
+    ),
     "Bodies": ("bodies",),
-    "Laws": ("law", "registry", "laws"),
+    "Laws": ("core.law", "core.registry", "laws"),
     "Contact forces": ("laws.forces", "laws.calibration"),
     "Shots and fits": ("fits", "cli", "saved"),
-    "Monte Carlo": ("montecarlo",),
+    "Monte Carlo": ("montecarlo", "core.distributions"),
     "Motions": ("motion",),
     "Methods": ("methods",),
     "Pictures": ("plot",),
@@ -50,10 +55,14 @@ def public_names() -> dict[str, list[str]]:
     for package, prefix in (("", ""), ("plot", "plot."), ("theory", "theory."), ("data", "data.")):
         stub = ROOT / "jimpact" / package / "__init__.pyi"
         for line in ast.parse(stub.read_text(encoding="utf-8")).body:
-            if not isinstance(line, ast.ImportFrom) or line.module is None:
+            if isinstance(line, ast.ImportFrom) and line.module:
+                module, names = line.module, [alias.name for alias in line.names]
+            elif isinstance(line, ast.Assign):  # names of another room
+                module, names = package, [ast.unparse(target) for target in line.targets]
+            else:
                 continue
-            for name in line.names:
-                place = f"{package or line.module}.{name.name}"
+            for name in names:
+                place = f"{package or module}.{name}"
                 matches = [
                     (len(start), title)
                     for title, starts in API.items()
@@ -62,7 +71,7 @@ def public_names() -> dict[str, list[str]]:
                 ]
                 if not matches:
                     raise ValueError(f"API must have a page for {place}: see docs/pages.py")
-                pages[max(matches)[1]].append(prefix + name.name)
+                pages[max(matches)[1]].append(prefix + name)
     return pages
 
 

@@ -359,7 +359,14 @@ def brick():
     def look(q, v):
         spun = (box.moved(q, v), box.rates(q, v), box.inertial_force(q, v))
         step = [box.gap_function(box.moved(q, s * v)) for s in (1e-6, -1e-6)]
-        return box._parts(q), spun, (step[0] - step[1]) / 2e-6
+        parts = (
+            box.mass_matrix(q),
+            box.normals(q),
+            box.tangents(q),
+            box.gap_function(q),
+            box.valid(q),
+        )
+        return parts, spun, (step[0] - step[1]) / 2e-6
 
     v = np.array([0.3, -0.2, 0.5, 2.0, -1.0, 3.0])
     return box, turn, normal / np.linalg.norm(normal), q, v, look(q, v)

@@ -30,6 +30,9 @@ def names_in_stub(package):
                 assert alias.asname == alias.name, "without `as` a name of a stub is private"
                 module = f"{package.__name__}.{node.module}" if node.module else package.__name__
                 found[alias.name] = module
+        elif isinstance(node, ast.Assign):  # names of another room, by its module
+            module = next(x for x in stub.body if isinstance(x, ast.Import)).names[0].name
+            found[ast.unparse(node.targets[0])] = module
     return found
 
 

@@ -9,7 +9,7 @@ import pytest
 from motion_cases import stack, status
 
 import jimpact as ji
-from jimpact.motion import fitting_motion
+from jimpact.fits import fitting_motion
 from jimpact.motion.dynamics import kinematics
 from jimpact.motion.flow import status_at_start
 from jimpact.motion.simulate import CHUNK

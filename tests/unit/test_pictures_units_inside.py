@@ -1,0 +1,48 @@
+"""Axes of metres and radians a second, on results as if they had been computed."""
+
+import numpy as np
+import pytest
+from canned import canned
+
+import jimpact as ji
+from jimpact.methods.advice_report import Advice, Candidate
+
+
+def block_and_its_pictures():
+    """A block on both corners, which turns and moves, and the pictures of one law for it."""
+    block, before = ji.Block(0.2, 0.6, corners="base"), np.array([0.5, -1.0, 2.0])
+    scene, law = block.scene(), ji.Newton(0.5)
+    comparison = ji.compare(scene, before, {"newton": law})
+    after = np.asarray(comparison.entries["newton"].outcome.velocity)
+    row, none = Candidate(law, scene, after, after, after, 0.1, 0.2, "ok"), np.zeros(2)
+    advice = Advice(
+        "newton", 0.5, True, "newton", before, none, {"newton": row}, (), none, (), 1, None
+    )
+    pictures = (ji.plot.comparison, comparison), (ji.plot.advice, advice)
+    return block, scene, after, pictures
+
+
+def test_metres_and_radians_a_second_have_axes_of_their_own():
+    block, scene, after, pictures = block_and_its_pictures()
+    root = np.sqrt(np.diag(np.asarray(scene.mass)) if scene.mass.ndim == 2 else scene.mass)
+    for picture, result in pictures:
+        shown, _ = picture(result).axes  # without names: one unit for all
+        assert shown.get_ylabel() == "velocity after the impact · √inertia [√J]"
+        drawn = [x.get_ydata()[0] for x in shown.lines if x.get_marker() == "o"]
+        np.testing.assert_allclose(drawn, root * after)
+        moves, turns, _ = picture(result, names=block.velocity_names).axes
+        for axes, unit, wanted in ((moves, "m/s", after[:2]), (turns, "rad/s", after[2:])):
+            assert axes.get_ylabel() == f"velocity after the impact [{unit}]"
+            drawn = [x.get_ydata()[0] for x in axes.lines if x.get_marker() == "o"]
+            np.testing.assert_allclose(drawn, wanted)
+        with pytest.raises(ValueError, match="`names` must have 3 names"):
+            picture(result, names=["x [m]"])
+
+
+def test_measured_metres_and_radians_a_second_have_columns_of_their_own():
+    data = ji.Experiments([1.0, 0.0], [0.2, 0.8], units=["m/s", "rad/s"])
+    problem = ji.FitProblem.from_shots(ji.Newton(0.5), ji.chain([1.0, 1.0]), data)
+    moves, turns, *residuals = ji.plot.fit(canned(1, problem=problem)).axes
+    for axes, unit in ((moves, "m/s"), (turns, "rad/s")):
+        assert axes.get_ylabel() == f"velocity after the impact [{unit}]"
+    assert residuals[1].get_ylabel() == "measured − fitted [rad/s]"
