@@ -48,7 +48,7 @@ class Force(Declared):
         raise NotImplementedError(f"{type(self).__name__} must define `force`.")
 
     def onset(self, x: jax.Array, rate: jax.Array) -> jax.Array:
-        """Sign of the force at x > 0 and rate x'."""
+        """Sign of the force at x >= 0 and rate x', of any dimension; positive at rate 0."""
         return self.force(x, rate)
 
     @property
@@ -280,7 +280,7 @@ class KelvinVoigt(Force):
 
 
 class HuntCrossley(Force):
-    """Damping that grows with the indentation: `F = k x^eta (1 + d x')`.
+    """Damping that grows with the indentation: `F = k x^eta (1 + d x')`, cut at 0.
 
     Args:
         stiffness: k > 0 [N / m^eta].
@@ -294,6 +294,8 @@ class HuntCrossley(Force):
     >>> float(ji.HuntCrossley(2.0, 0.5).force(jnp.array(1.0), jnp.array(0.1)))
     2.1
     """
+
+    slackens: ClassVar[bool] = True
 
     stiffness: Values = parameter(low=0.0, open_low=True, log=True)
     damping: Values = parameter(low=0.0)
@@ -311,6 +313,10 @@ class HuntCrossley(Force):
         eta = jnp.asarray(self.exponent, x.dtype)
         power = jnp.where(positive, jnp.where(positive, x, 1.0) ** eta, 0.0)
         return self.stiffness * power * (1 + self.damping * rate)
+
+    def onset(self, x: jax.Array, rate: jax.Array) -> jax.Array:
+        """`1 + d x'`: where the indentation is 0 the force ends by itself."""
+        return 1 + self.damping * rate + 0.0 * x
 
 
 class KuwabaraKono(Force):
