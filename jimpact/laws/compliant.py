@@ -135,7 +135,7 @@ class Compliant(Law):
         )
         if bistiffness is None:
             speed, depth = units.velocity * units.root, units.indentation
-            onset = jax.lax.stop_gradient(force.onset(depth, jnp.zeros_like(depth)))
+            onset = jax.lax.stop_gradient(force.onset_scale(depth, speed))
             viscous = Viscous(force, depth, speed, units.momentum / units.time, onset)
         problem = problem._replace(viscous=viscous)
         if bistiffness is not None and force.bound is not None:

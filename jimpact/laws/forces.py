@@ -51,6 +51,10 @@ class Force(Declared):
         """Sign of the force at x >= 0 and rate x', of any dimension; positive at rate 0."""
         return self.force(x, rate)
 
+    def onset_scale(self, depth: jax.Array, speed: jax.Array) -> jax.Array:
+        """The largest `onset` at this indentation [m], from rest to this speed [m/s]."""
+        return jnp.maximum(self.onset(depth, jnp.zeros_like(depth)), self.onset(depth, speed))
+
     @property
     def bistiffness(self) -> "Bistiffness | None":
         """The same force as a `Bistiffness`, which stores energy and has a history; else None."""
@@ -358,7 +362,9 @@ class UserForce(Force):
     """A force of your own: `function(x, rate, parameters)`, for arrays (m,); cut at 0.
 
     Args:
-        function: smooth for x > 0; it must push at x > 0, rate = 0.
+        function: smooth for x >= 0; it must push at x > 0, rate = 0. Where F(0) > 0 the contact
+            ends at x = 0 with that force. Contacts that touch at rest can then take any force up
+            to F(0) without motion; this is not resolved (status `max_steps`).
         parameters: any pytree; its arrays are differentiable.
 
     >>> import jimpact as ji

@@ -54,7 +54,7 @@ class ContactScales(NamedTuple):
     speed: jax.Array  # [m/s]
     depth: jax.Array  # [m] indentation at that speed
     force: jax.Array  # [N] at that indentation
-    onset: jax.Array  # `Force.onset` there, of the dimension that it has
+    onset: jax.Array  # of `Force.onset`, of the dimension that it has
     impulse: jax.Array  # [N s]
     slip: jax.Array  # () [m/s] of the whole motion so far
 
@@ -72,8 +72,7 @@ def _contact_scales(force: Force, contacts: Contacts, fastest: jax.Array) -> Con
     w, slip = jnp.diagonal(contacts.delassus)[:m], jnp.maximum(jnp.max(fastest), SLOWEST)
     speed = jnp.maximum(fastest[:m], SLOWEST)
     depth = force.indentation_scale(0.5 * speed**2 / w)
-    still = jnp.zeros_like(depth)
-    push, onset = force.force(depth, still), force.onset(depth, still)
+    push, onset = force.force(depth, jnp.zeros_like(depth)), force.onset_scale(depth, speed)
     return jax.lax.stop_gradient(ContactScales(speed, depth, push, onset, speed / w, slip))
 
 

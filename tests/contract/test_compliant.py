@@ -259,6 +259,18 @@ def test_user_forces():
     assert float(out.energy_change) == pytest.approx(0, abs=1e-7)
 
 
+def test_a_force_that_is_cut_at_0_keeps_the_tolerance():
+    """Hunt-Crossley, while a heavy ball drives a light one: the cut is an event."""
+    k, d, gaps = np.array([1.0, 4.0]), np.array([2.5, 1.0]), np.array([0.0, 0.03])
+    masses, v = [4.0, 0.03, 0.6], np.array([11.0, 0.0, -0.7])
+    force = FORCES["hunt-crossley"]
+    after = jax.jit(
+        lambda d: ji.impact(ji.Compliant(force[0](k, d)), ji.chain(masses, gaps=gaps), v)
+    )(d)
+    expected = viscous(*chain_matrices(masses), v, force[1](k, d), gaps, onset=force[2](k, d))
+    np.testing.assert_allclose(after.velocity, expected, atol=1.5e-8 * 11)
+
+
 def test_forces_that_are_positive_at_touch():
     """A contact ends at x = 0 with the force that it has there, elastic or damped.
 
