@@ -295,7 +295,7 @@ def test_forces_that_are_positive_at_touch():
     np.testing.assert_allclose(wall.velocity[:, 0], [0.8, 0.8, 0.8, u], atol=1e-8)
     np.testing.assert_allclose(chain.energy_change[:3], 0.0, atol=1e-8)
     assert float(chain.energy_change[3]) < -0.01
-    assert not np.any(wall.status) and not np.any(chain.status)
+    assert not np.any([*wall.status, *chain.status])
 
 
 @pytest.mark.slow
