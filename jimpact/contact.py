@@ -49,9 +49,9 @@ class Contact(eqx.Module):
     u = H^T v, normal impulses p and tangential impulses p_t.
 
     Open contacts are decoupled (their rows of W are 0 off the diagonal, gamma- = 0, no stored
-    energy), unless the law uses gaps, and so are contacts that bilateral constraints hold; gap velocities within `noise` are 0. `impact` always calls
-    `impulses`. If no contact approaches or stores energy, it passes gamma- = -1 and discards the
-    result, so that gradients stay finite.
+    energy), unless the law uses gaps, and so are contacts that bilateral constraints hold; gap
+    velocities within `noise` are 0. `impact` always calls `impulses`. If no contact approaches or
+    stores energy, it passes gamma- = -1 and discards the result, so that gradients stay finite.
 
     Args:
         delassus: W (m, m) [1/kg], or a `Tridiagonal` (a chain) or `Sparse` (a packing).
