@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact.core.scene import Scene, gap_velocity, solve_mass, without_constraints
+from jimpact.numerics.dense import solve_definite
 from jimpact.numerics.sparse import Sparse, components
 from jimpact.numerics.tangential import TangentialBlock
 from jimpact.numerics.tridiagonal import (
@@ -48,9 +49,9 @@ class Contact(eqx.Module):
     u = H^T v, normal impulses p and tangential impulses p_t.
 
     Open contacts are decoupled (their rows of W are 0 off the diagonal, gamma- = 0, no stored
-    energy), unless the law uses gaps; gap velocities within `noise` are 0. `impact` always calls
-    `impulses`. If no contact approaches or stores energy, it passes gamma- = -1 and discards the
-    result, so that gradients stay finite.
+    energy), unless the law uses gaps, and so are contacts that bilateral constraints hold; gap
+    velocities within `noise` are 0. `impact` always calls `impulses`. If no contact approaches or
+    stores energy, it passes gamma- = -1 and discards the result, so that gradients stay finite.
 
     Args:
         delassus: W (m, m) [1/kg], or a `Tridiagonal` (a chain) or `Sparse` (a packing).
@@ -250,9 +251,35 @@ def contact_of(
         noise=noise,
         tangential_block=block,
     )
+    if scene.constraints is not None:
+        contact = _without_held(contact, held_by_constraints(scene))
     if scene.gaps is None:
         return contact
-    return _taking_part(contact, scene.gaps < jnp.inf if uses_gaps else scene.closed)
+    return _taking_part(contact, scene.gaps < jnp.inf if uses_gaps else contact.closed)
+
+
+@full_precision
+def held_by_constraints(scene: Scene) -> jax.Array:
+    """Contacts (m,) whose normal is a combination of bilateral constraints, within rounding.
+
+    They cannot move. W_jj, a small difference of large numbers, does not show it: what decides is
+    the residual of the normal, the part of it that no reactions of the constraints balance.
+    """
+    free, h = without_constraints(scene), scene.constraints
+    moved = solve_mass(free, h)
+    reactions = solve_definite(h.T @ moved, moved.T @ scene.normals)
+    left = scene.normals - h @ reactions
+    square = jnp.sum(left * solve_mass(free, left), axis=0)
+    return square <= precision(square.dtype).noise * kinetic_norm(scene) ** 2
+
+
+def _without_held(contact: Contact, held: jax.Array) -> Contact:
+    """The contact where those `held` (m,) take no part, like open ones with the free W_jj."""
+    own = jnp.diag(jnp.where(held, contact.norm**2, diagonal(contact.delassus)))
+    w = jnp.where(jnp.eye(held.shape[0], dtype=bool), own, contact.normal_delassus)
+    closed, stored = contact.closed & ~held, jnp.where(held, 0.0, contact.stored)
+    contact = dataclasses.replace(contact, delassus=w, closed=closed, stored=stored)
+    return _taking_part(contact, ~held)
 
 
 def _taking_part(contact: Contact, part: jax.Array) -> Contact:
@@ -486,6 +513,7 @@ def contacts_of_groups(
         columns = jnp.concatenate([columns, scene.tangents], axis=1)
         slip = scene.tangents.T @ velocity
     moved = solve_mass(scene, columns)
+    held = None if scene.constraints is None else held_by_constraints(scene)
 
     def contacts_of(padded: np.ndarray) -> Contact:
         """The contacts of groups of one size."""
@@ -507,6 +535,8 @@ def contacts_of_groups(
             noise=noise[index],
             tangential_block=block,
         )
-        return jax.vmap(_taking_part)(contact, part)
+        if held is not None:
+            contact = jax.vmap(_without_held)(contact, held[index])
+        return jax.vmap(_taking_part)(contact, contact.closed)
 
     return [contacts_of(padded) for padded in groups]

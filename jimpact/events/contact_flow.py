@@ -18,7 +18,8 @@ MODES (rows)   phase (m), how often each contact has closed (m); with friction t
 A contact is OPEN, in COMPRESSION or in EXPANSION. Without gaps the geometry is frozen: an open
 contact closes as soon as gamma < 0. With gaps (`gapped`) it keeps track of x = -gap and closes when
 that returns to 0. A `viscous` force replaces the power law; it never pulls, so that a contact
-may be SLACK: x > 0, and no force. With a `limit` of x the force is bounded: the contact YIELDS at
+may be SLACK: x > 0, and no force. It opens at x = 0, from SLACK or, with what force it has there,
+from COMPRESSION. With a `limit` of x the force is bounded: the contact YIELDS at
 x = limit until it expands, and what it takes up meanwhile is lost.
 """
 
@@ -113,6 +114,7 @@ class Viscous(NamedTuple):
     indentation: jax.Array  # [m]
     speed: jax.Array  # [m/s]
     force: jax.Array  # [N]
+    onset_unit: jax.Array  # of `onset`, whose dimension is the model's own
 
     def push(self, x: jax.Array, gamma: jax.Array) -> jax.Array:
         """Dimensionless force, not tensile."""
@@ -121,7 +123,8 @@ class Viscous(NamedTuple):
 
     def onset(self, x: jax.Array, gamma: jax.Array) -> jax.Array:
         """Smooth function with the sign of the force, of order 1."""
-        return self._value("onset", x * self.indentation, gamma) / self.force
+        x = jnp.where(x >= 0, x, 0.0) * self.indentation
+        return self._value("onset", x, gamma) / self.onset_unit
 
     def _value(self, name: str, x: jax.Array, gamma: jax.Array) -> jax.Array:
         """A force knows contacts (m,), not batches."""
@@ -396,13 +399,15 @@ class ContactFlow(Flow):
             onset = self.viscous.onset(x, g)  # type: ignore[union-attr]
             compressed, slack = phase == Phase.COMPRESSION, phase == Phase.SLACK
             by_x = jnp.where(compressed, onset, jnp.where(slack, -onset, by_x))
-            by_g = jnp.where(compressed, 1.0, jnp.where(slack, x, by_g))
+            by_g = jnp.where(compressed | slack, x, by_g)
         return jnp.concatenate([by_x, by_g])
 
     def rooted(self, modes: jax.Array) -> jax.Array:
         """Openings: x falls to 0 like the square of the time left."""
-        opens = modes[: self.contacts] == Phase.EXPANSION
-        return jnp.concatenate([opens, jnp.zeros_like(opens)])
+        phase = modes[: self.contacts]
+        opens = phase == Phase.EXPANSION
+        by_g = (phase == Phase.COMPRESSION) & self.slackens
+        return jnp.concatenate([opens, by_g])
 
     def switch(
         self, modes: jax.Array, y: jax.Array, which: jax.Array
@@ -414,7 +419,7 @@ class ContactFlow(Flow):
         by_x, by_g = which[:m], which[m : 2 * m]
         if self.slackens:
             after = self._slackening(phase, by_x, by_g)
-            opened = by_g & (phase == Phase.SLACK)
+            opened = by_g & (phase != Phase.OPEN)
             closed = by_x & (phase == Phase.OPEN)
             x = jnp.where(opened | closed, 0.0, x)
         else:
@@ -442,7 +447,7 @@ class ContactFlow(Flow):
         after = jnp.where(by_x & (phase == Phase.COMPRESSION), Phase.SLACK, phase)
         free = (phase == Phase.SLACK) | (phase == Phase.OPEN)
         after = jnp.where(by_x & free, Phase.COMPRESSION, after)
-        return jnp.where(by_g & (phase == Phase.SLACK), Phase.OPEN, after)
+        return jnp.where(by_g & ~(phase == Phase.OPEN), Phase.OPEN, after)
 
     def begins(self, before: jax.Array, after: jax.Array) -> jax.Array:
         """Behind a gap x sets in like t; without gaps like t^2, and forces are smooth enough."""

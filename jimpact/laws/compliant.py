@@ -134,8 +134,9 @@ class Compliant(Law):
             contact.gaps,
         )
         if bistiffness is None:
-            speed = units.velocity * units.root
-            viscous = Viscous(force, units.indentation, speed, units.momentum / units.time)
+            speed, depth = units.velocity * units.root, units.indentation
+            onset = jax.lax.stop_gradient(force.onset_scale(depth, speed))
+            viscous = Viscous(force, depth, speed, units.momentum / units.time, onset)
         problem = problem._replace(viscous=viscous)
         if bistiffness is not None and force.bound is not None:
             depth = (force.bound / k) ** (1 / jnp.asarray(exponent, k.dtype))

@@ -51,8 +51,12 @@ class Force(Declared):
         raise NotImplementedError(f"{type(self).__name__} must define `force`.")
 
     def onset(self, x: jax.Array, rate: jax.Array) -> jax.Array:
-        """Sign of the force at x > 0 and rate x'."""
+        """Sign of the force at x >= 0 and rate x', of any dimension; positive at rate 0."""
         return self.force(x, rate)
+
+    def onset_scale(self, depth: jax.Array, speed: jax.Array) -> jax.Array:
+        """The largest `onset` at this indentation [m], from rest to this speed [m/s]."""
+        return jnp.maximum(self.onset(depth, jnp.zeros_like(depth)), self.onset(depth, speed))
 
     @property
     def bistiffness(self) -> "Bistiffness | None":
@@ -283,7 +287,7 @@ class KelvinVoigt(Force):
 
 
 class HuntCrossley(Force):
-    """Damping that grows with the indentation: `F = k x^eta (1 + d x')`.
+    """Damping that grows with the indentation: `F = k x^eta (1 + d x')`, cut at 0.
 
     Args:
         stiffness: k > 0 [N / m^eta].
@@ -297,6 +301,8 @@ class HuntCrossley(Force):
     >>> float(ji.HuntCrossley(2.0, 0.5).force(jnp.array(1.0), jnp.array(0.1)))
     2.1
     """
+
+    slackens: ClassVar[bool] = True
 
     stiffness: Values = parameter(low=0.0, open_low=True, log=True)
     damping: Values = parameter(low=0.0)
@@ -314,6 +320,10 @@ class HuntCrossley(Force):
         eta = jnp.asarray(self.exponent, x.dtype)
         power = jnp.where(positive, jnp.where(positive, x, 1.0) ** eta, 0.0)
         return self.stiffness * power * (1 + self.damping * rate)
+
+    def onset(self, x: jax.Array, rate: jax.Array) -> jax.Array:
+        """`1 + d x'`: where the indentation is 0 the force ends by itself."""
+        return 1 + self.damping * rate + 0.0 * x
 
 
 class KuwabaraKono(Force):
@@ -355,7 +365,9 @@ class UserForce(Force):
     """A force of your own: `function(x, rate, parameters)`, for arrays (m,); cut at 0.
 
     Args:
-        function: smooth for x > 0; it must push at x > 0, rate = 0.
+        function: smooth for x >= 0; it must push at x > 0, rate = 0. Where F(0) > 0 the contact
+            ends at x = 0 with that force. Contacts that touch at rest can then take any force up
+            to F(0) without motion; this is not resolved (status `max_steps`).
         parameters: any pytree; its arrays are differentiable.
 
     >>> import jimpact as ji

@@ -54,6 +54,7 @@ class ContactScales(NamedTuple):
     speed: jax.Array  # [m/s]
     depth: jax.Array  # [m] indentation at that speed
     force: jax.Array  # [N] at that indentation
+    onset: jax.Array  # of `Force.onset`, of the dimension that it has
     impulse: jax.Array  # [N s]
     slip: jax.Array  # () [m/s] of the whole motion so far
 
@@ -71,9 +72,8 @@ def _contact_scales(force: Force, contacts: Contacts, fastest: jax.Array) -> Con
     w, slip = jnp.diagonal(contacts.delassus)[:m], jnp.maximum(jnp.max(fastest), SLOWEST)
     speed = jnp.maximum(fastest[:m], SLOWEST)
     depth = force.indentation_scale(0.5 * speed**2 / w)
-    return jax.lax.stop_gradient(
-        ContactScales(speed, depth, force.force(depth, jnp.zeros_like(depth)), speed / w, slip)
-    )
+    push, onset = force.force(depth, jnp.zeros_like(depth)), force.onset_scale(depth, speed)
+    return jax.lax.stop_gradient(ContactScales(speed, depth, push, onset, speed / w, slip))
 
 
 class CompliantFlow(MotionFlow):
@@ -155,9 +155,9 @@ class CompliantFlow(MotionFlow):
         """By indentation, then by velocity (2 m,)."""
         gamma, depth = rate / self.scales.speed, x / self.scales.depth
         if self.force.slackens:
-            onset = self.force.onset(x, -rate) / self.scales.force
+            onset = self.force.onset(jnp.where(x >= 0, x, 0.0), -rate) / self.scales.onset
             by_x = jnp.where(const == Phase.COMPRESSION, onset, -onset)
-            by_g = jnp.where(const == Phase.SLACK, depth, 1.0)
+            by_g = depth
         else:
             by_x = jnp.where(const == Phase.EXPANSION, depth, 1.0)
             by_g = jnp.where(const == Phase.COMPRESSION, -gamma, gamma)
@@ -166,9 +166,11 @@ class CompliantFlow(MotionFlow):
 
     def rooted(self, modes: jax.Array) -> jax.Array:
         """Openings, by the root of the indentation."""
-        opens = self.constants(modes).phase[:, None] == Phase.EXPANSION
-        rest = jnp.zeros((self.rounding.shape[0] - opens.shape[0], 1), bool)
-        return jnp.concatenate([opens, rest])
+        phase = self.constants(modes).phase[:, None]
+        opens = phase == Phase.EXPANSION
+        by_g = (phase == Phase.COMPRESSION) & self.force.slackens
+        rest = jnp.zeros((self.rounding.shape[0] - 2 * opens.shape[0], 1), bool)
+        return jnp.concatenate([opens, by_g, rest])
 
     def switch(
         self, modes: jax.Array, y: jax.Array, which: jax.Array
@@ -181,7 +183,7 @@ class CompliantFlow(MotionFlow):
         if self.force.slackens:
             after = jnp.where(by_x & (phase == Phase.COMPRESSION), Phase.SLACK, phase)
             after = jnp.where(by_x & (phase == Phase.SLACK), Phase.COMPRESSION, after)
-            opened = by_g & (phase == Phase.SLACK)
+            opened = by_g
         else:
             turned = by_g & (phase == Phase.COMPRESSION)
             after = jnp.where(turned, Phase.EXPANSION, phase)

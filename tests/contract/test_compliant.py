@@ -276,6 +276,45 @@ def test_user_forces():
     assert float(out.energy_change) == pytest.approx(0, abs=1e-7)
 
 
+def test_a_force_that_is_cut_at_0_keeps_the_tolerance():
+    """Hunt-Crossley, while a heavy ball drives a light one: the cut is an event."""
+    k, d, gaps = np.array([1.0, 4.0]), np.array([2.5, 1.0]), np.array([0.0, 0.03])
+    masses, v = [4.0, 0.03, 0.6], np.array([11.0, 0.0, -0.7])
+    force = FORCES["hunt-crossley"]
+    after = jax.jit(
+        lambda d: ji.impact(ji.Compliant(force[0](k, d)), ji.chain(masses, gaps=gaps), v)
+    )(d)
+    expected = viscous(*chain_matrices(masses), v, force[1](k, d), gaps, onset=force[2](k, d))
+    np.testing.assert_allclose(after.velocity, expected, atol=1.5e-8 * 11)
+
+
+def test_forces_that_are_positive_at_touch():
+    """A contact ends at x = 0 with the force that it has there, elastic or damped.
+
+    `F = g(x) (1 + c x')` at a wall: `log((1 + c v) / (1 - c u)) = c (v + u)`, whatever g is.
+    """
+
+    @jax.jit
+    @jax.vmap
+    def run(preload, damping):
+        force = ji.UserForce(
+            lambda x, rate, p: (p[0] + 40.0 * x + 70.0 * x**2) * (1 + p[1] * rate),
+            jnp.stack([preload, damping]),
+        )
+        law = ji.Compliant(force)
+        gapped = ji.chain([0.7, 1.9, 1.1], gaps=[0.3, 0.05])
+        chain = ji.impact(law, gapped, [1.2, 0.2, -0.4])
+        return ji.impact(law, ji.Scene([2.3], [[1.0]]), [-0.8]), chain
+
+    c = 0.9
+    wall, chain = run(jnp.array([0.0, 2.0, 25.0, 6.0]), jnp.array([0.0, 0.0, 0.0, c]))
+    u = brentq(lambda u: np.log((1 + 0.8 * c) / (1 - u * c)) - c * (0.8 + u), 0.1, 0.8, xtol=1e-14)
+    np.testing.assert_allclose(wall.velocity[:, 0], [0.8, 0.8, 0.8, u], atol=1e-8)
+    np.testing.assert_allclose(chain.energy_change[:3], 0.0, atol=1e-8)
+    assert float(chain.energy_change[3]) < -0.01
+    assert not np.any([*wall.status, *chain.status])
+
+
 @pytest.mark.slow
 def test_many_balls_strike_many():
     """M of ten Hertz balls strike the others: M + 2 go forward with 99 % of the energy; M = 7: 8."""

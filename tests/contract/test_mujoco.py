@@ -181,6 +181,19 @@ def test_equality_constraints_are_bilateral_constraints(storage):
     assert v[2] == pytest.approx(-1.0, abs=2e-3)
 
 
+def test_a_welded_foot_and_a_locked_joint_at_its_stop_take_no_part():
+    hinge = '<joint name="hinge" axis="0 1 0" range="-40 0" limited="true"/>'
+    arm = body("0 2 .5", 'type="sphere" size=".05" pos=".3 0 0" mass="2"', hinge, name="arm")
+    held = '<equality><joint joint1="hinge"/><weld body1="a"/></equality>'
+    model, data = load(LINKED + arm, rest=held)
+    data.qvel[8] = -1.4
+    world = ji.from_mujoco(model, data)
+    assert world.scene.contacts == 3
+    out = ji.impact(ji.Newton(0.3), world.scene, world.velocity)
+    assert ji.STATUS[int(out.status)].name == "ok"
+    np.testing.assert_allclose(sorted(out.impulse), [0.0, 0.0, 3.0 * 1.3 * 1.4], atol=1e-9)
+
+
 def test_velocities_against_constraints_are_named():
     model, data = load(LINKED, rest=JOINED)
     data.qvel[[2, 8]] = -1.0, 1.0

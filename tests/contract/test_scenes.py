@@ -117,6 +117,44 @@ def test_welded_bodies_are_one(name):
     assert bool(momentum)
 
 
+HOLDS = {
+    "newton": lambda: ji.Newton(0.4),
+    "moreau": lambda: ji.Moreau(0.4, friction=0.3),
+    "poisson": lambda: ji.Poisson(0.4, friction=0.3),
+    "lzb": lambda: ji.LZB(0.4, friction=0.3, initial_energy=jnp.array([0.0, 0.2])),
+    "binary": lambda: ji.Binary(0.4),
+    "compliant": lambda: ji.Compliant(ji.Bistiffness(3.0, 1.5, 0.4), friction=0.3),
+}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [x if x in ("newton", "moreau") else pytest.param(x, marks=pytest.mark.slow) for x in HOLDS],
+)
+def test_contacts_that_constraints_hold_take_no_part(name):
+    """A foot welded to the ground that it touches, exactly and by rounding, beside a ball."""
+    rng = np.random.default_rng(7)
+    held = rng.normal(size=(20, 3, 2))
+    held[0] = [[0.0, 1.0], [1.0, 0.0], [0.0, 0.0]]
+    weights = np.concatenate([[[0.0, 1.0]], rng.normal(size=(19, 2))])
+
+    @jax.jit
+    @jax.vmap
+    def run(held, weights):  # coordinates: position and height of the ball, three of the foot
+        constraints = jnp.concatenate([jnp.zeros((2, 2)), held])
+        foot = jnp.concatenate([jnp.zeros(2), held @ weights])
+        normals = jnp.stack([jnp.array([0.0, 1.0, 0.0, 0.0, 0.0]), foot], axis=1)
+        tangents = jnp.zeros((5, 2)).at[0, 0].set(1.0).at[4, 1].set(1.0)
+        mass = jnp.diag(jnp.array([1.5, 1.5, 0.7, 0.9, 2.0])) + 0.1
+        scene = ji.Scene(mass, normals, tangents, constraints=constraints)
+        return ji.impact(HOLDS[name](), scene, [0.8, -1.2, 0.0, 0.0, 0.0])
+
+    out = run(held, weights)
+    assert set(np.asarray(out.status)) == {0}
+    np.testing.assert_array_equal(out.impulse[:, 1], 0.0)
+    np.testing.assert_allclose(out.velocity[:, 1], 0.4 * 1.2, atol=1e-7)
+
+
 def built(make, *given, at=(), **options):
     """Scene of a body, touching at this angle, .., made in one program."""
 
