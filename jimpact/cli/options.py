@@ -172,8 +172,8 @@ class MonteCarloCommand(DrawingCommand):
     """Number of samples; default: the study's, or 100000."""
     seed: Count = None
     """Seed; default: the study's, or 0."""
-    executor: str = "serial"
-    """serial, devices (all of the process), dask (here), or the address of a Dask scheduler."""
+    executor: str = "threads"
+    """threads (one a core), serial, devices, dask (here), or the address of a Dask scheduler."""
     folder: Folder = None
     """Folder of finished chunks; the same command again continues from there."""
     keep_samples: Flag = False

@@ -24,6 +24,7 @@ from jimpact.montecarlo.statistics import Chunk, Task, joined
 from jimpact.montecarlo.store import Store
 from jimpact.tools.checks import check_executor, in_common_dtype, needed
 from jimpact.tools.progress import counting_bar
+from jimpact.tools.threads import as_workers, in_threads
 
 CHUNK = 4096  # samples: fast on a CPU for cheap and costly laws alike; a GPU wants more
 BINS = 1000  # of a histogram; ten times more: quantiles finer than 100 000 samples determine them
@@ -43,7 +44,8 @@ def monte_carlo(
     key: Any = 0,
     *,
     chunk: int = CHUNK,
-    executor: Any = "serial",
+    executor: Any = "threads",
+    workers: int | None = None,
     folder: str | Path | None = None,
     keep_samples: bool = False,
     bins: int = BINS,
@@ -65,9 +67,10 @@ def monte_carlo(
         samples: number of samples; default: that of the passed samples, or 100 000.
         key: a JAX random key, or an integer seed.
         chunk: samples computed together; changing it changes the random samples.
-        executor: 'serial', 'devices' (all JAX devices), 'dask' (processes on this machine), the
-            address of a Dask scheduler, or anything with a `map` (a Dask client, an executor of
-            `concurrent.futures`).
+        executor: 'threads', 'serial' (one chunk after another), 'devices' (all JAX devices), 'dask'
+            (processes on this machine), the address of a Dask scheduler, or anything with a `map`
+            (a Dask client, an executor of `concurrent.futures`).
+        workers: threads >= 1 of 'threads'; None: one for each core that the process may use.
         folder: where every finished chunk is stored; the same call again continues from it, and
             may ask for more samples.
         keep_samples: store the raw samples in the folder, too (`read_samples`).
@@ -97,10 +100,16 @@ def monte_carlo(
     """
     run = planned_run(Sources(law, velocity, gaps), scene, samples, key, chunk, bins, keep_samples)
     check_executor(executor)
+    if workers is not None and executor != "threads":
+        raise ValueError(
+            "Argument `workers` must be left out but for executor='threads', but has value "
+            f"{workers!r} for {executor!r}."
+        )
+    workers = as_workers(workers)
     if keep_samples and folder is None:
         raise ValueError("Argument `folder` must be given to keep samples, but is None.")
     store = None if folder is None else Store(folder, run.identity)
-    total, resumed, rate = _total(run, executor, store, progress)
+    total, resumed, rate = _total(run, executor, workers, store, progress)
     result = result_of(run, total, resumed, rate, _gap_scale(run.sources, scene))
     failed = result.samples - result.count
     if failed:
@@ -114,7 +123,7 @@ def monte_carlo(
 
 
 def _total(
-    run: Run, executor: Any, store: Store | None, progress: float | None
+    run: Run, executor: Any, workers: int, store: Store | None, progress: float | None
 ) -> tuple[Chunk, int, float]:
     """All chunks joined in their order, how many samples were read, and computed a second.
 
@@ -144,7 +153,7 @@ def _total(
             total = read(0) or new(run(run.task(0)))  # it sets the histograms
             missing = (n for n in range(1, run.chunks) if n not in stored)
             tasks = (run.task(number, total["ends"]) for number in missing)
-            with closing(_computed(executor, run, tasks)) as chunks:
+            with closing(_computed(executor, workers, run, tasks)) as chunks:
                 for number in range(1, run.chunks):
                     chunk = read(number) if number in stored else new(next(chunks))
                     if chunk is None:
@@ -177,8 +186,11 @@ def _gap_scale(sources: Sources, scene: Scene) -> np.ndarray | None:
 # ------------------------------------------ where chunks are computed, which changes no result
 
 
-def _computed(executor: Any, run: Run, tasks: Iterable[Task]) -> Generator[Chunk]:
+def _computed(executor: Any, workers: int, run: Run, tasks: Iterable[Task]) -> Generator[Chunk]:
     """`run(task)` for every task, in order."""
+    if executor in ("threads", "serial"):
+        yield from in_threads(run, tasks, workers if executor == "threads" else 1)
+        return
     remaining = iter(tasks)
     with _opened(executor, run) as (mapped, work):
         while window := list(itertools.islice(remaining, WINDOW)):
@@ -189,9 +201,7 @@ def _computed(executor: Any, run: Run, tasks: Iterable[Task]) -> Generator[Chunk
 @contextmanager
 def _opened(executor: Any, run: Run) -> Iterator[tuple[Callable[..., Any], Work]]:
     """The `map` of an executor, and what it maps tasks by."""
-    if executor == "serial":
-        yield map, run
-    elif executor == "devices":
+    if executor == "devices":
         devices = jax.devices()  # each compiles the program once
         with ThreadPoolExecutor(len(devices)) as pool:
             yield pool.map, lambda task: run(task, devices[task.number % len(devices)])

@@ -15,7 +15,12 @@ import numpy as np
 if TYPE_CHECKING:
     import jax
 
-EXECUTORS = ("serial", "devices", "dask")  # where chunks of a Monte Carlo run are computed
+EXECUTORS = (
+    "threads",
+    "serial",
+    "devices",
+    "dask",
+)  # where chunks of a Monte Carlo run are computed
 
 
 def needed(module: str, how: str) -> ModuleType:

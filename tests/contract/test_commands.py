@@ -450,7 +450,10 @@ def test_laws(capsys, tmp_path, monkeypatch):
         (["compare", "--out", "a.txt"], "--out must end in"),
         (["compare", "nowhere.toml"], "does not exist"),
         (["montecarlo", "three_balls.toml"], "must have a [monte_carlo] table"),
-        (["montecarlo", "--executor", "dusk"], "`executor` must be one of serial, devices, dask"),
+        (
+            ["montecarlo", "--executor", "dusk"],
+            "`executor` must be one of threads, serial, devices, dask",
+        ),
         (["montecarlo", "--out", "picture.txt"], "--out must end in"),
         (["simulate", "nothing.toml"], "cradle_motion.toml, discs_in_a_box.toml"),
         (["simulate", "--out", "picture.jpg"], "--out must end in .png"),

@@ -49,6 +49,34 @@ def test_anything_with_a_map(wanted):
     assert same(run("devices"), wanted)
 
 
+@pytest.mark.parametrize("workers", [None, 1, 3])
+def test_threads_change_no_bit(wanted, workers):
+    assert same(run("threads", workers=workers), wanted)
+
+
+def test_what_was_finished_before_an_error_in_a_thread_is_kept(wanted, tmp_path, monkeypatch):
+    """The third chunk fails; the same call continues from the two before it."""
+    import numpy
+
+    stored, fails = [], numpy.savez
+
+    def savez(file, **arrays):
+        if len(stored) == 2:
+            raise KeyboardInterrupt
+        stored.append(int(arrays["number"]))
+        return fails(file, **arrays)
+
+    monkeypatch.setattr(numpy, "savez", savez)
+    with pytest.raises(
+        KeyboardInterrupt, match=r"stopped after 256 of 1,000 samples; .* continues"
+    ):
+        run("threads", workers=2, folder=tmp_path)
+    monkeypatch.undo()
+    assert stored == [0, 1]
+    assert len(list(tmp_path.glob("chunk-*.npz"))) == 2
+    assert same(run("threads", workers=2, folder=tmp_path), wanted)
+
+
 def test_errors_of_a_chunk_come_through():
     class Broken:
         def map(self, work, tasks):
