@@ -15,12 +15,8 @@ import numpy as np
 if TYPE_CHECKING:
     import jax
 
-EXECUTORS = (
-    "threads",
-    "serial",
-    "devices",
-    "dask",
-)  # where chunks of a Monte Carlo run are computed
+# where chunks of a Monte Carlo run are computed
+EXECUTORS = ("threads", "serial", "devices", "dask")
 
 
 def needed(module: str, how: str) -> ModuleType:
