@@ -130,9 +130,7 @@ def _conserved(problem: FitProblem) -> list[np.ndarray]:
         whole = (w > 0).all() and len(rows)
         back = (rows / w).T if whole else np.zeros((len(w), 0))
         if whole and problem.mixing is not None:
-            mixing = np.asarray(problem.mixing[k], float)
-            own = np.arange(k * len(w), (k + 1) * len(w)) % mixing.shape[1]  # given other shots
-            back = np.linalg.solve(mixing[:, own].T, back)
+            back = np.linalg.solve(np.asarray(problem.mixing[k], float).T, back)
         bases.append(np.linalg.qr(back)[0])
     return bases
 

@@ -9,7 +9,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.linalg import block_diag
 
 from jimpact.bodies.base import CLOSED_BELOW, Body
 from jimpact.core.scene import WALLS, Scene, chain, dense_mass, stackable, with_gaps
@@ -25,9 +24,6 @@ from jimpact.tools.checks import (
 # Share of velocities, momenta and readings up to which a difference is rounding, also in files of
 # ten digits. Ten times more would take measured shots for corrected ones no more often.
 ROUNDING = 1e-9
-# Asymmetry of a covariance, relative to its largest entry, that rounding and printing leave. Ten
-# times more would accept one whose sixth digit is wrong.
-_ASYMMETRY = 1e-6
 _PRINTED = 4  # shots that `print` shows
 _VALUES = ("pre", "post", "sigma", "sigma_pre", "resolution")
 
@@ -51,15 +47,10 @@ class Experiments(eqx.Module):
             a `sigma`, or a `resolution`. `fit` passes it on to v+, see `FitProblem`.
         resolution: steps in which `post` was read, (K, n) or a scalar, > 0 [m/s]: readings rounded
             to q have the standard error q / sqrt(12), which is added to sigma (in squares).
-        covariance: of the errors of (v-, v+) of each shot (K, 2 n, 2 n), or of all shots
-            (2 n K, 2 n K), shot by shot, as flights between impacts give it (`ji.tracks`): errors
-            of v- and v+ are then correlated. Instead of sigma, sigma_pre and resolution, which
-            then are its standard errors.
 
     Raises:
         ValueError: no shots, different shapes, NaN in `pre`, infinite values, sigma <= 0, no value
-            measured, scenes that do not belong to these velocities, a covariance that is not
-            symmetric and positive definite.
+            measured, scenes that do not belong to these velocities.
 
     >>> import jimpact as ji
     >>> data = ji.Experiments(pre=[1.0, 0.0], post=[0.26, 0.73], sigma=0.01)
@@ -76,7 +67,6 @@ class Experiments(eqx.Module):
     units: tuple[str, ...] = eqx.field(static=True)
     sigma_pre: jax.Array | None
     resolution: jax.Array | None
-    covariance: jax.Array | None
 
     def __init__(
         self,
@@ -89,7 +79,6 @@ class Experiments(eqx.Module):
         units: Sequence[str] | None = None,
         sigma_pre: Any = None,
         resolution: Any = None,
-        covariance: Any = None,
     ):
         self.pre = _as_rows("pre", pre)
         self.post = _as_rows("post", post)
@@ -103,17 +92,6 @@ class Experiments(eqx.Module):
         measured = ~np.isnan(np.asarray(self.post))
         if not measured.any():
             raise ValueError("Argument `post` must hold a measured value, but all are missing.")
-        self.covariance = None
-        if covariance is not None:
-            others = {"sigma": sigma, "sigma_pre": sigma_pre, "resolution": resolution}
-            given = [f"`{name}`" for name, value in others.items() if value is not None]
-            if given:
-                raise ValueError(
-                    f"Argument `covariance` must be given without {', '.join(given)}: it holds the "
-                    "errors of all velocities."
-                )
-            self.covariance = _as_covariance(covariance, measured)
-            sigma_pre, sigma = _standard_errors(self.covariance, measured)
         self.sigma = _as_sigma("sigma", sigma, measured)
         self.resolution = _as_sigma("resolution", resolution, measured)
         self.sigma_pre = _as_sigma("sigma_pre", sigma_pre, measured | True, zero=True)
@@ -223,11 +201,6 @@ class Experiments(eqx.Module):
         >>> [round(float(v), 6) for v in corrected.post[0]]
         [0.15, 0.85]
         """
-        if self.covariance is not None:
-            raise ValueError(
-                "Argument `covariance` must be None to correct momentum: a fit with covariances "
-                "weighs what violates it already."
-            )
         post, lost = np.array(self.post, dtype=float), list(self.lost)
         for k, (m, pre, row) in enumerate(self.balances(scene)):
             if len(m) == 0 or np.isnan(row).any():
@@ -238,8 +211,7 @@ class Experiments(eqx.Module):
 
     def _with(self, **changed: Any) -> "Experiments":
         """A copy with other fields."""
-        every = {"units": self.units, "covariance": self.covariance}
-        fields = self._of_each_shot() | every | changed
+        fields = self._of_each_shot() | {"units": self.units} | changed
         resolution = fields.pop("resolution")
         copy = Experiments(**fields)
         if resolution is None:
@@ -251,8 +223,6 @@ class Experiments(eqx.Module):
     def _of_each_shot(self) -> dict[str, Any]:
         """What each shot has, by the name of its argument; None: no shot has it."""
         values = {name: getattr(self, name) for name in _VALUES}
-        if self.covariance is not None:  # which the others follow from
-            values |= dict.fromkeys(("sigma", "sigma_pre", "resolution"))
         fields = {name: None if x is None else np.asarray(x) for name, x in values.items()}
         return fields | {"scenes": self.scenes, "shots": self.shots, "lost_freedom": self.lost}
 
@@ -274,8 +244,7 @@ class Experiments(eqx.Module):
         """
         rows = np.arange(len(self.shots))[which]
         fields = self._of_each_shot().items()
-        chosen = {k: None if x is None else [x[i] for i in rows] for k, x in fields}
-        return self._with(**chosen, covariance=_covariance_of(self, rows))
+        return self._with(**{k: None if x is None else [x[i] for i in rows] for k, x in fields})
 
     def __add__(self, other: "Experiments") -> "Experiments":
         """These shots and others, see `join`."""
@@ -305,7 +274,6 @@ class Experiments(eqx.Module):
             ("as many bodies and the same units", [data.units for data in many]),
             ("a `sigma` (or `resolution`) in all or in none", [d.sigma is None for d in many]),
             ("scenes of their own in all or in none", [d.scenes is None for d in many]),
-            ("a `covariance` in all or in none", [d.covariance is None for d in many]),
         ):
             if len(set(same)) > 1:
                 raise ValueError(f"Argument `many` must have {name}.")
@@ -322,22 +290,7 @@ class Experiments(eqx.Module):
         if len(set(joined["shots"])) < len(joined["shots"]):
             sets = enumerate(many, 1)
             joined["shots"] = [f"{i}/{label}" for i, data in sets for label in data.shots]
-        if many[0].covariance is not None:
-            joined["covariance"] = _joined_covariance(many)
         return many[0]._with(**joined)
-
-    def error_of(self, k: int, before: np.ndarray, after: np.ndarray) -> float:
-        """Standard error of `before . v- + after . v+` of shot k; with a sigma of 1 if unknown."""
-        both = np.concatenate([before, after])
-        if self.covariance is not None:
-            block = np.asarray(_covariance_of(self, np.array([k]))).reshape(len(both), -1)
-            return float(np.sqrt(both @ block @ both))
-        n = len(before)
-        pre, post = (
-            None if x is None else np.asarray(x[k], float) for x in (self.sigma_pre, self.sigma)
-        )
-        sigma = [np.zeros(n) if pre is None else pre, np.ones(n) if post is None else post]
-        return float(np.linalg.norm(np.concatenate(sigma) * both))
 
     @property
     def contacts(self) -> np.ndarray:
@@ -468,67 +421,6 @@ def _as_sigma(name: str, value: Any, measured: np.ndarray, zero: bool = False) -
     # the error of a value that was not measured does not matter
     check_values(name, np.where(measured, np.asarray(sigma), 1.0), low=0.0, open_low=not zero)
     return jnp.where(measured, sigma, jnp.nan)
-
-
-def _as_covariance(value: Any, measured: np.ndarray) -> jax.Array:
-    """Covariance of (v-, v+), (K, 2 n, 2 n) or (2 n K, 2 n K), checked."""
-    covariance = as_float_array("covariance", value)
-    check_concrete("covariance", covariance)
-    count, n = measured.shape
-    each, every = (count, 2 * n, 2 * n), (2 * n * count, 2 * n * count)
-    if covariance.shape not in (each, every) and not (count == 1 and covariance.ndim == 2):
-        raise ValueError(
-            f"Argument `covariance` must have shape {each}, of (v-, v+) of each shot, or {every}, "
-            f"of all shots, but has shape {tuple(covariance.shape)}."
-        )
-    if covariance.shape == every and covariance.shape != each:
-        blocks = np.asarray(covariance, float)[None]
-        known = np.hstack([np.ones((count, n), bool), measured]).reshape(1, -1)
-    else:
-        blocks = np.asarray(covariance, float).reshape(-1, 2 * n, 2 * n)
-        known = np.hstack([np.ones((count, n), bool), measured])
-    for k, (block, here) in enumerate(zip(blocks, known)):
-        part = block[np.ix_(here, here)]  # errors of values that were not measured do not matter
-        where = f"shot {k + 1}" if len(blocks) > 1 or count == 1 else "all shots"
-        if not np.isfinite(part).all():
-            raise ValueError(f"Argument `covariance` must be finite, but is not for {where}.")
-        if np.abs(part - part.T).max() > _ASYMMETRY * np.abs(part).max():
-            raise ValueError(f"Argument `covariance` must be symmetric, but is not for {where}.")
-        size = np.sqrt(np.maximum(np.diagonal(part), 0.0))
-        least = np.linalg.eigvalsh(part / np.outer(size, size))[0] if size.all() else 0.0
-        if least <= 0:
-            raise ValueError(
-                f"Argument `covariance` must be positive definite, but for {where} its least "
-                f"eigenvalue, scaled to a unit diagonal, is {least:.3g}."
-            )
-    return covariance if covariance.ndim == 3 or count > 1 else covariance.reshape(each)
-
-
-def _standard_errors(covariance: jax.Array, measured: np.ndarray) -> tuple[Any, Any]:
-    """Those of v- and v+ (K, n) that a covariance holds."""
-    count, n = measured.shape
-    diagonal = jnp.diagonal(covariance, axis1=-2, axis2=-1).reshape(count, 2 * n)
-    sigma = jnp.sqrt(diagonal)
-    return sigma[:, :n], jnp.where(measured, sigma[:, n:], 1.0)
-
-
-def _covariance_of(data: Experiments, rows: np.ndarray) -> np.ndarray | None:
-    """The covariance of some shots."""
-    if data.covariance is None:
-        return None
-    covariance, size = np.asarray(data.covariance), 2 * data.pre.shape[1]
-    if covariance.ndim == 3:
-        return covariance[rows]
-    every = (size * rows[:, None] + np.arange(size)).ravel()
-    return covariance[np.ix_(every, every)]
-
-
-def _joined_covariance(many: Sequence[Experiments]) -> np.ndarray:
-    """The covariance of all shots of several sets, whose errors are independent."""
-    parts = [np.asarray(data.covariance) for data in many]
-    if all(part.ndim == 3 for part in parts):
-        return np.concatenate(parts)
-    return block_diag(*(block_diag(*part) if part.ndim == 3 else part for part in parts))
 
 
 def _as_scenes(scenes: Sequence[Scene], shape: tuple[int, ...]) -> tuple[Scene, ...]:

@@ -104,9 +104,11 @@ class DataBalances:
         self.energies: list[_Defect] = []
         self.resting: list[int] = []  # shots in which no contact that takes part approaches
         self.only_open = True  # whether open ones do in all of these
+        known, unknown = (experiments.sigma, experiments.sigma_pre), np.ones(experiments.pre.shape)
+        errors = [np.asarray(x, float) for x in known if x is not None] or [unknown]
         each = (experiments.each(scene, f) for f in (closed_normals, possible_normals, dense_mass))
-        balances = zip(experiments.balances(scene), *each)
-        for k, ((rows, pre, post), closed, possible, mass) in enumerate(balances):
+        balances = zip(experiments.balances(scene), *each, np.hstack(errors))
+        for k, ((rows, pre, post), closed, possible, mass, sigma) in enumerate(balances):
             if stored_energy == 0 and not _approaches(possible if uses_gaps else closed, pre):
                 self.resting.append(k)
                 self.only_open &= _approaches(possible, pre)
@@ -116,14 +118,13 @@ class DataBalances:
                 excess, scale, before = row @ (post - pre), np.abs(row) @ np.abs(pre), row @ pre
                 back = before < -ROUNDING * scale
                 ratio = 1 + (-excess if back else excess) / scale if scale else np.inf
-                defect = _Defect(
-                    k, excess, scale, before, ratio, experiments.error_of(k, -row, row)
-                )
+                error = np.linalg.norm(np.append(row, -row)[: len(sigma)] * sigma)
+                defect = _Defect(k, excess, scale, before, ratio, float(error))
                 self.momenta.setdefault(j, []).append(defect)
             t_minus, t_plus = 0.5 * pre @ mass @ pre, 0.5 * post @ mass @ post
             gain, ratio = t_plus - t_minus - stored_energy, t_plus / t_minus if t_minus else np.nan
-            error = experiments.error_of(k, -mass @ pre, mass @ post)
-            self.energies.append(_Defect(k, gain, t_minus, t_minus, ratio, error))
+            error = np.linalg.norm(np.append(mass @ post, -mass @ pre)[: len(sigma)] * sigma)
+            self.energies.append(_Defect(k, gain, t_minus, t_minus, ratio, float(error)))
 
     def listed(self, ratios: dict[int, float]) -> str:
         """Shots with their ratios, or the range of the ratios of many."""

@@ -14,7 +14,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.linalg import block_diag
 
 from jimpact.core.law import Law, entries, forward_only, with_entries
 from jimpact.core.scene import Scene, dense_mass, stackable
@@ -88,10 +87,9 @@ class FitProblem:
     all that `fit` does. Each of the `priors` adds a value to the residual, `(x_i - mean) / std`.
 
     Errors S of v- are passed on: with `J = dv+/dv-` of the law, those of a shot have the covariance
-    `C = diag(sigma^2) + J S J^T`, with a `covariance` V of (v-, v+) `C = [-J I] V [-J I]^T`, and
-    its residual is multiplied by the inverse of the Cholesky factor of C (J of the start; `fit`
-    takes J of the law it finds). Of shots whose momentum was corrected, `post - K m (post - pre)`,
-    the residual has `(I - K m) J` in the place of J.
+    `C = diag(sigma^2) + J S J^T`, and its residual is multiplied by the inverse of the Cholesky
+    factor of C (J of the start; `fit` takes J of the law it finds). Of shots whose momentum was
+    corrected, `post - K m (post - pre)`, the residual has `(I - K m) J` in the place of J.
 
     Make one with `from_shots` or `from_observable`. Solvers work on y, x in natural scales; arrays
     of parameters are as long as there are entries in the fitted fields, Q, of which the first P
@@ -120,8 +118,7 @@ class FitProblem:
         notes: in words, what was fixed instead of fitted.
         experiments, scene: of shots, or None.
         left_out: in words, which shots were left out.
-        mixing: (K, n, n), makes correlated errors of a shot independent, or (K, n, K n), those of
-            all shots, or None.
+        mixing: (K, n, n), makes correlated errors of a shot independent, or None.
 
     >>> import jimpact as ji
     >>> data = ji.Experiments(pre=[[1.0, 0.0], [2.0, 0.0]], post=[[0.3, 0.7], [0.6, 1.4]])
@@ -293,15 +290,16 @@ class FitProblem:
         # a residual that conserves momentum shows that part of the errors
         slope = kept_by_corrections(data, self.scene) @ slope
         here = ~np.isnan(self.measured)
-        covariance = _passed_on(data, slope, here)
-        sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)).reshape(count, n)
-        scale = sigma.reshape(len(covariance), -1)
-        factor = np.linalg.cholesky(covariance / (scale[:, :, None] * scale[:, None, :]))
-        mixing = np.linalg.inv(factor).reshape(count, n, -1)
+        before = slope * np.asarray(data.sigma_pre, float)[:, None, :]
+        variance = np.where(here, np.asarray(data.sigma, float), 1.0) ** 2
+        both = np.where(here[:, :, None] & here[:, None, :], before @ before.swapaxes(1, 2), 0.0)
+        covariance = both + variance[:, :, None] * np.eye(n)
+        sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+        factor = np.linalg.cholesky(covariance / (sigma[:, :, None] * sigma[:, None, :]))
         # factors that a weight already has (shots left out) stay
         old = np.where(here, np.asarray(self.sigma, float), 1.0)
         weight, sigma = self.weight * old / sigma, np.where(here, sigma, np.nan)
-        arrays = _weighed(self.measured, sigma, weight, self.unit, mixing)
+        arrays = _weighed(self.measured, sigma, weight, self.unit, np.linalg.inv(factor))
         return replace(self, **_in(self.low.dtype, arrays))
 
     def program(self) -> "FitProblem":
@@ -317,10 +315,6 @@ class FitProblem:
         parts = (self.observe, self.measured, self.weight, self.mixing)
         observe, measured, weight, mixing = jax.tree.map(lambda x: np.asarray(x)[last], parts)
         weight[count:] = 0.0
-        if self._correlates_shots:
-            more = weight.size - mixing.shape[-1]
-            mixing = np.pad(mixing, ((0, 0), (0, 0), (0, more)))
-            mixing[count:] = 0.0  # their errors are 0, but they would mix those of others
         return replace(bare, observe=observe, measured=measured, weight=weight, mixing=mixing)
 
     # ------------------------------------------------------------------ functions of x
@@ -400,9 +394,7 @@ class FitProblem:
         here = ~np.isnan(self.measured)
         sigma, other = np.broadcast_to(self.sigma, here.shape), np.zeros(here.shape)
         if self.mixing is not None:
-            rows = np.asarray(self.mixing).reshape(-1, self.mixing.shape[-1])
-            column = np.arange(len(rows)) % rows.shape[1]
-            other = np.log(rows[np.arange(len(rows)), column]).reshape(here.shape)
+            other = np.log(np.diagonal(self.mixing, axis1=1, axis2=2))
         constant = np.log(sigma[here] * math.sqrt(2 * math.pi)) - other[here]
         return -0.5 * squares - float(np.sum(constant))
 
@@ -428,7 +420,7 @@ class FitProblem:
         The last Q are those of the priors. Where errors of v- are passed on, `dv+/dv-` (K, n, n)
         of the shots comes last: one program compiles an impact once.
         """
-        count, passed = y.shape[0], 0 if self.mixing is None else self.mixing.shape[1]
+        count, passed = y.shape[0], 0 if self.mixing is None else self.mixing.shape[-1]
 
         def outcome(both: jax.Array) -> tuple[tuple[jax.Array, jax.Array], Any]:
             """Residual and prediction of y and a change of v-, and all not differentiated."""
@@ -464,7 +456,7 @@ class FitProblem:
         statuses = shape[0] if isinstance(self.observe, Shots) else 1
         aux: Any = (np.zeros((count, *shape), dtype), np.zeros((count, statuses), np.int32))
         if self.mixing is not None:
-            aux += (np.zeros((count, *shape, shape[1]), dtype),)
+            aux += (np.zeros(np.shape(self.mixing), dtype),)
         return np.zeros((count, size), dtype), np.zeros((count, size, q), dtype), aux
 
     def lanes(self, count: int) -> int:
@@ -535,18 +527,9 @@ class FitProblem:
     def errors_of(self, independent: np.ndarray) -> np.ndarray:
         """The errors (K, n, ...) that are these as independent ones; NaN where not measured."""
         weight = self._weight_of(independent)
-        back = None
-        if self.mixing is not None:
-            mixing = np.asarray(self.mixing, float)
-            square = mixing.reshape(-1, mixing.shape[-1], mixing.shape[-1])
-            back = np.linalg.inv(square).reshape(mixing.shape)
+        back = None if self.mixing is None else np.linalg.inv(np.asarray(self.mixing, float))
         errors = _mixed(independent, back)
         return np.where(weight > 0, errors / np.where(weight > 0, weight, 1.0), np.nan)
-
-    @property
-    def _correlates_shots(self) -> bool:
-        """Whether the errors of one shot depend on those of others."""
-        return self.mixing is not None and self.mixing.shape[-1] != self.mixing.shape[1]
 
     def _weight_of(self, errors: np.ndarray) -> np.ndarray:
         """The weights, with as many axes as these errors."""
@@ -690,31 +673,5 @@ def _of_parameters(
 
 @full_precision
 def _mixed(errors: Any, mixing: Any, xp: Any = np) -> Any:
-    """Weighted errors (K, n, ...) mixed within each shot, or with those of all shots."""
-    if mixing is None:
-        return errors
-    if mixing.shape[-1] == mixing.shape[1]:
-        return xp.einsum("kij,kj...->ki...", mixing, errors)
-    return xp.einsum("kia,a...->ki...", mixing, errors.reshape(-1, *errors.shape[2:]))
-
-
-def _passed_on(data: Experiments, slope: np.ndarray, here: np.ndarray) -> np.ndarray:
-    """Covariance of the residuals: (K, n, n), or (1, K n, K n) where shots are correlated.
-
-    Equation: `A V A^T` with `A = [-slope, I]` of each shot. Values that were not measured have a
-    variance of 1, and no correlation. `slope` (K, n, n), `here` (K, n).
-    """
-    count, n = here.shape
-    if data.covariance is None:
-        before = slope * np.asarray(data.sigma_pre, float)[:, None, :]
-        variance = np.where(here, np.asarray(data.sigma, float), 1.0) ** 2
-        covariance = before @ before.swapaxes(1, 2) + variance[:, :, None] * np.eye(n)
-    else:
-        each = np.concatenate([-slope, np.tile(np.eye(n), (count, 1, 1))], axis=2)
-        given = np.nan_to_num(np.asarray(data.covariance, float))
-        if given.ndim == 2:
-            whole = block_diag(*each)
-            each, given, here = whole[None], given[None], here.reshape(1, -1)
-        covariance = each @ given @ each.swapaxes(1, 2)
-    unit = np.eye(here.shape[1])
-    return np.where(here[:, :, None] & here[:, None, :], covariance, unit)
+    """Weighted errors (K, n, ...) mixed within each shot."""
+    return errors if mixing is None else xp.einsum("kij,kj...->ki...", mixing, errors)
