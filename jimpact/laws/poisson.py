@@ -34,8 +34,8 @@ class Poisson(Law):
 
     Status: `impulse_not_unique` for redundant contacts; `several_outcomes` where v+ depends on how
     they share p_c (the least one is taken): without friction where their e differ, with friction
-    where another share expands to another v+ (up to 3 contacts: those with the least p_c of each
-    contact are tried; of more contacts where their e differ); `energy_gain` where e
+    where another share expands to another v+ (up to 3 contacts: those with the least or most p_c of
+    a contact are tried; of more contacts where their e differ); `energy_gain` where e
     above 1 creates energy. With friction also as in `Moreau`.
 
     Without friction it loses at least `(1 - e_max^2) p_c^T W p_c / 2`, whatever the e_j up to 1:
@@ -144,7 +144,7 @@ def _expands_otherwise(
     """
     expansion, x, rate, shares = jax.lax.stop_gradient((expansion, compression, rate, shares))
     m, root = len(expansion.friction), precision(x.dtype).root
-    returned = expansion.restitution * (shares - x)[:, :m]
+    returned = expansion.restitution[None] * (shares - x[None])[:, :m]
     needed = jnp.any(jnp.abs(returned) > root * jnp.abs(x).max())
 
     def compared() -> jax.Array:

@@ -54,7 +54,7 @@ _SETTLED, _INSIDE = 1e-13, 1e-9
 class FrictionImpulses(NamedTuple):
     """p (m,), p_t (m,) or (2 m,), the status code (), and columns (m + t, m + t) in which they are
     free, p first (0: they are unique); without derivatives. Of up to 3 contacts also other `shares`
-    (m, m + t) with the same velocities: those with the least p of each contact."""
+    (2 m, m + t) with the same velocities: those with the least and the most p of each contact."""
 
     normal: jax.Array
     tangential: jax.Array
@@ -347,7 +347,7 @@ def _enumerate(
     problem: _FrictionProblem,
 ) -> tuple[_Modes, jax.Array, jax.Array, jax.Array]:
     """The consistent modes (N = 1) that stick most, their x (m, b), the status, and the x
-    (m, b, m) of consistent modes with the least p of each contact."""
+    (m, b, 2 m) of consistent modes with the least and the most p of each contact."""
     m, rows = len(problem.friction), problem.rate.shape[1] - 1
     dtype = problem.matrix.dtype
     kinds, taking = _table(m, rows, problem.load is not None)
@@ -380,8 +380,9 @@ def _enumerate(
     status = jnp.where(differ(_rates(problem, x)), CODE["several_outcomes"], status)
     none = CODE["infeasible" if rows == 1 else "max_steps"]
     chosen = jax.tree.map(lambda leaf: leaf[..., best][..., None], modes)
-    least = jnp.argmin(jnp.where(good, x[:, 0], jnp.inf), axis=1)
-    others = x[..., jnp.where(jnp.any(good), least, best)]
+    signed = jnp.concatenate([x[:, 0], -x[:, 0]])
+    extreme = jnp.argmin(jnp.where(good, signed, jnp.inf), axis=1)
+    others = x[..., jnp.where(jnp.any(good), extreme, best)]
     return chosen, x[..., best], jnp.where(jnp.any(good), status, none), others
 
 
