@@ -1,6 +1,6 @@
 """Poisson's law in the two-stage form of Pfeiffer and Glocker."""
 
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,10 +9,11 @@ from jimpact.core.contact import Contact
 from jimpact.core.law import Impulses, Law, OptionalValues, Values, option, parameter
 from jimpact.laws.friction import friction_fields
 from jimpact.numerics.dense import null_projector
-from jimpact.numerics.friction import solve
+from jimpact.numerics.friction import FrictionImpulses, solve
 from jimpact.numerics.lcp import solve_lcp
 from jimpact.numerics.tridiagonal import as_matrix, is_regular
 from jimpact.tools.compiling import full_precision
+from jimpact.tools.loops import any_lane, cond
 from jimpact.tools.precision import precision, without_rounding
 from jimpact.tools.status import CODE
 
@@ -31,9 +32,11 @@ class Poisson(Law):
             `v_t+ = -e_t v_t-`, as far as the expansion's friction reaches.
         allow_above_one: let e exceed 1, which dispersion in a chain would need.
 
-    Status: `impulse_not_unique` for redundant contacts; `several_outcomes` where, besides, their e
-    differ: v+ then depends on how they share p_c (the least one is taken); `energy_gain` where
-    e above 1 creates energy. With friction as in `Moreau`.
+    Status: `impulse_not_unique` for redundant contacts; `several_outcomes` where v+ depends on how
+    they share p_c (the least one is taken): without friction where their e differ, with friction
+    where another share expands to another v+ (up to 3 contacts: those with the least or most p_c of
+    a contact are tried; of more contacts where their e differ); `energy_gain` where e
+    above 1 creates energy. With friction also as in `Moreau`.
 
     Without friction it loses at least `(1 - e_max^2) p_c^T W p_c / 2`, whatever the e_j up to 1:
     of all s >= 0 the law takes that of least energy, and `s = (e_max - e_j) p_c` is one of them.
@@ -90,26 +93,73 @@ class Poisson(Law):
     def _with_friction(self, contact: Contact, mu: jax.Array, e_t: jax.Array) -> Impulses:
         """Two friction problems."""
         assert contact.slip is not None  # see `check_law`
-        m, each, a = contact.contacts, contact.tangents, contact.whole_delassus
-        mu = mu * jnp.ones_like(contact.gap_velocity)
-        e_t = jnp.repeat(e_t * jnp.ones_like(mu), each)
-        first = solve(a, contact.gap_velocity, contact.slip, mu, complementary=True)
-        returned = self.restitution * first.normal
-        rate = jnp.concatenate([contact.gap_velocity, (1 + e_t) * contact.slip])
-        impulse = jnp.concatenate([first.normal + returned, first.tangential])
-        size, rate = jnp.abs(rate) + jnp.abs(a) @ jnp.abs(impulse), rate + a @ impulse
-        # what compression has brought to rest must not be moved by what is left of rounding
-        rate = without_rounding(rate, precision(mu.dtype).accumulated * size)
-        # also at e = 0, where it begins with e
-        load = returned + precision(mu.dtype).eps ** 2 * first.normal
-        second = solve(a, rate[:m], rate[m:], mu, complementary=True, load=load)
+        a, gamma = contact.whole_delassus, contact.gap_velocity
+        mu, e = mu * jnp.ones_like(gamma), self.restitution * jnp.ones_like(gamma)
+        e_t = jnp.repeat(e_t * jnp.ones_like(mu), contact.tangents)
+        first = solve(a, gamma, contact.slip, mu, complementary=True)
+        expansion = _Expansion(a, jnp.concatenate([gamma, (1 + e_t) * contact.slip]), mu, e)
+        compression = jnp.concatenate([first.normal, first.tangential])
+        second, rate = expansion.after(compression)
         code = jnp.maximum(first.status, second.status)
+        shared = jnp.asarray(False)
         if self.restitution.ndim == 1:
-            e = jnp.concatenate([self.restitution, jnp.zeros_like(contact.slip)])
-            shared = _depends_on_sharing(a, e, first.free)
-            code = jnp.maximum(code, jnp.where(shared, CODE["several_outcomes"], CODE["ok"]))
-        p = first.normal + returned + second.normal
+            both = jnp.concatenate([e, jnp.zeros_like(contact.slip)])
+            shared = _depends_on_sharing(a, both, first.free)
+        if first.shares is not None:
+            shared = shared | _expands_otherwise(expansion, compression, rate, first.shares)
+        code = jnp.maximum(code, jnp.where(shared, CODE["several_outcomes"], CODE["ok"]))
+        p = (1 + e) * first.normal + second.normal
         return Impulses(p, first.tangential + second.tangential, code)
+
+
+class _Expansion(NamedTuple):
+    """The second friction problem, of the impulses of the first."""
+
+    matrix: jax.Array  # (m + t, m + t)
+    rate: jax.Array  # (m + t,) gamma- and (1 + e_t) u-
+    friction: jax.Array  # mu (m,)
+    restitution: jax.Array  # e (m,)
+
+    def after(self, compression: jax.Array) -> tuple[FrictionImpulses, jax.Array]:
+        """Impulses s and p_te after those of `compression` (m + t,), and the rates (m + t,)."""
+        m, zero = len(self.friction), precision(self.rate.dtype)
+        p_c = compression[:m]
+        returned = self.restitution * p_c
+        impulse = compression + jnp.pad(returned, (0, len(compression) - m))
+        size = jnp.abs(self.rate) + jnp.abs(self.matrix) @ jnp.abs(impulse)
+        # what compression has brought to rest must not be moved by what is left of rounding
+        rate = without_rounding(self.rate + self.matrix @ impulse, zero.accumulated * size)
+        # also at e = 0, where it begins with e
+        load = returned + zero.eps**2 * p_c
+        x = solve(self.matrix, rate[:m], rate[m:], self.friction, complementary=True, load=load)
+        return x, rate + self.matrix @ jnp.concatenate([x.normal, x.tangential])
+
+
+def _expands_otherwise(
+    expansion: _Expansion, compression: jax.Array, rate: jax.Array, shares: jax.Array
+) -> jax.Array:
+    """Whether () other `shares` (k, m + t) of the impulses of compression expand to another v+.
+
+    `rate` (m + t,): the rates to which the impulses of `compression` (m + t,) expand.
+    """
+    expansion, x, rate, shares = jax.lax.stop_gradient((expansion, compression, rate, shares))
+    m, root = len(expansion.friction), precision(x.dtype).root
+    returned = expansion.restitution[None] * (shares - x[None])[:, :m]
+    needed = jnp.any(jnp.abs(returned) > root * jnp.abs(x).max())
+
+    def compared() -> jax.Array:
+        """Whether rates differ at any of these shares."""
+
+        def differs(share: jax.Array) -> jax.Array:
+            """Whether they differ where compression is shared like this."""
+            other, after = expansion.after(share)
+            apart = jnp.abs(after - rate) > root * jnp.abs(expansion.rate).max()
+            return jnp.any(apart) & (other.status < CODE["infeasible"])
+
+        return jnp.any(jax.lax.map(differs, shares))
+
+    none = jnp.zeros_like(needed)
+    return needed & cond(any_lane(needed), compared, lambda: none)
 
 
 def _free(w: jax.Array, loaded: jax.Array) -> jax.Array:

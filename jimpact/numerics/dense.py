@@ -165,9 +165,10 @@ def solve_mass_matrix(mass: jax.Array, right: jax.Array) -> jax.Array:
 def block_inverse(matrix: jax.Array) -> jax.Array:
     """Inverses of (m, b, m, b, N), block by block, b = 2 or 3, without pivots.
 
-    A singular block is perturbed by eps^(1/3), which refinements by the caller undo.
+    A singular block is perturbed by eps^(2/3), which refinements by the caller undo. More would
+    perturb regular blocks, too, in single precision.
     """
-    perturbation = precision(matrix.dtype).eps ** (1 / 3)
+    perturbation = precision(matrix.dtype).eps ** (2 / 3)
     m, eye = len(matrix), jnp.eye(matrix.shape[1], dtype=matrix.dtype)[..., None]
 
     def eliminate(i: jax.Array, inverse: jax.Array) -> jax.Array:

@@ -53,12 +53,14 @@ _SETTLED, _INSIDE = 1e-13, 1e-9
 
 class FrictionImpulses(NamedTuple):
     """p (m,), p_t (m,) or (2 m,), the status code (), and columns (m + t, m + t) in which they are
-    free, p first (0: they are unique); without derivatives."""
+    free, p first (0: they are unique); without derivatives. Of up to 3 contacts also other `shares`
+    (2 m, m + t) with the same velocities: those with the least and the most p of each contact."""
 
     normal: jax.Array
     tangential: jax.Array
     status: jax.Array
     free: jax.Array
+    shares: jax.Array | None
 
 
 class _FrictionProblem(NamedTuple):
@@ -177,7 +179,7 @@ def solve(
         complementary,
     )
     fixed = _FrictionProblem(*jax.lax.stop_gradient(problem[:4]), complementary)
-    modes, decided, status = (_enumerate if m <= ENUMERATED else _search)(fixed)
+    modes, decided, status, others = (_enumerate if m <= ENUMERATED else _search)(fixed)
     modes, inverted = _most_at_rest(fixed, modes, decided)
     free, code = _freedom(fixed, inverted)
     status = jnp.maximum(status, code)
@@ -188,8 +190,16 @@ def solve(
     x = x.at[:, 1:].add(drag * x[:, :1]) * scale * size
     p = jnp.where(x[:, 0] < 0, 0.0, x[:, 0]) if complementary else x[:, 0]  # rounding
     free = jax.lax.stop_gradient(scale)[..., None] * free.reshape(*scale.shape, -1)
-    both = [free[:, 0], free[:, 1:].reshape(m * rows, -1)]
-    return FrictionImpulses(p, x[:, 1:].reshape(-1), status, jnp.concatenate(both))
+    free = _normals_first(free)
+    shares = None
+    if others is not None:
+        shares = _normals_first(jax.lax.stop_gradient(scale * size)[..., None] * others).T
+    return FrictionImpulses(p, x[:, 1:].reshape(-1), status, free, shares)
+
+
+def _normals_first(x: jax.Array) -> jax.Array:
+    """(m + t, N) of (m, b, N)."""
+    return jnp.concatenate([x[:, 0], x[:, 1:].reshape(-1, x.shape[2])])
 
 
 # ------------------------------------------------------------------- the equations of modes
@@ -333,8 +343,11 @@ def _table(contacts: int, rows: int, loaded: bool) -> tuple[np.ndarray, np.ndarr
     return table[0], table[1] == 1
 
 
-def _enumerate(problem: _FrictionProblem) -> tuple[_Modes, jax.Array, jax.Array]:
-    """The consistent modes (N = 1) that stick most, their x (m, b), and the status."""
+def _enumerate(
+    problem: _FrictionProblem,
+) -> tuple[_Modes, jax.Array, jax.Array, jax.Array]:
+    """The consistent modes (N = 1) that stick most, their x (m, b), the status, and the x
+    (m, b, 2 m) of consistent modes with the least and the most p of each contact."""
     m, rows = len(problem.friction), problem.rate.shape[1] - 1
     dtype = problem.matrix.dtype
     kinds, taking = _table(m, rows, problem.load is not None)
@@ -367,7 +380,10 @@ def _enumerate(problem: _FrictionProblem) -> tuple[_Modes, jax.Array, jax.Array]
     status = jnp.where(differ(_rates(problem, x)), CODE["several_outcomes"], status)
     none = CODE["infeasible" if rows == 1 else "max_steps"]
     chosen = jax.tree.map(lambda leaf: leaf[..., best][..., None], modes)
-    return chosen, x[..., best], jnp.where(jnp.any(good), status, none)
+    signed = jnp.concatenate([x[:, 0], -x[:, 0]])
+    extreme = jnp.argmin(jnp.where(good, signed, jnp.inf), axis=1)
+    others = x[..., jnp.where(jnp.any(good), extreme, best)]
+    return chosen, x[..., best], jnp.where(jnp.any(good), status, none), others
 
 
 def _newton(problem: _FrictionProblem, modes: _Modes) -> tuple[_Modes, jax.Array]:
@@ -510,8 +526,8 @@ def _modes_at(problem: _FrictionProblem, x: jax.Array) -> _Modes:
     return _turned(problem, _Modes(taking, sticks, direction, jnp.zeros_like(p)), x)
 
 
-def _search(problem: _FrictionProblem) -> tuple[_Modes, jax.Array, jax.Array]:
-    """Modes, x (m, b) and status of many contacts.
+def _search(problem: _FrictionProblem) -> tuple[_Modes, jax.Array, jax.Array, None]:
+    """Modes, x (m, b) and status of many contacts; other shares are not looked for.
 
     By attempts of interior points, the last one by projections where contacts may part, each
     with Newton's method on the modes that it leads to.
@@ -558,7 +574,7 @@ def _search(problem: _FrictionProblem) -> tuple[_Modes, jax.Array, jax.Array]:
     most = ATTEMPTS + 1 if problem.complementary else ATTEMPTS
     best, _ = while_loop(lambda s: wrong(s[0]) & (s[1] < most), attempt, start)
     status = jnp.where(wrong(best), CODE["max_steps"], CODE["ok"])
-    return _modes_at(problem, best.impulse), best.impulse, status
+    return _modes_at(problem, best.impulse), best.impulse, status, None
 
 
 def _projected(problem: _FrictionProblem, x: jax.Array, needed: jax.Array) -> jax.Array:
