@@ -1,5 +1,6 @@
 """Public names of `ji.data` and where they live."""
 
+from .engines import ENGINE_SCENES as ENGINE_SCENES, engine_impacts as engine_impacts
 from .measured import (
     cube_impacts as cube_impacts,
     ellipse_impacts as ellipse_impacts,
