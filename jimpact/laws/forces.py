@@ -52,7 +52,7 @@ class Force(Declared):
         return self.force(x, rate)
 
     def onset_scale(self, depth: jax.Array, speed: jax.Array) -> jax.Array:
-        """The largest `onset` at indentation `depth` (m,) [m], at rest and at `speed` (m,) [m/s]."""
+        """Largest `onset` at indentation `depth` (m,) [m], at rest and at `speed` (m,) [m/s]."""
         return jnp.maximum(self.onset(depth, jnp.zeros_like(depth)), self.onset(depth, speed))
 
     @property
