@@ -266,7 +266,7 @@ def held_by_constraints(scene: Scene) -> jax.Array:
     the residual of the normal, the part of it that no reactions of the constraints balance.
     """
     free, h = without_constraints(scene), scene.constraints
-    assert h is not None
+    assert h is not None  # asked only of scenes with constraints
     moved = solve_mass(free, h)
     reactions = solve_definite(h.T @ moved, moved.T @ scene.normals)
     left = scene.normals - h @ reactions

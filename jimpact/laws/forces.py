@@ -55,7 +55,7 @@ class Force(Declared):
         return self.force(x, rate)
 
     def onset_scale(self, depth: jax.Array, speed: jax.Array) -> jax.Array:
-        """The largest `onset` at an indentation `depth` [m], from rest to this `speed` [m/s]."""
+        """Largest `onset` at indentation `depth` (m,) [m], at rest and at `speed` (m,) [m/s]."""
         return jnp.maximum(self.onset(depth, jnp.zeros_like(depth)), self.onset(depth, speed))
 
     @property
