@@ -211,3 +211,15 @@ def test_a_body_under_loads_is_a_system():
         ji.System(block.gap_function, block.mass, gravity=True)
     with pytest.raises(ValueError, match="`potential`"):
         ji.System(block, potential=ji.gravity(block), gravity=True)
+
+
+@pytest.mark.slow
+def test_a_contact_opens_where_a_force_that_is_positive_at_touch_ends():
+    """An elastic force of 5 N + k x: from .2 m a ball comes back to .2 m, however often it bounces."""
+    ball = ji.System(ji.Column([0.7]), gravity=9.81)
+    law = ji.Compliant(ji.UserForce(lambda x, rate, p: 5.0 + 800.0 * x))
+    motion = ji.simulate(ball, law, [0.2], [0.0], 1.3, samples=131, method="contact_forces")
+    assert ji.STATUS[int(motion.status)].name == "ok"
+    energy = np.asarray(motion.kinetic_energy + motion.potential_energy)
+    free = np.asarray(motion.q[:, 0]) > 0
+    np.testing.assert_allclose(energy[free], 0.7 * 9.81 * 0.2, rtol=1e-6)
