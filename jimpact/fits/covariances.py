@@ -1,6 +1,6 @@
 """Covariances of the velocities (v-, v+) of measured shots: one for each shot, or of all shots.
 
-Of each shot: (K, 2n, 2n). Of all shots: (2nK, 2nK), in the order v- and v+ of shot 1, of shot 2, ...
+Of each shot: (K, 2n, 2n). Of all shots: (2nK, 2nK), in the order v-, v+ of shot 1, of shot 2, ...
 """
 
 from collections.abc import Sequence
