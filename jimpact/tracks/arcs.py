@@ -14,6 +14,8 @@ from scipy.linalg import solveh_banded
 
 STEPS = 60  # of Gauss-Newton; 5 are common. More are not, as frames change flights by turns.
 SETTLING = 20  # steps after which frames stay in their flights
+# Share of a flight by which an instant moves in a step, below one half, so that two never meet.
+LARGEST_MOVE = 0.45
 # Share of a frame below which the instants have settled. Ten times more is still far below noise.
 SETTLED = 1e-7
 
@@ -64,6 +66,7 @@ def fit_arcs(
     free: bool,
     contact: float,
     instants: np.ndarray | None = None,
+    frozen: bool = False,
 ) -> Arcs:
     """The arcs of these flights by maximum likelihood.
 
@@ -76,6 +79,7 @@ def fit_arcs(
         free: whether it is unknown.
         contact: duration of a contact, whose frames are left out.
         instants: first values for the impacts (K,).
+        frozen: whether these stay, so that places alone are found.
     """
     pool, n = np.concatenate(flights), q.shape[1]
     if instants is None:
@@ -83,22 +87,23 @@ def fit_arcs(
     tau = np.concatenate([[t[pool[0]]], instants, [t[pool[-1]]]])
     places, a, step = np.zeros((len(tau), n)), acceleration.copy(), float(np.median(np.diff(t)))
     members, moving = _members(t, pool, tau, contact, flights), False
-    for k in range(STEPS):
+    for k in range(1 if frozen else STEPS):
         normal, change = _step(t, q, sigma, members, (tau, places, a), free, moving)
         new = tau + change[0]
-        low, high = (tau[:-2] + tau[1:-1]) / 2, (tau[1:-1] + tau[2:]) / 2
-        new[1:-1] = np.clip(new[1:-1], low, high)  # between the middles of both flights
+        room = LARGEST_MOVE * np.diff(tau)
+        new[1:-1] = np.clip(new[1:-1], tau[1:-1] - room[:-1], tau[1:-1] + room[1:])
         moved, moving = np.abs(new - tau).max(initial=0.0), True
         tau, places, a = new, places + change[1], a + change[2]
-        if k < SETTLING:
+        if k < SETTLING and not frozen:
             members = _members(t, pool, tau, contact, flights)
         if k > 0 and moved <= SETTLED * step:
             break
-    normal, _ = _step(t, q, sigma, members, (tau, places, a), free, True)
+    normal, _ = _step(t, q, sigma, members, (tau, places, a), free, not frozen)
     residual = np.full(q.shape, np.nan)
     for i, frames in enumerate(members):
         residual[frames] = (q[frames] - _arc(t[frames], i, tau, places, a)) / sigma
-    covariance = _inverse(*normal, free)
+    ends = np.arange(len(tau))
+    covariance = _inverse(*normal, free, ends if frozen else ends[[0, -1]])
     return Arcs(tau, places, a, covariance, members, residual)
 
 
@@ -212,12 +217,14 @@ def _scaled(bands: np.ndarray, scale: np.ndarray) -> np.ndarray:
     return scaled
 
 
-def _inverse(bands: np.ndarray, border: np.ndarray, corner: np.ndarray, free: bool) -> np.ndarray:
-    """The covariance; fixed instants have none."""
+def _inverse(
+    bands: np.ndarray, border: np.ndarray, corner: np.ndarray, free: bool, fixed: np.ndarray
+) -> np.ndarray:
+    """The covariance; `fixed` instants have none."""
     scale = 1 / np.sqrt(np.maximum(bands[-1], 1e-300))
     inverse = scale[:, None] * solveh_banded(_scaled(bands, scale), np.diag(scale))
     n = corner.shape[0]
-    alone = np.arange(n, len(inverse), n + 1)[[0, -1]]
+    alone = fixed * (n + 1) + n
     inverse[alone, alone] = 0.0
     if not free:
         return (inverse + inverse.T) / 2

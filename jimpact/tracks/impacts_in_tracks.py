@@ -167,14 +167,19 @@ def _of_true_impacts(
     free: bool,
     contact: float,
 ) -> tuple[Arcs, list[np.ndarray]]:
-    """The arcs, flights joined (the smallest jump first) until all jumps are impacts."""
+    """The arcs, flights joined (the smallest jump first) until all jumps are impacts.
+
+    Instants stay at first: where there is no jump, nothing determines them.
+    """
+    frozen = len(flights) > 1
     while True:
         a = common_acceleration(x, q, flights) if free else a
-        arcs = fit_arcs(x, q, sigma, flights, a, free, contact)
+        arcs = fit_arcs(x, q, sigma, flights, a, free, contact, frozen=frozen)
         size = _jumps(arcs)
         weak = np.flatnonzero(size < SMALLEST_JUMP)
-        if not weak.size:
+        if not weak.size and not frozen:
             return arcs, flights
+        frozen = frozen and weak.size > 0
         # of neighbours only the weaker: its joining makes the other clearer
         ends = np.concatenate([[np.inf], size, [np.inf]])
         low = [k for k in weak if ends[k + 1] <= min(ends[k], ends[k + 2])]
