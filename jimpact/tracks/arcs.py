@@ -118,9 +118,7 @@ def _members(
     return inside if min(map(len, inside)) >= 3 else flights
 
 
-def _arc(
-    x: np.ndarray, i: int, tau: np.ndarray, places: np.ndarray, a: np.ndarray
-) -> np.ndarray:
+def _arc(x: np.ndarray, i: int, tau: np.ndarray, places: np.ndarray, a: np.ndarray) -> np.ndarray:
     """Places (F, n) in flight i."""
     s = ((x - tau[i]) / (tau[i + 1] - tau[i]))[:, None]
     bend = ((x - tau[i]) * (tau[i + 1] - x) / 2)[:, None]

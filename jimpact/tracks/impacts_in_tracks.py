@@ -232,7 +232,7 @@ def _of_residuals(sigma: np.ndarray, arcs: Arcs, free: bool) -> np.ndarray:
     seen = np.isfinite(arcs.residual).sum(axis=0)
     freedom = np.maximum(seen - ends - (ends - 2) / n - free, 1.0)
     scale = np.sqrt(np.nansum(arcs.residual**2, axis=0) / freedom)
-    return np.maximum(sigma * scale, np.finfo(float).tiny**0.25)
+    return np.maximum(sigma * scale, np.finfo(float).tiny ** 0.25)
 
 
 def _as_track(
