@@ -212,9 +212,9 @@ class Experiments(eqx.Module):
 
         Equation: minimize `sum ((v+' - v+) / sigma)^2` subject to `C^T M (v+' - v-) = 0`
         (sigma = 1 where unknown; with a `covariance` by that of v+). For equal masses in a chain:
-        the mean excess is taken from each component. Shots with missing values stay as they are. v- stay as they were measured; where
-        they have a `sigma_pre`, `fit` passes it on through the correction. `scene`: where shots
-        carry none.
+        the mean excess is taken from each component. Shots with missing values stay as they are.
+        v- stay as they were measured; where they have a `sigma_pre`, `fit` passes it on through the
+        correction. `scene`: where shots carry none.
 
         >>> import jimpact as ji
         >>> data = ji.Experiments(pre=[1.0, 0.0], post=[0.2, 0.9])

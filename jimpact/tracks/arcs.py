@@ -8,6 +8,7 @@ normal matrix is banded.
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.linalg import solveh_banded
@@ -83,7 +84,7 @@ def fit_arcs(
     """
     pool, n = np.concatenate(flights), q.shape[1]
     if instants is None:
-        instants = np.array([(t[f[-1]] + t[g[0]]) / 2 for f, g in zip(flights, flights[1:])])
+        instants = np.array([(t[f[-1]] + t[g[0]]) / 2 for f, g in pairwise(flights)])
     tau = np.concatenate([[t[pool[0]]], instants, [t[pool[-1]]]])
     places, a, step = np.zeros((len(tau), n)), acceleration.copy(), float(np.median(np.diff(t)))
     members, moving = _members(t, pool, tau, contact, flights), False

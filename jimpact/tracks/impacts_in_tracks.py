@@ -112,8 +112,8 @@ def _checked(t: Any, q: Any, shortest: int, units: Any) -> tuple[np.ndarray, np.
     check_values("q", q, nan_allowed=True)
     if len(t) < shortest:
         raise ValueError(
-            f"Argument `t` must have {shortest} frames or more, those of a flight (`shortest`), but "
-            f"has {len(t)}."
+            f"Argument `t` must have {shortest} frames or more, those of a flight (`shortest`), "
+            f"but has {len(t)}."
         )
     if not (np.diff(t) > 0).all():
         k = int(np.argmin(np.diff(t) > 0))
@@ -123,8 +123,8 @@ def _checked(t: Any, q: Any, shortest: int, units: Any) -> tuple[np.ndarray, np.
     lost = ~np.isfinite(q).any(axis=0)
     if lost.any():
         raise ValueError(
-            f"Argument `q` must be seen in each coordinate, but coordinate {int(lost.argmax()) + 1} "
-            "is NaN in all frames."
+            f"Argument `q` must be seen in each coordinate, but coordinate "
+            f"{int(lost.argmax()) + 1} is NaN in all frames."
         )
     n = q.shape[1]
     names = ("m",) * n if units is None else (units,) * n if isinstance(units, str) else units
@@ -142,8 +142,8 @@ def _of_coordinates(name: str, value: Any, n: int) -> np.ndarray:
     array = np.asarray(as_float_array(name, value), float)
     if array.shape not in ((), (n,)):
         raise ValueError(
-            f"Argument `{name}` must be a number or have shape ({n},), one for each coordinate, but "
-            f"has shape {array.shape}."
+            f"Argument `{name}` must be a number or have shape ({n},), one for each coordinate, "
+            f"but has shape {array.shape}."
         )
     check_values(name, array)
     return np.broadcast_to(array, (n,)).copy()

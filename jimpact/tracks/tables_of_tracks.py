@@ -47,8 +47,8 @@ def read(
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: neither or both of time and rate, an unknown unit, or not that of a name, no such
-            column or two, text in a number, no line of names; with file, line and column.
+        ValueError: neither or both of time and rate, an unknown unit, or not that of a name, no
+            such column or two, text in a number, no line of names; with file, line and column.
 
     >>> import pathlib, tempfile
     >>> import jimpact as ji

@@ -143,7 +143,7 @@ def _scenes(place: Scene | Body, poses: np.ndarray, near: float) -> list[Scene |
         return [place] * len(poses)
     scenes: list[Scene | None] = list(place.scenes(poses, near))
     for k, pose in enumerate(poses):
-        if abs(float(np.min(np.asarray(place(pose))))) > near:
+        if abs(float(np.min(np.asarray(place.gap_function(pose))))) > near:
             scenes[k] = None
     return scenes
 
