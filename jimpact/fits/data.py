@@ -246,9 +246,11 @@ class Experiments(eqx.Module):
     def _of_each_shot(self) -> dict[str, Any]:
         """What each shot has, by the name of its argument; None: no shot has it."""
         values = {name: getattr(self, name) for name in _VALUES}
-        fields = {name: None if x is None else np.asarray(x) for name, x in values.items()}
-        fields |= {"scenes": self.scenes, "shots": self.shots, "lost_freedom": self.lost}
-        return fields | {"covariance": self.covariance}
+        fields: dict[str, Any] = {
+            name: None if x is None else np.asarray(x) for name, x in values.items()
+        }
+        shots = {"scenes": self.scenes, "shots": self.shots, "lost_freedom": self.lost}
+        return fields | shots | {"covariance": self.covariance}
 
     def with_contacts(self, contacts: int | Sequence[int]) -> "Experiments":
         """The shots on such numbers of `contacts`."""

@@ -15,6 +15,9 @@ from scipy.linalg import solveh_banded
 
 STEPS = 60  # of Gauss-Newton; 5 are common. More are not, as frames change flights by turns.
 SETTLING = 20  # steps after which frames stay in their flights
+# Frames that an instant may lie within the flights that were found, as a frame near an impact may
+# lie on either arc. Ten times more, and the instant of a jump that is none would run away.
+BEYOND = 3
 # Share of a flight by which an instant moves in a step, below one half, so that two never meet.
 LARGEST_MOVE = 0.45
 # Share of a frame below which the instants have settled. Ten times more is still far below noise.
@@ -54,7 +57,7 @@ class Arcs:
                     row[i * size + n], row[(i + 1) * size + n] = slope[c], -slope[c]
                     if len(row) > (K + 2) * size:
                         row[(K + 2) * size + c] = sign * h[i] / 2
-        flat = gain.reshape(2 * n * K, -1)
+        flat = gain.reshape(2 * n * K, len(self.covariance))
         return before, after, flat @ self.covariance @ flat.T
 
 
@@ -86,6 +89,8 @@ def fit_arcs(
     if instants is None:
         instants = np.array([(t[f[-1]] + t[g[0]]) / 2 for f, g in pairwise(flights)])
     tau = np.concatenate([[t[pool[0]]], instants, [t[pool[-1]]]])
+    last = np.array([t[f[-1]] for f in flights[:-1]])
+    first = np.array([t[f[0]] for f in flights[1:]])
     places, a, step = np.zeros((len(tau), n)), acceleration.copy(), float(np.median(np.diff(t)))
     members, moving = _members(t, pool, tau, contact, flights), False
     for k in range(1 if frozen else STEPS):
@@ -93,6 +98,7 @@ def fit_arcs(
         new = tau + change[0]
         room = LARGEST_MOVE * np.diff(tau)
         new[1:-1] = np.clip(new[1:-1], tau[1:-1] - room[:-1], tau[1:-1] + room[1:])
+        new[1:-1] = np.clip(new[1:-1], last - BEYOND * step, first + BEYOND * step)
         moved, moving = np.abs(new - tau).max(initial=0.0), True
         tau, places, a = new, places + change[1], a + change[2]
         if k < SETTLING and not frozen:

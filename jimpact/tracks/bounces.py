@@ -24,7 +24,7 @@ def bounce_times(times: Any, sigma: Any, gravity: float = 9.80665) -> Experiment
 
     Returns:
         `Experiments` of N - 2 shots of one velocity, upwards, with `covariance`. In
-        `ji.chain([m], walls="left")` the ball falls on its wall.
+        `ji.chain([m], "left")` the ball falls on its wall.
 
     Raises:
         ValueError: fewer than 3 times, times that do not rise or are not finite, sigma <= 0.
@@ -64,5 +64,5 @@ def bounce_times(times: Any, sigma: Any, gravity: float = 9.80665) -> Experiment
     covariance = gain * np.broadcast_to(sigma, times.shape) ** 2 @ gain.T
     pre, post = (gain @ times).reshape(count, 2).T
     return Experiments(
-        pre[:, None], post[:, None], covariance=covariance, shots=range(2, count + 2)
+        pre[:, None], post[:, None], covariance=covariance, shots=[str(k) for k in range(2, count + 2)]
     )

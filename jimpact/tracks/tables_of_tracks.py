@@ -80,7 +80,7 @@ def read(
         _check_unit_in_name(path, name, own)
     body = [(k, _cells(line, separator)) for k, line in enumerate(lines, 1) if k > start]
     body = [(k, cells) for k, cells in body if any(cell.strip() for cell in cells)]
-    if body and not any(_is_number(cell, decimal) for cell in body[0][1]):
+    if body and not any(char.isdigit() for cell in body[0][1] for char in cell):
         body = body[1:]  # a line of units
     if not body:
         raise ValueError(f"{path}: there are no lines of numbers below the names of the columns.")
