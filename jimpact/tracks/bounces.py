@@ -64,5 +64,8 @@ def bounce_times(times: Any, sigma: Any, gravity: float = 9.80665) -> Experiment
     covariance = gain * np.broadcast_to(sigma, times.shape) ** 2 @ gain.T
     pre, post = (gain @ times).reshape(count, 2).T
     return Experiments(
-        pre[:, None], post[:, None], covariance=covariance, shots=[str(k) for k in range(2, count + 2)]
+        pre[:, None],
+        post[:, None],
+        covariance=covariance,
+        shots=[str(k) for k in range(2, count + 2)],
     )

@@ -9,12 +9,14 @@ from jimpact._checks import as_float_array, check_concrete, check_values
 from jimpact.files.shots_file import ANGULAR, LINEAR
 from jimpact.tracks.arcs import Arcs, fit_arcs
 from jimpact.tracks.judging import findings, findings_of_input
-from jimpact.tracks.segments import common_acceleration, flights_and_acceleration, noise
+from jimpact.tracks.segments import (
+    SMALLEST_JUMP,
+    common_acceleration,
+    flights_and_acceleration,
+    noise,
+)
 from jimpact.tracks.track import Track, TrackImpact
 
-# Jump of a velocity, in standard errors, from which on it is an impact. Ten times more would miss
-# soft impacts; of noise alone five or more is found once in a million.
-SMALLEST_JUMP = 5.0
 VELOCITY_OF = {"m": LINEAR, "rad": ANGULAR}
 
 

@@ -11,6 +11,9 @@ from scipy.stats import chi2
 # A frame that fits no flight costs what one good frame in so many exceeds. Ten times more would
 # keep more false points in flights, ten times less would lose more good frames.
 LOST_SHARE = 1e-3
+# Jump of a velocity, in standard errors, from which on it is an impact. Ten times more would miss
+# soft impacts; of noise alone five or more is found once in a million.
+SMALLEST_JUMP = 5.0
 # Frames of a flight that the partition looks back over, so that its time is linear in the frames.
 # Longer flights are parted, and joined again. Ten times more takes ten times as long.
 LOOK_BACK = 400
@@ -32,8 +35,8 @@ def noise(q: np.ndarray) -> np.ndarray:
 
 
 def price(frames: int, n: int) -> float:
-    """Of a flight: that of the Bayesian information criterion, for 2n values and an instant."""
-    return float((2 * n + 1) * np.log(frames))
+    """Of a flight: by the Bayesian information criterion for 2n values and an instant, or more."""
+    return max(float((2 * n + 1) * np.log(frames)), SMALLEST_JUMP**2)
 
 
 def flights_of(

@@ -16,6 +16,9 @@ from jimpact.tracks.arcs import Arcs
 # A jump of velocities lies in the cone of a scene's impulses up to so many standard errors. Ten
 # times more would pass impacts with something else than the contacts.
 OUT_OF_CONE = 5.0
+# ... or up to this share of the jump, by kinetic energy: bodies and calibrations differ from their
+# model. Ten times more is all of it; ten times less drops most measured impacts of a square.
+SHARE_OUT = 0.2
 
 
 @dataclass(frozen=True)
@@ -97,7 +100,7 @@ class Track:
 
         With a scene or a body only those stay that its contacts can have made: one approaches, the
         lowest gap of the body is closed at the pose of the impact, and the change of momentum is
-        one of contacts that push (with any friction), within 5 standard errors. A chain counts
+        one of contacts that push (with any friction), within 5 standard errors or a fifth of it. A chain counts
         coordinates and velocities towards its right end: of bodies that move the other way round,
         mirror the track (-q, and the bodies in reverse).
 
@@ -159,10 +162,15 @@ def _can_be_of(scene: Scene, impact: TrackImpact) -> bool:
         if other is not None:
             columns.append(np.asarray(other, float))
             low.append(np.full(columns[-1].shape[1], -np.inf))
-    moves = np.linalg.solve(np.asarray(dense_mass(scene), float), np.hstack(columns))
-    n = len(impact.pre)
+    mass = np.asarray(dense_mass(scene), float)
+    moves, n = np.linalg.solve(mass, np.hstack(columns)), len(impact.pre)
     signs = np.hstack([-np.eye(n), np.eye(n)])
-    whiten = np.linalg.inv(np.linalg.cholesky(signs @ impact.covariance @ signs.T))
-    jump, limits = whiten @ (impact.post - impact.pre), np.concatenate(low)
-    rest = lsq_linear(whiten @ moves, jump, (limits, np.full(len(limits), np.inf)))
-    return bool(2 * rest.cost <= OUT_OF_CONE**2)
+    errors = np.linalg.inv(np.linalg.cholesky(signs @ impact.covariance @ signs.T))
+    energy, limits = np.linalg.cholesky(mass).T, np.concatenate(low)
+    limit = SHARE_OUT * np.linalg.norm(energy @ (impact.post - impact.pre))
+    for metric, allowed in ((errors, OUT_OF_CONE), (energy, limit)):
+        jump = metric @ (impact.post - impact.pre)
+        rest = lsq_linear(metric @ moves, jump, (limits, np.full(len(limits), np.inf)))
+        if 2 * rest.cost <= allowed**2:
+            return True
+    return False
