@@ -100,9 +100,9 @@ class Track:
 
         With a scene or a body only those stay that its contacts can have made: one approaches, the
         lowest gap of the body is closed at the pose of the impact, and the change of momentum is
-        one of contacts that push (with any friction), within 5 standard errors or a fifth of it. A chain counts
-        coordinates and velocities towards its right end: of bodies that move the other way round,
-        mirror the track (-q, and the bodies in reverse).
+        one of contacts that push (with any friction), within 5 standard errors or a fifth of it. A
+        chain counts coordinates and velocities towards its right end: of bodies that move the other
+        way round, mirror the track (-q, and the bodies in reverse).
 
         Args:
             scene: of all impacts; a body, which each pose places; None: `fit` is given one, and no
@@ -170,7 +170,7 @@ def _can_be_of(scene: Scene, impact: TrackImpact) -> bool:
     limit = SHARE_OUT * np.linalg.norm(energy @ (impact.post - impact.pre))
     for metric, allowed in ((errors, OUT_OF_CONE), (energy, limit)):
         jump = metric @ (impact.post - impact.pre)
-        rest = lsq_linear(metric @ moves, jump, (limits, np.full(len(limits), np.inf)))
+        rest = lsq_linear(metric @ moves, jump, (limits, np.full(len(limits), np.inf)), "bvls")
         if 2 * rest.cost <= allowed**2:
             return True
     return False

@@ -27,7 +27,7 @@ def ball(rng: np.random.Generator, fps: int) -> tuple[np.ndarray, np.ndarray, np
 def least_error(since: np.ndarray) -> float:
     """The bound, by the information on place, both velocities and the instant."""
     after = since >= 0
-    velocity = np.where(after, E * SPEED, -SPEED)
+    velocity = np.where(after, E * SPEED, -SPEED) - G * since
     slopes = np.stack([np.ones_like(since), since * ~after, since * after, -velocity], axis=1)
     covariance = np.linalg.inv(slopes.T @ slopes) * NOISE**2
     gradient = np.array([0.0, E / SPEED, 1 / SPEED, 0.0])
