@@ -1,6 +1,6 @@
 """Public names and where they live: read by type checkers, and on import by `lazy_loader`."""
 
-from . import data as data, plot as plot, theory as theory
+from . import data as data, plot as plot, theory as theory, tracks as tracks
 from .bodies.assembly import Bodies as Bodies
 from .bodies.base import Body as Body
 from .bodies.functions import scene_from_gaps as scene_from_gaps

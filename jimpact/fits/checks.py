@@ -130,7 +130,8 @@ def _conserved(problem: FitProblem) -> list[np.ndarray]:
         whole = (w > 0).all() and len(rows)
         back = (rows / w).T if whole else np.zeros((len(w), 0))
         if whole and problem.mixing is not None:
-            back = np.linalg.solve(np.asarray(problem.mixing[k], float).T, back)
+            own = problem.mixing[k] if problem.mixing.ndim == 3 else problem.mixing[k, :, k]
+            back = np.linalg.solve(np.asarray(own, float).T, back)
         bases.append(np.linalg.qr(back)[0])
     return bases
 

@@ -12,6 +12,12 @@ import numpy as np
 
 from jimpact.bodies.base import CLOSED_BELOW, Body
 from jimpact.core.scene import WALLS, Scene, chain, dense_mass, stackable, with_gaps
+from jimpact.fits.covariances import (
+    as_covariance,
+    covariance_of,
+    diagonal_blocks,
+    joined_covariance,
+)
 from jimpact.fits.shots_file import ANGULAR, LINEAR, read_shots
 from jimpact.tools.checks import (
     as_float_array,
@@ -47,10 +53,15 @@ class Experiments(eqx.Module):
             a `sigma`, or a `resolution`. `fit` passes it on to v+, see `FitProblem`.
         resolution: steps in which `post` was read, (K, n) or a scalar, > 0 [m/s]: readings rounded
             to q have the standard error q / sqrt(12), which is added to sigma (in squares).
+        covariance: of the errors of (v-, v+), instead of sigma, sigma_pre and resolution: one for
+            each shot, (K, 2n, 2n), or of all shots, (2nK, 2nK), where they share errors, as
+            successive impacts share a flight. The fields `sigma` and `sigma_pre` are then the roots
+            of its diagonal.
 
     Raises:
         ValueError: no shots, different shapes, NaN in `pre`, infinite values, sigma <= 0, no value
-            measured, scenes that do not belong to these velocities.
+            measured, scenes that do not belong to these velocities; a covariance beside sigma, of
+            another shape, not finite, not symmetric or not positive definite for each shot.
 
     >>> import jimpact as ji
     >>> data = ji.Experiments(pre=[1.0, 0.0], post=[0.26, 0.73], sigma=0.01)
@@ -67,6 +78,7 @@ class Experiments(eqx.Module):
     units: tuple[str, ...] = eqx.field(static=True)
     sigma_pre: jax.Array | None
     resolution: jax.Array | None
+    covariance: np.ndarray | None
 
     def __init__(
         self,
@@ -79,6 +91,7 @@ class Experiments(eqx.Module):
         units: Sequence[str] | None = None,
         sigma_pre: Any = None,
         resolution: Any = None,
+        covariance: Any = None,
     ):
         self.pre = _as_rows("pre", pre)
         self.post = _as_rows("post", post)
@@ -92,6 +105,20 @@ class Experiments(eqx.Module):
         measured = ~np.isnan(np.asarray(self.post))
         if not measured.any():
             raise ValueError("Argument `post` must hold a measured value, but all are missing.")
+        self.covariance = None
+        if covariance is not None:
+            others = {"sigma": sigma, "sigma_pre": sigma_pre, "resolution": resolution}
+            for name, beside in others.items():
+                if beside is not None:
+                    raise ValueError(
+                        f"Argument `{name}` must be left out where `covariance` is given, which "
+                        "holds all errors, but both are given."
+                    )
+            self.covariance = as_covariance(covariance, measured.shape)
+            variances = diagonal_blocks(self.covariance, 2 * measured.shape[1]).diagonal(
+                axis1=1, axis2=2
+            )
+            sigma_pre, sigma = np.split(np.sqrt(variances), 2, axis=1)
         self.sigma = _as_sigma("sigma", sigma, measured)
         self.resolution = _as_sigma("resolution", resolution, measured)
         self.sigma_pre = _as_sigma("sigma_pre", sigma_pre, measured | True, zero=True)
@@ -190,10 +217,10 @@ class Experiments(eqx.Module):
         """The same shots, moved as little as possible so that they conserve momentum.
 
         Equation: minimize `sum ((v+' - v+) / sigma)^2` subject to `C^T M (v+' - v-) = 0`
-        (sigma = 1 where unknown). For equal masses in a chain: the mean excess is taken from each
-        component. Shots with missing values stay as they are. v- stay as they were measured; where
-        they have a `sigma_pre`, `fit` passes it on through the correction. `scene`: where shots
-        carry none.
+        (sigma = 1 where unknown; with a `covariance` by that of v+). For equal masses in a chain:
+        the mean excess is taken from each component. Shots with missing values stay as they are.
+        v- stay as they were measured; where they have a `sigma_pre`, `fit` passes it on through the
+        correction. `scene`: where shots carry none.
 
         >>> import jimpact as ji
         >>> data = ji.Experiments(pre=[1.0, 0.0], post=[0.2, 0.9])
@@ -201,17 +228,19 @@ class Experiments(eqx.Module):
         >>> [round(float(v), 6) for v in corrected.post[0]]
         [0.15, 0.85]
         """
-        post, lost = np.array(self.post, dtype=float), list(self.lost)
+        post, lost, after = np.array(self.post, dtype=float), list(self.lost), _after(self)
         for k, (m, pre, row) in enumerate(self.balances(scene)):
             if len(m) == 0 or np.isnan(row).any():
                 continue
-            post[k] -= _smallest_change(self, k, m) @ (m @ (row - pre))
+            post[k] -= _smallest_change(after[k], m) @ (m @ (row - pre))
             lost[k] += len(m)
         return self._with(post=post, lost_freedom=lost)
 
     def _with(self, **changed: Any) -> "Experiments":
         """A copy with other fields."""
         fields = self._of_each_shot() | {"units": self.units} | changed
+        if fields["covariance"] is not None:  # the errors follow from it
+            fields |= {"sigma": None, "sigma_pre": None}
         resolution = fields.pop("resolution")
         copy = Experiments(**fields)
         if resolution is None:
@@ -223,8 +252,11 @@ class Experiments(eqx.Module):
     def _of_each_shot(self) -> dict[str, Any]:
         """What each shot has, by the name of its argument; None: no shot has it."""
         values = {name: getattr(self, name) for name in _VALUES}
-        fields = {name: None if x is None else np.asarray(x) for name, x in values.items()}
-        return fields | {"scenes": self.scenes, "shots": self.shots, "lost_freedom": self.lost}
+        fields: dict[str, Any] = {
+            name: None if x is None else np.asarray(x) for name, x in values.items()
+        }
+        shots = {"scenes": self.scenes, "shots": self.shots, "lost_freedom": self.lost}
+        return fields | shots | {"covariance": self.covariance}
 
     def with_contacts(self, contacts: int | Sequence[int]) -> "Experiments":
         """The shots on such numbers of `contacts`."""
@@ -243,8 +275,14 @@ class Experiments(eqx.Module):
         ('2',)
         """
         rows = np.arange(len(self.shots))[which]
-        fields = self._of_each_shot().items()
-        return self._with(**{k: None if x is None else [x[i] for i in rows] for k, x in fields})
+        fields = self._of_each_shot()
+        covariance = fields.pop("covariance")
+        some: dict[str, Any] = {
+            k: None if x is None else [x[i] for i in rows] for k, x in fields.items()
+        }
+        if covariance is not None:
+            some["covariance"] = covariance_of(covariance, rows, self.pre.shape[1])
+        return self._with(**some)
 
     def __add__(self, other: "Experiments") -> "Experiments":
         """These shots and others, see `join`."""
@@ -278,11 +316,14 @@ class Experiments(eqx.Module):
             if len(set(same)) > 1:
                 raise ValueError(f"Argument `many` must have {name}.")
         columns = [data._of_each_shot() for data in many]
+        covariances = [each.pop("covariance") for each in columns]
         if any(each["sigma_pre"] is not None for each in columns):
             for each in columns:
                 if each["sigma_pre"] is None:
                     each["sigma_pre"] = np.zeros_like(each["pre"])
         joined: dict[str, Any] = {}
+        if any(covariance is not None for covariance in covariances):
+            joined["covariance"] = joined_covariance([data.joint for data in many])
         for name in columns[0]:
             parts = [each[name] for each in columns]
             known = all(part is not None for part in parts)
@@ -291,6 +332,20 @@ class Experiments(eqx.Module):
             sets = enumerate(many, 1)
             joined["shots"] = [f"{i}/{label}" for i, data in sets for label in data.shots]
         return many[0]._with(**joined)
+
+    @property
+    def joint(self) -> np.ndarray | None:
+        """Covariance of (v-, v+): (K, 2n, 2n), or (2nK, 2nK) of all shots; None: not known.
+
+        By `covariance`, or else by `sigma` and `sigma_pre` (0 where it is None) as independent
+        errors. Of a value that was not measured the variance of `sigma` is 1.
+        """
+        if self.covariance is not None or self.sigma is None:
+            return self.covariance
+        after = np.where(self.measured, np.asarray(self.sigma, float), 1.0)
+        before = np.zeros_like(after) if self.sigma_pre is None else np.asarray(self.sigma_pre)
+        errors = np.hstack([before, after])
+        return errors[:, :, None] ** 2 * np.eye(errors.shape[1])
 
     @property
     def contacts(self) -> np.ndarray:
@@ -343,24 +398,30 @@ class Experiments(eqx.Module):
         return [function(scene)] * len(self.shots)
 
 
-def _smallest_change(data: Experiments, k: int, rows: np.ndarray) -> np.ndarray:
-    """The least change (n, c) of v+ of shot k, in sigmas, for momenta of rows (c, n)."""
-    n = rows.shape[1]
-    variance = np.ones(n) if data.sigma is None else np.asarray(data.sigma[k], float) ** 2
-    weighted = variance[:, None] * rows.T
+def _after(data: Experiments) -> np.ndarray:
+    """Covariances (K, n, n) of v+, identities where nothing is known."""
+    (count, n), joint = data.pre.shape, data.joint
+    if joint is None:
+        return np.tile(np.eye(n), (count, 1, 1))
+    return diagonal_blocks(joint, 2 * n)[:, n:, n:]
+
+
+def _smallest_change(after: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """The least change (n, c) of v+ of a covariance (n, n) for momenta of rows (c, n)."""
+    weighted = after @ rows.T
     return np.asarray(weighted @ np.linalg.inv(rows @ weighted))
 
 
 def kept_by_corrections(data: Experiments, scene: Scene | None) -> np.ndarray:
     """(K, n, n) projectors by which the momentum of shots was corrected, identities if it was not.
 
-    Equation: `I - S m^T (m S m^T)^-1 m` with m = C^T M and S = diag(sigma^2).
+    Equation: `I - S m^T (m S m^T)^-1 m` with m = C^T M and S the covariance of v+.
     """
-    kept = np.tile(np.eye(data.pre.shape[1]), (len(data.shots), 1, 1))
+    kept, after = np.tile(np.eye(data.pre.shape[1]), (len(data.shots), 1, 1)), _after(data)
     for k, (m, pre, post) in enumerate(data.balances(scene)):
         rounding = ROUNDING * np.abs(m) @ (np.abs(pre) + np.abs(post))
         if 0 < len(m) <= data.lost[k] and (np.abs(m @ (post - pre)) <= rounding).all():
-            kept[k] -= _smallest_change(data, k, m) @ m
+            kept[k] -= _smallest_change(after[k], m) @ m
     return kept
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from scipy.special import ndtri, stdtr, stdtrit
 
 from jimpact.core.scene import Scene, dense_mass
+from jimpact.fits.covariances import diagonal_blocks
 from jimpact.fits.data import ROUNDING, Experiments, closed_normals, possible_normals
 from jimpact.tools.records import listed
 
@@ -104,11 +105,13 @@ class DataBalances:
         self.energies: list[_Defect] = []
         self.resting: list[int] = []  # shots in which no contact that takes part approaches
         self.only_open = True  # whether open ones do in all of these
-        known, unknown = (experiments.sigma, experiments.sigma_pre), np.ones(experiments.pre.shape)
-        errors = [np.asarray(x, float) for x in known if x is not None] or [unknown]
+        count, n = experiments.pre.shape
+        joint = np.tile(np.diag(np.repeat([0.0, 1.0], n)), (count, 1, 1))  # where nothing is known
+        if experiments.joint is not None:
+            joint = diagonal_blocks(experiments.joint, 2 * n)
         each = (experiments.each(scene, f) for f in (closed_normals, possible_normals, dense_mass))
-        balances = zip(experiments.balances(scene), *each, np.hstack(errors))
-        for k, ((rows, pre, post), closed, possible, mass, sigma) in enumerate(balances):
+        balances = zip(experiments.balances(scene), *each, joint)
+        for k, ((rows, pre, post), closed, possible, mass, covariance) in enumerate(balances):
             if stored_energy == 0 and not _approaches(possible if uses_gaps else closed, pre):
                 self.resting.append(k)
                 self.only_open &= _approaches(possible, pre)
@@ -118,13 +121,13 @@ class DataBalances:
                 excess, scale, before = row @ (post - pre), np.abs(row) @ np.abs(pre), row @ pre
                 back = before < -ROUNDING * scale
                 ratio = 1 + (-excess if back else excess) / scale if scale else np.inf
-                error = np.linalg.norm(np.append(row, -row)[: len(sigma)] * sigma)
-                defect = _Defect(k, excess, scale, before, ratio, float(error))
+                error = _error(np.append(-row, row), covariance)
+                defect = _Defect(k, excess, scale, before, ratio, error)
                 self.momenta.setdefault(j, []).append(defect)
             t_minus, t_plus = 0.5 * pre @ mass @ pre, 0.5 * post @ mass @ post
             gain, ratio = t_plus - t_minus - stored_energy, t_plus / t_minus if t_minus else np.nan
-            error = np.linalg.norm(np.append(mass @ post, -mass @ pre)[: len(sigma)] * sigma)
-            self.energies.append(_Defect(k, gain, t_minus, t_minus, ratio, float(error)))
+            error = _error(np.append(-mass @ pre, mass @ post), covariance)
+            self.energies.append(_Defect(k, gain, t_minus, t_minus, ratio, error))
 
     def listed(self, ratios: dict[int, float]) -> str:
         """Shots with their ratios, or the range of the ratios of many."""
@@ -168,6 +171,11 @@ class DataBalances:
         apart = noise * float(stdtrit(freedom, 1 - OUTLIER_LEVEL / len(gains)))
         least = max(noise * float(ndtri(1 - DEFECT_LEVEL)), np.median(values[0]) + apart)
         return {d.k for d in gains if d.error > 0 and d.excess / d.error > least}
+
+
+def _error(gradient: np.ndarray, covariance: np.ndarray) -> float:
+    """Standard error of what has this gradient (2n,) in (v-, v+)."""
+    return float(np.sqrt(max(gradient @ covariance @ gradient, 0.0)))
 
 
 def _units(data: DataBalances) -> Iterator[Finding]:

@@ -26,6 +26,7 @@ _PACKAGES = ("jimpact", "jax", "jaxlib", "equinox", "numpy", "scipy")
 _KINDS: dict[str, Any] = {
     kind.__name__: kind for kind in (StaticNumber, StaticNumbers, float, tuple, list)
 } | {"Prior": Prior._make}
+_LATER = {"covariance"}  # fields that files of format 1 may lack: they had no such thing
 # classes of a fit that have no public name, by their own
 _PARTS = {
     kind.__name__: kind
@@ -105,6 +106,7 @@ def instance_of(cls: Any, fields: dict[str, Any]) -> Any:
     if not dataclasses.is_dataclass(cls):
         raise TypeError(f"{cls!r} is no class of a law, scene or result")
     known = {field.name for field in dataclasses.fields(cls)}
+    fields = dict.fromkeys(known & _LATER) | fields
     if known != set(fields):
         name = getattr(cls, "__name__", cls)
         raise TypeError(f"{name} has the fields {sorted(known)}, the file {sorted(fields)}")

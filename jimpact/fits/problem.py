@@ -17,6 +17,7 @@ import numpy as np
 
 from jimpact.core.law import Law, entries, forward_only, with_entries
 from jimpact.core.scene import Scene, dense_mass, stackable
+from jimpact.fits.covariances import diagonal_blocks, moved_covariance, whitening
 from jimpact.fits.data import Experiments, kept_by_corrections
 from jimpact.fits.matrices import AdmissibleMatrices, matrix_region
 from jimpact.fits.observables import (
@@ -270,7 +271,10 @@ class FitProblem:
         """
         used, mixing, weight = factor > 0, self.mixing, self.weight * factor
         if mixing is not None:  # which comes before the factors
-            weight, mixing = self.weight * used, np.where(used, factor, 1.0)[..., None] * mixing
+            weight, scale = self.weight * used, np.where(used, factor, 1.0)
+            if mixing.ndim == 4:  # of all shots: those left out leave the covariance, too
+                mixing = _without(mixing, used & ~np.isnan(self.measured))
+            mixing = scale.reshape(scale.shape + (1,) * (mixing.ndim - 2)) * mixing
         measured = np.where(used, self.measured, np.nan)
         arrays = _weighed(measured, self.sigma, weight, self.unit, mixing)
         return replace(self, **_in(self.low.dtype, arrays))
@@ -288,18 +292,22 @@ class FitProblem:
         slope = np.asarray(slopes[:count], float)
         slope = np.where(np.isfinite(slope).all(axis=(1, 2), keepdims=True), slope, np.eye(n))
         # a residual that conserves momentum shows that part of the errors
-        slope = kept_by_corrections(data, self.scene) @ slope
+        kept = kept_by_corrections(data, self.scene)
+        gain = kept @ np.concatenate([-slope, np.broadcast_to(np.eye(n), slope.shape)], axis=2)
+        covariance = moved_covariance(data.joint, gain)
+        own = diagonal_blocks(data.joint, 2 * n)[:, n:, n:]
+        rest = (np.eye(n) - kept) @ own @ (np.eye(n) - kept).swapaxes(1, 2)
+        each = np.arange(count)
+        if covariance.ndim == 4:
+            covariance[each, :, each] += rest
+        else:
+            covariance += rest
         here = ~np.isnan(self.measured)
-        before = slope * np.asarray(data.sigma_pre, float)[:, None, :]
-        variance = np.where(here, np.asarray(data.sigma, float), 1.0) ** 2
-        both = np.where(here[:, :, None] & here[:, None, :], before @ before.swapaxes(1, 2), 0.0)
-        covariance = both + variance[:, :, None] * np.eye(n)
-        sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-        factor = np.linalg.cholesky(covariance / (sigma[:, :, None] * sigma[:, None, :]))
+        sigma, mixing = whitening(covariance, here)
         # factors that a weight already has (shots left out) stay
         old = np.where(here, np.asarray(self.sigma, float), 1.0)
         weight, sigma = self.weight * old / sigma, np.where(here, sigma, np.nan)
-        arrays = _weighed(self.measured, sigma, weight, self.unit, np.linalg.inv(factor))
+        arrays = _weighed(self.measured, sigma, weight, self.unit, mixing)
         return replace(self, **_in(self.low.dtype, arrays))
 
     def program(self) -> "FitProblem":
@@ -315,6 +323,9 @@ class FitProblem:
         parts = (self.observe, self.measured, self.weight, self.mixing)
         observe, measured, weight, mixing = jax.tree.map(lambda x: np.asarray(x)[last], parts)
         weight[count:] = 0.0
+        if mixing is not None and mixing.ndim == 4:
+            mixing = mixing[:, :, last]
+            mixing[count:] = 0.0  # or a copy would count as the shot
         return replace(bare, observe=observe, measured=measured, weight=weight, mixing=mixing)
 
     # ------------------------------------------------------------------ functions of x
@@ -394,7 +405,9 @@ class FitProblem:
         here = ~np.isnan(self.measured)
         sigma, other = np.broadcast_to(self.sigma, here.shape), np.zeros(here.shape)
         if self.mixing is not None:
-            other = np.log(np.diagonal(self.mixing, axis1=1, axis2=2))
+            size = here.size if self.mixing.ndim == 4 else here.shape[1]
+            own = np.diagonal(self.mixing.reshape(-1, size, size), axis1=1, axis2=2)
+            other = np.log(own.reshape(here.shape))
         constant = np.log(sigma[here] * math.sqrt(2 * math.pi)) - other[here]
         return -0.5 * squares - float(np.sum(constant))
 
@@ -455,8 +468,8 @@ class FitProblem:
         size = math.prod(shape) + q
         statuses = shape[0] if isinstance(self.observe, Shots) else 1
         aux: Any = (np.zeros((count, *shape), dtype), np.zeros((count, statuses), np.int32))
-        if self.mixing is not None:
-            aux += (np.zeros(np.shape(self.mixing), dtype),)
+        if self.mixing is not None:  # dv+/dv- of each shot
+            aux += (np.zeros((count, *shape, shape[-1]), dtype),)
         return np.zeros((count, size), dtype), np.zeros((count, size, q), dtype), aux
 
     def lanes(self, count: int) -> int:
@@ -527,7 +540,7 @@ class FitProblem:
     def errors_of(self, independent: np.ndarray) -> np.ndarray:
         """The errors (K, n, ...) that are these as independent ones; NaN where not measured."""
         weight = self._weight_of(independent)
-        back = None if self.mixing is None else np.linalg.inv(np.asarray(self.mixing, float))
+        back = None if self.mixing is None else _inverse(np.asarray(self.mixing, float))
         errors = _mixed(independent, back)
         return np.where(weight > 0, errors / np.where(weight > 0, weight, 1.0), np.nan)
 
@@ -673,5 +686,22 @@ def _of_parameters(
 
 @full_precision
 def _mixed(errors: Any, mixing: Any, xp: Any = np) -> Any:
-    """Weighted errors (K, n, ...) mixed within each shot."""
-    return errors if mixing is None else xp.einsum("kij,kj...->ki...", mixing, errors)
+    """Weighted errors (K, n, ...) mixed within each shot, or between all shots."""
+    if mixing is None:
+        return errors
+    axes = "kij,kj...->ki..." if mixing.ndim == 3 else "kilj,lj...->ki..."
+    return xp.einsum(axes, mixing, errors)
+
+
+def _inverse(mixing: np.ndarray) -> np.ndarray:
+    """The inverse of mixing within shots (K, n, n), or between all (K, n, K, n)."""
+    if mixing.ndim == 3:
+        return np.linalg.inv(mixing)
+    size = mixing.shape[0] * mixing.shape[1]
+    return np.linalg.inv(mixing.reshape(size, size)).reshape(mixing.shape)
+
+
+def _without(mixing: np.ndarray, here: np.ndarray) -> np.ndarray:
+    """Mixing between shots where only the values `here` (K, n) take part."""
+    back = _inverse(np.asarray(mixing, float)).reshape(here.size, here.size)
+    return whitening((back @ back.T).reshape(mixing.shape), here)[1]

@@ -244,7 +244,8 @@ def _sigma_sources(fit: "Fit") -> list[str]:
         size = f"{steps[0]:.3g}" if len(steps) == 1 else f"{steps[0]:.3g} to {steps[-1]:.3g}"
         lines.append(f"               with that of readings in steps of {size}: step / sqrt(12)")
     if data is not None and data.sigma_pre is not None:
-        lines.append("               with those of the velocities before, passed on by the law")
+        errors = "their covariance with" if data.covariance is not None else "those of"
+        lines.append(f"               with {errors} the velocities before, passed on by the law")
     return lines
 
 

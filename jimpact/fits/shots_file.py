@@ -88,10 +88,37 @@ def read_positions(path: str | Path) -> Positions:
         )
     values = _values(columns, rows, dict.fromkeys(("t", *kinds), size))
     time = values["t"][:, 0]
-    steps = np.diff(time)
-    if len(time) < 2 or not (np.abs(steps - steps.mean()) <= UNEVEN_STEPS * steps.mean()).all():
-        raise ValueError(f"{path}: the times `t` must be two or more, rising in equal steps.")
-    return Positions(time, values["q"], values.get("sigma_q"))
+    at = keys.index(("t", 1))
+    rounding = max(_last_digit(cells[at]) for _, cells in rows) * columns[at].factor
+    return Positions(_even(where, time, rounding), values["q"], values.get("sigma_q"))
+
+
+def _last_digit(cell: str) -> float:
+    """The step in which a number is written: .001 of '0.033'."""
+    mantissa, _, power = cell.lower().partition("e")
+    return float(10.0 ** (int(power or 0) - len(mantissa.partition(".")[2])))
+
+
+def _even(where: str, time: np.ndarray, rounding: float) -> np.ndarray:
+    """Times in equal steps from which the measured ones differ by rounding only."""
+    if len(time) < 2 or not (np.diff(time) > 0).all():
+        raise ValueError(f"{where}: the times `t` must be two or more, and rise.")
+    step = (time[-1] - time[0]) / (len(time) - 1)
+    even = time[0] + step * np.arange(len(time))
+    off = np.abs(time - even)
+    # each end and the time between may be off by half of the last digit
+    allowed = UNEVEN_STEPS * step + min(rounding, step / 4)
+    if off.max() <= UNEVEN_STEPS * step:
+        return time
+    if off.max() > allowed:
+        k = int(off.argmax())
+        raise ValueError(
+            f"{where}: the times `t` must rise in equal steps, but sample {k + 1} at {time[k]:g} s "
+            f"is {off[k]:.2g} s off steps of {step:.6g} s; as they are written they may be "
+            f"{allowed:.2g} s off."
+        )
+    slope, start = np.polyfit(np.arange(len(time)), time, 1)
+    return np.asarray(start + slope * np.arange(len(time)))
 
 
 def _read(

@@ -31,3 +31,4 @@ from .theory import (
     rocking_domains as rocking_domains,
     rocking_outcomes as rocking_outcomes,
 )
+from .tracks import track as track

@@ -1,0 +1,125 @@
+"""Covariances of the velocities (v-, v+) of measured shots: one for each shot, or of all shots.
+
+Of each shot: (K, 2n, 2n). Of all shots: (2nK, 2nK), in the order v-, v+ of shot 1, of shot 2, ...
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from jimpact.tools.checks import as_float_array, check_concrete, check_values
+
+# Share of a variance up to which an eigenvalue of a correlation is rounding, or two entries that
+# should be equal differ by it. Ten times more would pass shots whose v- and v+ are measured to 8
+# digits of each other; ten times less would refuse files of 10 digits.
+ROUNDING = 1e-10
+
+
+def as_covariance(value: Any, shape: tuple[int, int]) -> np.ndarray:
+    """A checked covariance of K shots of n velocities (`shape`); of all shots only if they share.
+
+    That of a shot must be positive definite, but for v- of variance 0, which are exact. That of all
+    shots may be singular: without a force v+ of an impact is v- of the next.
+    """
+    check_concrete("covariance", value)
+    as_float_array("covariance", value)  # raises for what are no numbers
+    # all digits, as those of an impact may be nearly those of another
+    (count, n), array = shape, np.asarray(value, float)
+    each, whole = (count, 2 * n, 2 * n), (2 * n * count, 2 * n * count)
+    if array.shape == each[1:] and count == 1:
+        array = array[None]
+    if array.shape not in (each, whole):
+        raise ValueError(
+            f"Argument `covariance` must have shape {each}, (v-, v+) of each shot, or {whole}, of "
+            f"all shots, but has shape {array.shape}."
+        )
+    check_values("covariance", array)
+    blocks = diagonal_blocks(array, 2 * n)
+    for k, block in enumerate(blocks):
+        _check_positive(block, f" in shot {k + 1}", exact=np.arange(2 * n) < n, least=ROUNDING)
+    if array.ndim == 2:
+        exact = np.tile(np.arange(2 * n) < n, count)
+        _check_positive(array, " of all shots", exact, least=-ROUNDING)
+        if not (array - block_diag(*blocks)).any():
+            array = blocks
+    return array
+
+
+def _check_positive(matrix: np.ndarray, where: str, exact: np.ndarray, least: float) -> None:
+    """Raise unless symmetric and positive; `exact`: entries that may have no error."""
+    must = "Argument `covariance` must be"
+    variance = np.diagonal(matrix)
+    sizes = np.sqrt(np.abs(np.outer(variance, variance)))
+    if not (np.abs(matrix - matrix.T) <= ROUNDING * sizes).all():
+        raise ValueError(f"{must} symmetric, but is not{where}.")
+    none = (variance == 0) & exact & ~matrix.any(axis=1)
+    some = np.ix_(~none, ~none)
+    if not (variance[~none] > 0).all():
+        raise ValueError(f"{must} positive definite, but has a variance <= 0{where}.")
+    lowest = np.linalg.eigvalsh(matrix[some] / sizes[some])[0]
+    if lowest < least:
+        raise ValueError(
+            f"{must} positive definite, but its correlation has the eigenvalue {lowest:.3g}{where}."
+        )
+
+
+def diagonal_blocks(covariance: Any, size: int) -> np.ndarray:
+    """(K, size, size): of each shot, also where the covariance is that of all."""
+    array = np.asarray(covariance, float)
+    if array.ndim == 3:
+        return array
+    count = len(array) // size
+    return array.reshape(count, size, count, size)[np.arange(count), :, np.arange(count)]
+
+
+def covariance_of(covariance: Any, shots: np.ndarray, n: int) -> np.ndarray:
+    """That of some shots (indices from 0) of n velocities."""
+    array = np.asarray(covariance, float)
+    if array.ndim == 3:
+        return array[shots]
+    rows = (2 * n * np.asarray(shots)[:, None] + np.arange(2 * n)).ravel()
+    return array[np.ix_(rows, rows)]
+
+
+def joined_covariance(many: Sequence[Any]) -> np.ndarray:
+    """That of the shots of several sets whose errors are independent."""
+    if all(each.ndim == 3 for each in many):
+        return np.concatenate(many)
+    return block_diag(*(block_diag(*each) if each.ndim == 3 else each for each in many))
+
+
+def moved_covariance(covariance: Any, gain: np.ndarray) -> np.ndarray:
+    """`G C G^T` of values G (v-, v+) of each shot, gain (K, m, 2n): (K, m, m), or (K, m, K, m)."""
+    array = np.asarray(covariance, float)
+    if array.ndim == 3:
+        return gain @ array @ gain.swapaxes(1, 2)
+    count, _, size = gain.shape
+    blocks = array.reshape(count, size, count, size)
+    return np.einsum("kia,kalb,ljb->kilj", gain, blocks, gain, optimize=True)
+
+
+def whitening(covariance: np.ndarray, here: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Standard errors (K, n) of values, and what makes errors in units of these independent.
+
+    Args:
+        covariance: (K, n, n), or (K, n, K, n).
+        here: (K, n), whether a value takes part; others are left out as if not measured.
+
+    Raises:
+        ValueError: a combination of the values has no error.
+    """
+    rows = here if covariance.ndim == 3 else here.reshape(1, -1)
+    size = rows.shape[1]
+    matrices = covariance.reshape(-1, size, size)
+    matrices = np.where(rows[:, :, None] & rows[:, None, :], matrices, np.eye(size))
+    errors = np.sqrt(np.diagonal(matrices, axis1=1, axis2=2))
+    try:
+        factor = np.linalg.cholesky(matrices / (errors[:, :, None] * errors[:, None, :]))
+    except np.linalg.LinAlgError:
+        raise ValueError(
+            "Argument `covariance` must leave an error in each velocity after an impact that the "
+            "law predicts from those before, but is singular there: are shots in it twice?"
+        ) from None
+    return errors.reshape(here.shape), np.linalg.inv(factor).reshape(covariance.shape)

@@ -1,0 +1,66 @@
+"""Pictures: a track with its flights and impacts, and what is left of it."""
+
+from collections.abc import Sequence
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from jimpact.plot.style import COLOURS, GREY, new_figure, styled
+
+_HEIGHT = 2.8  # of a row [in]
+_BEYOND = 5.0  # sigmas that the panel of residuals shows, unless flights leave more
+
+
+@runtime_checkable
+class Track(Protocol):
+    """What a picture shows of `ji.tracks.Track`."""
+
+    t: np.ndarray
+    q: np.ndarray
+    sigma: np.ndarray
+    residual: np.ndarray
+    flights: Sequence[Any]
+    impacts: Sequence[Any]
+    units: Sequence[str]
+
+
+@styled(Track)
+def track(track: Track, title: str = "") -> Figure:
+    """Coordinates over time with the arcs of the flights, above the residuals in sigma.
+
+    Args:
+        track: of `ji.tracks.find_impacts`.
+        title: above the picture.
+
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
+
+    Raises:
+        TypeError: something else than a track.
+
+    >>> import numpy as np
+    >>> import jimpact as ji
+    >>> t = np.arange(40) / 100
+    >>> figure = ji.plot.track(ji.tracks.find_impacts(t, np.abs(t - 0.2), sigma=0.001))
+    >>> len(figure.axes)
+    2
+    """
+    n = track.q.shape[1]
+    count = len(track.impacts)
+    heading = title or f"{count} impact{'s' * (count != 1)}"
+    figure, panels = new_figure(_HEIGHT * n, heading, n, 2, squeeze=False)
+    for c, (places, rest) in enumerate(panels):
+        colour, unit = COLOURS[c % len(COLOURS)], track.units[c].split("/")[0]
+        fitted = track.q[:, c] - track.residual[:, c] * track.sigma[c]
+        places.plot(track.t, track.q[:, c], ".", color=GREY)
+        for frames in track.flights:
+            places.plot(track.t[frames], fitted[frames], color=colour)
+            rest.plot(track.t[frames], track.residual[frames, c], ".", color=colour)
+        for each in track.impacts:
+            for axis in (places, rest):
+                axis.axvline(each.time, color=GREY, linestyle=":")
+        places.set(xlabel="time [s]", ylabel=f"coordinate {c + 1} [{unit}]")
+        rest.set(xlabel="time [s]", ylabel="residual / sigma")
+        rest.set_ylim(*np.array([-1, 1]) * max(_BEYOND, np.nanmax(np.abs(track.residual[:, c]))))
+    return figure

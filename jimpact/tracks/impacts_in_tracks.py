@@ -1,0 +1,261 @@
+"""Impacts in a track: flights and instants at once, by maximum likelihood."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from jimpact.fits.shots_file import ANGULAR, LINEAR
+from jimpact.tools.checks import as_float_array, check_concrete, check_values
+from jimpact.tracks.arcs import Arcs, fit_arcs
+from jimpact.tracks.judging import findings, findings_of_input
+from jimpact.tracks.segments import (
+    SMALLEST_JUMP,
+    common_acceleration,
+    flights_and_acceleration,
+    noise,
+)
+from jimpact.tracks.track import Track, TrackImpact
+
+VELOCITY_OF = {"m": LINEAR, "rad": ANGULAR}
+
+
+def find_impacts(
+    t: Any,
+    q: Any,
+    sigma: Any = None,
+    *,
+    acceleration: Any = 0.0,
+    contact: float = 0.0,
+    shortest: int = 5,
+    window: float | None = None,
+    units: str | Sequence[str] | None = None,
+) -> Track:
+    """The impacts of a track: instants, velocities before and after, and their covariance.
+
+    Equation: between impacts `q = P + v (t - tau) + a (t - tau)^2 / 2`; the arcs on both sides of
+    an impact meet at its instant tau. Places P, velocities and instants of all impacts minimize
+    the sum of `((q - measured) / sigma)^2` at once: maximum likelihood for normal errors. Nothing
+    is smoothed or differentiated. Where a contact lasts, the arcs meet at the centroid of the pulse
+    of its force.
+
+    Args:
+        t: times of the frames, rising (T,) [s].
+        q: coordinates (T,) or (T, n) [m] or [rad]; NaN where the body was lost. An angle goes on
+            beyond pi, or is unwrapped where `units` say 'rad'. The velocities are the rates of q.
+        sigma: standard errors of q, a number or (n,), > 0; None: estimated from the residuals.
+        acceleration: between impacts, a number or (n,) [m/s^2]; -9.80665 of a height; None: one
+            unknown in each coordinate, common to all flights.
+        contact: the longest duration of a contact, whose frames are left out, >= 0 [s].
+        shortest: frames of a flight, >= 3.
+        window: of each flight use only so long before and after an impact, > 0 [s], where flights
+            are not quite ballistic; None: whole flights.
+        units: of each coordinate, 'm' or 'rad', or one for all; None: m.
+
+    Returns:
+        `Track`, which prints and plots; `warnings` say which flights are not ballistic, and that
+        no impact was found.
+
+    Raises:
+        ValueError: fewer frames than a flight and a half, times that do not rise or are not finite,
+            sigma <= 0, other shapes; no flight at all.
+
+    >>> import numpy as np
+    >>> import jimpact as ji
+    >>> t = np.arange(60) / 120
+    >>> height = np.where(t < 0.25, 1 - 2 * t, 0.5 + 1.6 * (t - 0.25))
+    >>> noise = 0.001 * np.random.default_rng(0).normal(size=60)
+    >>> track = ji.tracks.find_impacts(t, height + noise)
+    >>> [round(float(track.impacts[0].post[0] / -track.impacts[0].pre[0]), 2)]
+    [0.8]
+    """
+    t, q, names = _checked(t, q, shortest, units)
+    n = q.shape[1]
+    notes = findings_of_input(t, q, names)
+    q = _unwrapped(q, names)
+    given = noise(q) if sigma is None else _of_coordinates("sigma", sigma, n)
+    check_values("sigma", given, low=0.0, open_low=True)
+    known = None if acceleration is None else _of_coordinates("acceleration", acceleration, n)
+    for name, value in (("contact", contact), ("window", 1.0 if window is None else window)):
+        check_values(name, np.asarray(value, float), low=0.0, open_low=name == "window")
+    x = t - t.mean()
+    flights, a = flights_and_acceleration(x, q, given, known, shortest)
+    flights = [f for f in flights if x[f[-1]] - x[f[0]] > contact]
+    if not flights:
+        raise ValueError(
+            "Argument `q` must hold a flight, but no frames in a row lie on an arc within sigma = "
+            f"{given.tolist()} at an acceleration of {a.tolist()}: are these the units of q?"
+        )
+    free = known is None
+    arcs, flights = _of_true_impacts(x, q, given, flights, a, free, contact)
+    if sigma is None:  # what the residuals show; jumps are judged anew by it
+        given = _of_residuals(given, arcs, free)
+        arcs, flights = _of_true_impacts(x, q, given, flights, a, free, contact)
+    if window is not None and len(arcs.instants) > 2:
+        arcs = _windowed(x, q, given, arcs, free, contact, window)
+    return _as_track(t, q, given, arcs, names, notes)
+
+
+def _checked(t: Any, q: Any, shortest: int, units: Any) -> tuple[np.ndarray, np.ndarray, Any]:
+    """Times (T,), coordinates (T, n) and their units."""
+    for name, value in (("t", t), ("q", q)):
+        check_concrete(name, value)
+        as_float_array(name, value)  # raises for what are no numbers
+    t, q = np.asarray(t, float), np.array(q, float)
+    q = q[:, None] if q.ndim == 1 else q
+    if t.ndim != 1 or q.ndim != 2 or len(t) != len(q) or q.shape[1] == 0:
+        raise ValueError(
+            f"Arguments `t` and `q` must have shapes (T,) and (T,) or (T, n), but have {t.shape} "
+            f"and {q.shape}."
+        )
+    if isinstance(shortest, bool) or not isinstance(shortest, int | np.integer) or shortest < 3:
+        raise ValueError(f"Argument `shortest` must be a whole number >= 3, but is {shortest!r}.")
+    check_values("t", t)
+    check_values("q", q, nan_allowed=True)
+    if len(t) < shortest:
+        raise ValueError(
+            f"Argument `t` must have {shortest} frames or more, those of a flight (`shortest`), "
+            f"but has {len(t)}."
+        )
+    if not (np.diff(t) > 0).all():
+        k = int(np.argmin(np.diff(t) > 0))
+        raise ValueError(
+            f"Argument `t` must rise, but frame {k + 2} is at {t[k + 1]:g} s, after {t[k]:g} s."
+        )
+    lost = ~np.isfinite(q).any(axis=0)
+    if lost.any():
+        raise ValueError(
+            f"Argument `q` must be seen in each coordinate, but coordinate "
+            f"{int(lost.argmax()) + 1} is NaN in all frames."
+        )
+    n = q.shape[1]
+    names = ("m",) * n if units is None else (units,) * n if isinstance(units, str) else units
+    if len(names) != n or not set(names) <= set(VELOCITY_OF):
+        raise ValueError(
+            f"Argument `units` must have {n} entries, each 'm' or 'rad', but has value {units!r}: "
+            "convert lengths and angles to these."
+        )
+    return t, q, tuple(names)
+
+
+def _of_coordinates(name: str, value: Any, n: int) -> np.ndarray:
+    """A number for all coordinates, or one for each, as (n,)."""
+    check_concrete(name, value)
+    array = np.asarray(as_float_array(name, value), float)
+    if array.shape not in ((), (n,)):
+        raise ValueError(
+            f"Argument `{name}` must be a number or have shape ({n},), one for each coordinate, "
+            f"but has shape {array.shape}."
+        )
+    check_values(name, array)
+    return np.broadcast_to(array, (n,)).copy()
+
+
+def _unwrapped(q: np.ndarray, units: tuple[str, ...]) -> np.ndarray:
+    """Angles without steps of 2 pi."""
+    q = q.copy()
+    for c in np.flatnonzero(np.array(units) == "rad"):
+        seen = np.isfinite(q[:, c])
+        q[seen, c] = np.unwrap(q[seen, c])
+    return q
+
+
+def _of_true_impacts(
+    x: np.ndarray,
+    q: np.ndarray,
+    sigma: np.ndarray,
+    flights: list[np.ndarray],
+    a: np.ndarray,
+    free: bool,
+    contact: float,
+) -> tuple[Arcs, list[np.ndarray]]:
+    """The arcs, flights joined (the smallest jump first) until all jumps are impacts.
+
+    Instants stay at first: where there is no jump, nothing determines them.
+    """
+    frozen = len(flights) > 1
+    while True:
+        a = common_acceleration(x, q, flights) if free else a
+        arcs = fit_arcs(x, q, sigma, flights, a, free, contact, frozen=frozen)
+        size = _jumps(arcs)
+        weak = np.flatnonzero(size < SMALLEST_JUMP)
+        if not weak.size and not frozen:
+            return arcs, flights
+        frozen = frozen and weak.size > 0
+        # of neighbours only the weaker: its joining makes the other clearer
+        ends = np.concatenate([[np.inf], size, [np.inf]])
+        low = [k for k in weak if ends[k + 1] <= min(ends[k], ends[k + 2])]
+        for k in sorted(low, reverse=True):
+            flights = [*flights[:k], np.concatenate(flights[k : k + 2]), *flights[k + 2 :]]
+
+
+def _jumps(arcs: Arcs) -> np.ndarray:
+    """The largest jump of a velocity of each impact (K,), in standard errors."""
+    pre, post, covariance = arcs.velocities()
+    (K, n), signs = pre.shape, np.hstack([-np.eye(pre.shape[1]), np.eye(pre.shape[1])])
+    sizes = np.zeros(K)
+    for k in range(K):
+        own = slice(2 * n * k, 2 * n * (k + 1))
+        errors = np.sqrt(np.maximum(np.diag(signs @ covariance[own, own] @ signs.T), 1e-300))
+        sizes[k] = np.abs((post[k] - pre[k]) / errors).max()
+    return sizes
+
+
+def _windowed(
+    x: np.ndarray,
+    q: np.ndarray,
+    sigma: np.ndarray,
+    whole: Arcs,
+    free: bool,
+    contact: float,
+    window: float,
+) -> Arcs:
+    """The same by frames of each flight near its impacts only.
+
+    A flight keeps its one arc, so that velocities of both its ends stay those of one arc.
+    """
+    near = []
+    for i, frames in enumerate(whole.members):
+        ends = whole.instants[i + (i == 0) : i + 2 - (i == len(whole.members) - 1)]
+        close = (np.abs(x[frames][:, None] - ends) <= window).any(axis=1)
+        near.append(frames[close])
+    if min(map(len, near)) < 3:
+        raise ValueError(
+            f"Argument `window` must leave 3 frames or more of each flight, but {window:g} s leave "
+            f"{min(map(len, near))}."
+        )
+    start = whole.instants[1:-1]
+    return fit_arcs(x, q, sigma, near, whole.acceleration, free, contact, start)
+
+
+def _of_residuals(sigma: np.ndarray, arcs: Arcs, free: bool) -> np.ndarray:
+    """Standard errors (n,) by the residuals; each coordinate bears its part of the instants."""
+    n, ends = len(sigma), len(arcs.instants)
+    seen = np.isfinite(arcs.residual).sum(axis=0)
+    freedom = np.maximum(seen - ends - (ends - 2) / n - free, 1.0)
+    scale = np.sqrt(np.nansum(arcs.residual**2, axis=0) / freedom)
+    return np.maximum(sigma * scale, np.finfo(float).tiny ** 0.25)
+
+
+def _as_track(
+    t: np.ndarray,
+    q: np.ndarray,
+    sigma: np.ndarray,
+    arcs: Arcs,
+    units: tuple[str, ...],
+    notes: list[str],
+) -> Track:
+    """The track of these arcs, with what is wrong with it."""
+    pre, post, covariance = arcs.velocities()
+    n, size = q.shape[1], q.shape[1] + 1
+    impacts = []
+    for k, (before, after) in enumerate(zip(pre, post)):
+        own = slice(2 * n * k, 2 * n * (k + 1))
+        error = float(np.sqrt(arcs.covariance[(k + 1) * size + n, (k + 1) * size + n]))
+        time, place = float(arcs.instants[k + 1] + t.mean()), arcs.places[k + 1]
+        impacts.append(TrackImpact(time, error, place, before, after, covariance[own, own]))
+    lines = (*notes, *findings(t, q, sigma, arcs))
+    velocity_units = tuple(VELOCITY_OF[unit] for unit in units)
+    return Track(
+        tuple(impacts), tuple(arcs.members), sigma, covariance, lines, velocity_units, t, q, arcs
+    )

@@ -1,0 +1,157 @@
+"""Where the flights of a track are: the cheapest partition into ballistic flights and lost frames.
+
+A flight is a straight line in each coordinate once its acceleration is taken away. Its cost is
+chi^2 and a price for beginning one; dynamic programming finds the partition of least cost (Jackson
+et al., IEEE Signal Processing Letters 12, 2005).
+"""
+
+import numpy as np
+from scipy.stats import chi2
+
+# A frame that fits no flight costs what one good frame in so many exceeds. Ten times more would
+# keep more false points in flights, ten times less would lose more good frames.
+LOST_SHARE = 1e-3
+# Jump of a velocity, in standard errors, from which on it is an impact. Ten times more would miss
+# soft impacts; of noise alone five or more is found once in a million.
+SMALLEST_JUMP = 5.0
+# Frames of a flight that the partition looks back over, so that its time is linear in the frames.
+# Longer flights are parted, and joined again. Ten times more takes ten times as long.
+LOOK_BACK = 400
+# Share of the extent of a track below which noise is not looked for: positions with that many
+# digits. Ten times less would lose digits of chi^2 to rounding in flights of LOOK_BACK frames.
+LEAST_NOISE = 1e-7
+ROUNDS = 4  # of flights and one unknown acceleration in turn; both have settled in two
+
+
+def noise(q: np.ndarray) -> np.ndarray:
+    """Standard errors (n,) of positions (T, n), from their third differences.
+
+    They vanish for a constant acceleration; the median of their sizes, times 1.4826 (normal
+    errors), does not see the few at impacts. The variance of a third difference is 20 sigma^2.
+    """
+    sizes = np.nanmedian(np.abs(np.diff(q, 3, axis=0)), axis=0)
+    extent = np.nanmax(q, axis=0) - np.nanmin(q, axis=0)
+    return np.maximum(1.4826 * sizes / np.sqrt(20), LEAST_NOISE * max(extent.max(), 1e-300))
+
+
+def price(frames: int, n: int) -> float:
+    """Of a flight: by the Bayesian information criterion for 2n values and an instant, or more."""
+    return max(float((2 * n + 1) * np.log(frames)), SMALLEST_JUMP**2)
+
+
+def flights_of(
+    t: np.ndarray, q: np.ndarray, sigma: np.ndarray, acceleration: np.ndarray, shortest: int
+) -> list[np.ndarray]:
+    """The frames of each flight, at least `shortest` seen in every coordinate."""
+    frames, n = q.shape
+    good = np.isfinite(q)
+    lost, start = chi2.isf(LOST_SHARE, n) * good.any(axis=1), price(frames, n)
+    best, come = np.zeros(frames + 1), np.zeros(frames + 1, int)
+    for j in range(1, frames + 1):
+        best[j], come[j] = best[j - 1] + lost[j - 1], j - 1
+        if j < shortest:
+            continue
+        first = max(0, j - LOOK_BACK)
+        costs = _costs(t[first:j], q[first:j], good[first:j], sigma, acceleration, shortest)
+        total = costs[: j - first] + best[first:j]
+        k = int(np.argmin(total))
+        if total[k] + start < best[j]:
+            best[j], come[j] = total[k] + start, first + k
+    ends = [frames]
+    while ends[-1] > 0:
+        ends.append(int(come[ends[-1]]))
+    pairs = list(zip(ends[1:], ends))[::-1]
+    flights = [np.arange(i, j) for i, j in pairs if j - i >= shortest]
+    return _joined(t, q, sigma, acceleration, flights, start)
+
+
+def _costs(
+    t: np.ndarray,
+    q: np.ndarray,
+    good: np.ndarray,
+    sigma: np.ndarray,
+    acceleration: np.ndarray,
+    shortest: int,
+) -> np.ndarray:
+    """chi^2 (L,) of one flight from each of L frames to the last one; inf where too short."""
+    x = (t - t[-1])[::-1, None]
+    y = (q[::-1] - np.where(good, q, 0.0).sum(axis=0) / np.maximum(good.sum(axis=0), 1)) / sigma
+    y = np.where(good[::-1], y - acceleration / sigma * x**2 / 2, 0.0)
+    w = good[::-1].astype(float)
+    wx, xy = w * x, x * y
+    terms = np.stack([w, wx, wx * x, y, xy, y * y])
+    s, sx, sxx, sy, sxy, syy = np.cumsum(terms, axis=1)
+    enough = s.min(axis=1) >= max(shortest, 2) - 0.5
+    s = np.maximum(s, 1.0)
+    spread = np.maximum(sxx - sx * sx / s, 1e-300)  # 0 for one frame, which is not enough
+    cost = (syy - sy * sy / s - (sxy - sx * sy / s) ** 2 / spread).sum(axis=1)
+    return np.where(enough, np.maximum(cost, 0.0), np.inf)[::-1]
+
+
+def _joined(
+    t: np.ndarray,
+    q: np.ndarray,
+    sigma: np.ndarray,
+    acceleration: np.ndarray,
+    flights: list[np.ndarray],
+    start: float,
+) -> list[np.ndarray]:
+    """The flights, neighbours joined where one line for both is cheaper than two."""
+    joined: list[np.ndarray] = []
+    for flight in flights:
+        if joined:
+            both = np.concatenate([joined[-1], flight])
+            alone = sum(chi_squared(t, q, sigma, acceleration, f) for f in (joined[-1], flight))
+            if chi_squared(t, q, sigma, acceleration, both) < alone + start:
+                joined[-1] = both
+                continue
+        joined.append(flight)
+    return joined
+
+
+def chi_squared(
+    t: np.ndarray, q: np.ndarray, sigma: np.ndarray, acceleration: np.ndarray, frames: np.ndarray
+) -> float:
+    """chi^2 of one flight."""
+    x, total = t[frames] - t[frames].mean(), 0.0
+    for c in range(q.shape[1]):
+        y = q[frames, c] - acceleration[c] * x**2 / 2
+        ok = np.isfinite(y)
+        line = np.vander(x[ok], 2)
+        rest = y[ok] - line @ np.linalg.lstsq(line, y[ok], rcond=None)[0]
+        total += float(rest @ rest) / sigma[c] ** 2
+    return total
+
+
+def flights_and_acceleration(
+    t: np.ndarray, q: np.ndarray, sigma: np.ndarray, known: np.ndarray | None, shortest: int
+) -> tuple[list[np.ndarray], np.ndarray]:
+    """Flights, and the acceleration (n,): known, or the one that all have in common."""
+    if known is not None:
+        return flights_of(t, q, sigma, known, shortest), known
+    # second differences over so many frames, of which most lie in one flight
+    step = max(shortest, 2)
+    step = step if len(q) > 2 * step else 1
+    second = q[2 * step :] - 2 * q[step:-step] + q[: -2 * step]
+    acceleration = np.nanmedian(second, axis=0) / (step * np.median(np.diff(t))) ** 2
+    flights: list[np.ndarray] = []
+    for _ in range(ROUNDS):
+        flights = flights_of(t, q, sigma, acceleration, shortest)
+        if flights:
+            acceleration = common_acceleration(t, q, flights)
+    return flights, acceleration
+
+
+def common_acceleration(t: np.ndarray, q: np.ndarray, flights: list[np.ndarray]) -> np.ndarray:
+    """By least squares of parabolas of one curvature, each flight with a line of its own."""
+    found = np.zeros(q.shape[1])
+    for c in range(q.shape[1]):
+        above, below = 0.0, 0.0
+        for frames in flights:
+            ok = frames[np.isfinite(q[frames, c])]
+            x = t[ok] - t[ok].mean()
+            line = np.linalg.qr(np.vander(x, 2))[0]
+            curve = x**2 / 2 - line @ (line.T @ (x**2 / 2))
+            above, below = above + float(curve @ q[ok, c]), below + float(curve @ curve)
+        found[c] = above / below if below > 0 else 0.0
+    return found

@@ -1,0 +1,276 @@
+"""From the camera to a fit: impacts in tracks, bounce times, tables of trackers, bad input."""
+
+import numpy as np
+import pytest
+
+import jimpact as ji
+
+G = 9.80665
+
+
+def ball(rng, fps=120, e=0.8, height=0.5, noise=1e-3, coordinates=1):
+    """A ball that falls from a height and bounces once; its instant [s] is `sqrt(2 h / g)`."""
+    speed = np.sqrt(2 * G * height)
+    first = speed / G
+    t = (np.arange(int(fps * (first + 1.8 * e * first))) + rng.random()) / fps
+    since = t - first
+    y = np.where(since < 0, -speed * since, e * speed * since) - G * since**2 / 2
+    if coordinates == 3:
+        y = np.column_stack([0.3 * t - 0.1 * np.maximum(since, 0), 0.2 - 0.1 * t, y])
+    return t, y + noise * rng.normal(size=y.shape), first
+
+
+def restitution(impact):
+    pre, post = impact.pre[-1], impact.post[-1]
+    n = len(impact.pre)
+    slope = np.zeros(2 * n)
+    slope[n - 1], slope[-1] = post / pre**2, -1 / pre
+    return -post / pre, float(np.sqrt(slope @ impact.covariance @ slope))
+
+
+def bound(fps):
+    """Cramer and Rao: the least error of e = 0.8, by the information of place, v-, v+, instant."""
+    t, _, first = ball(np.random.default_rng(0), fps)
+    since, speed = t - first, np.sqrt(G)
+    after = since >= 0
+    speed = np.sqrt(2 * G * 0.5)
+    v = np.where(after, 0.8 * speed, -speed) - G * since
+    slopes = np.stack([np.ones_like(t), since * ~after, since * after, -v], axis=1)
+    covariance = np.linalg.inv(slopes.T @ slopes) * 1e-6
+    e_slope = np.array([0.0, 0.8 / speed, 1 / speed, 0.0])
+    return float(np.sqrt(e_slope @ covariance @ e_slope))
+
+
+@pytest.mark.parametrize("fps", [60, 120, 240])
+def test_restitution_has_no_bias_and_the_least_error(fps):
+    rng, values = np.random.default_rng(3), []
+    for _ in range(80):
+        t, y, _ = ball(rng, fps)
+        track = ji.tracks.find_impacts(t, y, sigma=1e-3, acceleration=-G)
+        (impact,) = track.impacts
+        values.append(restitution(impact))
+    e, stated = np.array(values).T
+    least = bound(fps)
+    assert abs(e.mean() - 0.8) < 3.5 * least / np.sqrt(len(e))
+    np.testing.assert_allclose(e.std(), least, rtol=0.3)  # 8 % is one standard error
+    np.testing.assert_allclose(stated.mean(), least, rtol=0.1)
+    assert np.mean(np.abs(e - 0.8) < 1.96 * stated) > 0.87
+
+
+def test_lost_frames_and_unknown_noise_in_space():
+    rng, found = np.random.default_rng(8), 0
+    for _ in range(60):
+        t, q, first = ball(rng, coordinates=3)
+        q[rng.random(len(t)) < 0.1] = np.nan
+        track = ji.tracks.find_impacts(t, q, acceleration=[0, 0, -G])
+        found += len(track.impacts) == 1
+    assert found == 60
+    impact = track.impacts[0]
+    assert abs(impact.time - first) < 5 * impact.time_error
+    np.testing.assert_allclose(track.sigma, 1e-3, rtol=0.5)
+
+
+def test_good_tracks_have_few_warnings_and_bad_ones_have():
+    rng, warned = np.random.default_rng(4), 0
+    for _ in range(100):
+        t, y, _ = ball(rng)
+        warned += bool(ji.tracks.find_impacts(t, y, sigma=1e-3, acceleration=-G).warnings)
+    assert warned <= 4  # 1 is expected; more than 4 happen once in 250
+    t, y, _ = ball(rng)
+    for bad, words in (
+        (dict(q=1.05 * y), "not ballistic"),
+        (dict(t=t + 2e-3 * rng.normal(size=len(t))), "within sigma"),
+        (dict(q=np.repeat(y[::4], 4)[: len(y)]), "repeat"),
+    ):
+        arguments = {"t": t, "q": y, "sigma": 1e-3, "acceleration": -G} | bad
+        arguments["t"] = np.sort(arguments["t"])
+        lines = ji.tracks.find_impacts(**arguments).warnings
+        assert any(words in line for line in lines), lines
+
+
+def test_gliders_of_unknown_acceleration_and_two_impacts():
+    rng = np.random.default_rng(6)
+    t = np.arange(300) / 100
+    x1 = 0.5 * t - 0.4 * np.maximum(t - 1.0, 0) + 0.3 * np.maximum(t - 2.0, 0)
+    x2 = 0.6 + 0.35 * np.maximum(t - 1.0, 0)
+    q = np.column_stack([x1, x2]) - 0.02 * t[:, None] ** 2 / 2
+    q += 2e-4 * rng.normal(size=q.shape)
+    track = ji.tracks.find_impacts(t, q, acceleration=None)
+    assert len(track.impacts) == 2
+    np.testing.assert_allclose([each.time for each in track.impacts], [1, 2], atol=0.01)
+    np.testing.assert_allclose(track.acceleration, -0.02, atol=0.002)
+    np.testing.assert_allclose(track.impacts[0].pre, [0.48, -0.02], atol=0.003)
+    assert track.covariance.shape == (8, 8)
+    np.testing.assert_allclose(track.covariance, track.covariance.T, atol=1e-18)
+    shots = track.experiments()
+    assert shots.covariance.shape == (8, 8)
+
+
+def test_frames_in_contact_are_left_out():
+    rng, e, duration = np.random.default_rng(9), 0.8, 0.008
+    t, y, first = ball(rng, fps=1000)
+    pressed = np.abs(t - first) < duration / 2
+    y[pressed] += 0.01 * (1 - (2 * (t[pressed] - first) / duration) ** 2)
+    track = ji.tracks.find_impacts(t, y, 1e-3, acceleration=-G, contact=0.012)
+    (impact,) = track.impacts
+    assert abs(restitution(impact)[0] - e) < 5 * restitution(impact)[1]
+
+
+def test_a_window_uses_frames_near_the_impact():
+    t, y, _ = ball(np.random.default_rng(2))
+    whole = ji.tracks.find_impacts(t, y, 1e-3, acceleration=-G)
+    near = ji.tracks.find_impacts(t, y, 1e-3, acceleration=-G, window=0.1)
+    assert sum(map(len, near.flights)) < sum(map(len, whole.flights))
+    assert restitution(near.impacts[0])[1] > restitution(whole.impacts[0])[1]
+
+
+def test_time_is_linear_and_impacts_many():
+    rng = np.random.default_rng(1)
+    fps, starts, t = 120, [0.0], np.arange(3000) / 120
+    y = np.zeros(len(t))
+    while starts[-1] < t[-1]:
+        speed = 2 + 1.5 * rng.random()
+        end = starts[-1] + 2 * speed / G
+        here = (t >= starts[-1]) & (t < end)
+        since = t[here] - starts[-1]
+        y[here] = speed * since - G * since**2 / 2
+        starts.append(end)
+    y += 1e-3 * rng.normal(size=len(t))
+    track = ji.tracks.find_impacts(t, y, acceleration=-G)
+    times = np.array([each.time for each in track.impacts])
+    np.testing.assert_allclose(times, starts[1 : len(times) + 1], atol=0.5 / fps)
+
+
+def test_a_square_that_lands_on_a_corner_is_a_shot_in_its_pose():
+    rng, body = np.random.default_rng(7), ji.Block(0.1, 0.1)
+    t, q = np.arange(60) / 240, np.zeros((60, 3))
+    pose = np.array([0.0, 0.0, 0.3])
+    pose[1] -= float(np.min(np.asarray(body.gap_function(pose))))
+    scene = body.scenes([pose])[0]
+    before = np.array([0.2, -1.5, 1.0])
+    after = np.asarray(ji.impact(ji.Newton(0.5), scene, before).velocity)
+    since = t[:, None] - 0.12
+    q = pose + np.where(since < 0, before * since, after * since)
+    q[:, 1] -= G * since[:, 0] ** 2 / 2
+    q += 1e-4 * rng.normal(size=q.shape)
+    track = ji.tracks.find_impacts(t, q, acceleration=[0, -G, 0], units=["m", "m", "rad"])
+    shots = track.experiments(body)
+    assert shots.units == ("m/s", "m/s", "rad/s")
+    assert shots.contacts.tolist() == [1]
+    fit = ji.fit(ji.Newton(0.8, friction=0.0), None, shots)
+    assert abs(fit.value[0] - 0.5) < 4 * fit.standard_error[0]
+    high = ji.tracks.find_impacts(
+        t, q + np.array([0.0, 0.05, 0.0]), acceleration=[0, -G, 0], units=["m", "m", "rad"]
+    )
+    with pytest.raises(ValueError, match="closed"):
+        high.experiments(body)
+
+
+def test_bounce_times_reach_the_bound():
+    rng, e, sigma = np.random.default_rng(5), 0.81, 0.005
+    flights = 0.55 * e ** np.arange(5)
+    true = np.concatenate([[0.0], np.cumsum(flights)])
+    wall, scatter, stated = ji.chain([1.0], "left"), [], []
+    for _ in range(12):
+        shots = ji.tracks.bounce_times(true + sigma * rng.normal(size=6), sigma)
+        fit = ji.fit(ji.Newton(0.7), wall, shots)
+        scatter.append((fit.value[0] - e) / fit.standard_error[0])
+        stated.append(fit.standard_error[0])
+    # t_0, the first flight and e by six times
+    k, powers = np.arange(6), np.concatenate([[0.0], np.cumsum(e ** np.arange(5))])
+    slope = 0.55 * np.array([sum(j * e ** (j - 1) for j in range(1, m)) for m in k])
+    slopes = np.stack([np.ones(6), powers, slope], axis=1)
+    least = sigma * np.sqrt(np.linalg.inv(slopes.T @ slopes)[2, 2])
+    np.testing.assert_allclose(np.mean(stated), least, rtol=0.1)
+    assert np.sqrt(np.mean(np.square(scatter))) < 1.8
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"t": [0.0, 0.1], "q": [0.0, 1.0]}, "5 frames"),
+        ({"t": [0.0, 0.1, 0.2, 0.15, 0.3, 0.4]}, "rise"),
+        ({"t": [0.0, 0.1, np.nan, 0.3, 0.4, 0.5]}, "finite"),
+        ({"sigma": 0.0}, "sigma"),
+        ({"sigma": -1.0}, "sigma"),
+        ({"q": np.full(6, np.nan)}, "NaN in all"),
+        ({"q": np.zeros((5, 1))}, "shapes"),
+        ({"units": "deg"}, "'rad'"),
+        ({"contact": -1.0}, "contact"),
+        ({"window": 0.0}, "window"),
+        ({"shortest": 2}, "shortest"),
+    ],
+)
+def test_bad_tracks_are_refused(arguments, words):
+    good = {"t": np.arange(6) / 10, "q": np.arange(6.0), "sigma": 0.1}
+    with pytest.raises(ValueError, match=words):
+        ji.tracks.find_impacts(**(good | arguments))
+
+
+def test_a_track_without_an_impact_says_so():
+    t = np.arange(30) / 100
+    track = ji.tracks.find_impacts(t, 1.0 - t, sigma=1e-3)
+    assert track.impacts == ()
+    assert "No impact" in track.warnings[0]
+    assert "No impact" in str(track)
+    with pytest.raises(ValueError, match="No impact"):
+        track.experiments()
+
+
+def test_an_impact_in_the_first_frames_is_told():
+    t = np.arange(40) / 100
+    track = ji.tracks.find_impacts(t, np.abs(t - 0.025), sigma=1e-4)
+    assert any("first 3 frames" in line for line in track.warnings)
+
+
+@pytest.mark.parametrize(
+    "times", [[0.0, 1.0], [0.0, 0.5, 0.4], [0.0, np.nan, 1.0], [0.3, 0.6, 0.0]]
+)
+def test_bad_bounce_times_are_refused(times):
+    with pytest.raises(ValueError, match="times"):
+        ji.tracks.bounce_times(times, 0.001)
+
+
+TRACKER = "#multi:\n\tball\t\t\nt\tx #1\ty\t\n0,00\t1,5\t2,0\n0,01\t\t\n0,02\t1,7\t2,2\n"
+LOGGER = '"Run 1: Time (s)";"Run 1: Height (mm)"\n0.0;1500\n0.010;nan\n0.020;1700;\n'
+CAPTURE = "FREQUENCY 100\nLABELS 2\n\nX Y\n1500 2000\n- -\n1700 2200\n"
+
+
+def test_tables_of_trackers_loggers_and_capture_systems(tmp_path):
+    path = tmp_path / "track.txt"
+    path.write_text(TRACKER)
+    t, q = ji.tracks.read(path, ["x #1", "y"], time="t", unit="m", decimal=",")
+    np.testing.assert_allclose(t, [0, 0.01, 0.02])
+    np.testing.assert_allclose(q, [[1.5, 2.0], [np.nan, np.nan], [1.7, 2.2]])
+    path.write_text(LOGGER)
+    time = "Run 1: Time (s)"
+    np.testing.assert_allclose(
+        ji.tracks.read(path, "Run 1: Height (mm)", time=time, unit="mm")[1],
+        [[1.5], [np.nan], [1.7]],
+    )
+    with pytest.raises(ValueError, match="states the unit mm"):
+        ji.tracks.read(path, "Run 1: Height (mm)", time=time, unit="m")
+    path.write_text(CAPTURE)
+    t, q = ji.tracks.read(path, ["X", "Y"], rate=100, unit="mm")
+    np.testing.assert_allclose(t, [0, 0.01, 0.02])
+    np.testing.assert_allclose(q[0], [1.5, 2.0])
+    with pytest.raises(TypeError):
+        ji.tracks.read(path, ["X"], rate=100)
+    for arguments, words in (
+        ({"columns": ["Z"]}, "`Z` is missing"),
+        ({"unit": "px"}, "Pixels"),
+        ({"time": "X"}, "both"),
+        ({"rate": None}, "neither"),
+        ({"rate": 0.0}, "rate"),
+        ({"decimal": "x"}, "decimal"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            ji.tracks.read(path, **({"columns": ["X"], "rate": 100, "unit": "mm"} | arguments))
+    path.write_text("X\n1,5\n")
+    with pytest.raises(ValueError, match="line 2, column `X`"):
+        ji.tracks.read(path, "X", rate=100, unit="m")
+
+
+def test_a_picture_of_a_track():
+    t, y, _ = ball(np.random.default_rng(1))
+    assert len(ji.tracks.find_impacts(t, y, acceleration=-G).plot().axes) == 2
