@@ -30,6 +30,7 @@ API = {  # a page, and the modules whose public names it holds: the longest matc
     "Laws": ("law", "registry", "laws"),
     "Contact forces": ("laws.forces", "laws.calibration"),
     "Shots and fits": ("fits", "cli", "saved"),
+    "Tracks": ("tracks",),
     "Monte Carlo": ("montecarlo",),
     "Motions": ("motion",),
     "Methods": ("methods",),
@@ -47,7 +48,8 @@ DATA = {
 def public_names() -> dict[str, list[str]]:
     """Public names by page, from the stubs that list them."""
     pages: dict[str, list[str]] = {title: [] for title in API}
-    for package, prefix in (("", ""), ("plot", "plot."), ("theory", "theory."), ("data", "data.")):
+    for package, prefix in (("", ""), ("plot", "plot."), ("theory", "theory."), ("data", "data."),
+                            ("tracks", "tracks.")):  # fmt: skip
         stub = ROOT / "jimpact" / package / "__init__.pyi"
         for line in ast.parse(stub.read_text(encoding="utf-8")).body:
             if not isinstance(line, ast.ImportFrom) or line.module is None:
@@ -310,7 +312,8 @@ ROOMS = (  # from above: (name, task, modules); a room imports from rows below i
     (("plot", "pictures", ("plot",)),),
     (("methods", "comparison, charts", ("methods",)), ("saved", "saved results", ("saved",))),
     (("theory", "outcomes, bounds", ("theory",)),),
-    (("motion", "whole motions", ("motion",)), ("data", "measured impacts", ("data",))),
+    (("motion", "whole motions", ("motion",)), ("tracks", "from the camera", ("tracks",)),
+     ("data", "measured impacts", ("data",))),
     (("fits", "shots, fits, verdicts", ("fits",)),),
     (("montecarlo", "random gaps", ("montecarlo",)),),
     (("laws", "one file for each law", ("laws",)), ("bodies", "gaps, tangents, mass", ("bodies",)),

@@ -91,9 +91,9 @@ class Track:
 
     def plot(self, title: str = "") -> Any:
         """A picture of the track, see `ji.plot.track`."""
-        from jimpact.plot.tracks import track
+        from jimpact import plot
 
-        return track(self, title)
+        return plot.track(self, title)
 
     def experiments(self, scene: Scene | Body | None = None, near: float = 2e-3) -> Experiments:
         """The impacts as shots with their covariance, in the scene of each pose.
