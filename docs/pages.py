@@ -35,6 +35,7 @@ API = {  # a page, and the modules whose public names it holds: the longest matc
     "Laws": ("core.law", "core.registry", "laws"),
     "Contact forces": ("laws.forces", "laws.calibration"),
     "Shots and fits": ("fits", "cli", "saved"),
+    "Tracks": ("tracks",),
     "Monte Carlo": ("montecarlo", "core.distributions"),
     "Motions": ("motion",),
     "Methods": ("methods",),
@@ -52,7 +53,8 @@ DATA = {
 def public_names() -> dict[str, list[str]]:
     """Public names by page, from the stubs that list them."""
     pages: dict[str, list[str]] = {title: [] for title in API}
-    for package, prefix in (("", ""), ("plot", "plot."), ("theory", "theory."), ("data", "data.")):
+    for package, prefix in (("", ""), ("plot", "plot."), ("theory", "theory."), ("data", "data."),
+                            ("tracks", "tracks.")):  # fmt: skip
         stub = ROOT / "jimpact" / package / "__init__.pyi"
         for line in ast.parse(stub.read_text(encoding="utf-8")).body:
             if isinstance(line, ast.ImportFrom) and line.module:

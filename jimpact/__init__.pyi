@@ -51,7 +51,6 @@ from .fits.fitting_motion import fit_motion as fit_motion
 from .fits.posterior import posterior as posterior
 from .fits.problem import FitProblem as FitProblem
 from .fits.profiles import contour as contour, profile as profile
-from .fits.report import load_fit as load_fit
 from .fits.search import Search as Search
 from .fits.selection import (
     fit_laws as fit_laws,

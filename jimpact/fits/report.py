@@ -395,7 +395,7 @@ def load_fit(path: str | Path) -> "Fit":
     >>> data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.3, 0.7], [0.6, 1.4]], sigma=0.02)
     >>> fit = ji.fit(ji.Newton(0.9), ji.chain([1.0, 1.0]), data)
     >>> path = fit.save(pathlib.Path(tempfile.mkdtemp()) / "fit.json")
-    >>> ji.load_fit(path).verdict == fit.verdict
+    >>> ji.load(path).verdict == fit.verdict
     True
     """
     path = Path(path)

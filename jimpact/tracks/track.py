@@ -93,7 +93,6 @@ class Track:
     def plot(self, title: str = "") -> Any:
         """A picture of the track, see `ji.plot.track`."""
         pictures = import_module("jimpact.plot")  # late: matplotlib takes long to import
-
         return pictures.track(self, title)
 
     def experiments(self, scene: Scene | Body | None = None, near: float = 2e-3) -> Experiments:

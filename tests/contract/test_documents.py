@@ -155,9 +155,11 @@ def test_the_gallery_draws_a_picture_of_each_of_its_functions(pages, tmp_path, m
 
 def test_every_public_name_has_a_place_in_the_api(pages):
     names = [name for page in pages.public_names().values() for name in page]
-    everything = [x for x in ji.__all__ if x not in ("data", "plot", "theory", "__version__")]
+    everything = [
+        x for x in ji.__all__ if x not in ("data", "plot", "theory", "tracks", "__version__")
+    ]
     everything += [f"{part.__name__.removeprefix('jimpact.')}.{name}"
-                   for part in (ji.plot, ji.theory, ji.data) for name in part.__all__]  # fmt: skip
+                   for part in (ji.plot, ji.theory, ji.data, ji.tracks) for name in part.__all__]  # fmt: skip
     assert sorted(names) == sorted(everything)
     index = (ROOT / "docs" / "names.md").read_text(encoding="utf-8")
     assert index == pages.names_page(), "run `python docs/pages.py`"
@@ -201,7 +203,9 @@ def test_public_names():
     without = []
     for name in ji.__all__:
         value = getattr(ji, name)
-        assert type(value).__name__ != "module" or name in ("data", "plot", "theory"), name
+        assert type(value).__name__ != "module" or name in ("data", "plot", "theory", "tracks"), (
+            name
+        )
         if callable(value) and not (value.__doc__ or "").strip():
             without.append(name)
     assert not without

@@ -606,7 +606,7 @@ def test_a_saved_fit_is_the_same_fit(tmp_path, options):
     path = found.save(tmp_path / "fit.json")
     again = ji.load(path)
     assert (str(again), again.to_dict()) == (str(found), found.to_dict())
-    assert str(ji.load_fit(path)) == str(found)
+    assert str(ji.load(path)) == str(found)
     for a, b in zip(*(jax.tree.leaves(x.problem) for x in (found, again))):
         np.testing.assert_allclose(a, b, rtol=1e-12)
     # the weights of the saved problem come from another program: rounding of a few products

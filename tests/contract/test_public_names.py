@@ -8,10 +8,11 @@ import pytest
 import jimpact as ji
 
 PUBLIC = {
-    "jimpact": {*ji.__all__, "data", "plot", "theory"},
+    "jimpact": {*ji.__all__, "data", "plot", "theory", "tracks"},
     "jimpact.plot": set(ji.plot.__all__),
     "jimpact.theory": set(ji.theory.__all__),
     "jimpact.data": set(ji.data.__all__),
+    "jimpact.tracks": set(ji.tracks.__all__),
 }
 MOST = 100  # names at the top
 FILES = sorted(Path(__file__).parent.glob("*.py"))

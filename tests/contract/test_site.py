@@ -107,9 +107,9 @@ def test_links_lead_somewhere_and_nothing_is_loaded_from_elsewhere(site):
 def test_what_is_public_is_in_the_site(site):
     """Every public name in the API or on its law's page; every law has a page and a picture."""
     anchors = set().union(*(Page(x).anchors for x in (site / "generated").rglob("*.html")))
-    inner = ("data", "plot", "theory", "__version__")
+    inner = ("data", "plot", "theory", "tracks", "__version__")
     missing = [x for x in ji.__all__ if x not in inner and f"jimpact.{x}" not in anchors]
-    missing += [f"{part.__name__}.{x}" for part in (ji.plot, ji.theory, ji.data) for x in part.__all__
+    missing += [f"{part.__name__}.{x}" for part in (ji.plot, ji.theory, ji.data, ji.tracks) for x in part.__all__
                 if f"{part.__name__}.{x}" not in anchors]  # fmt: skip
     assert not missing
     for name, row in ji.REGISTRY.items():
