@@ -1,0 +1,46 @@
+"""Files that a build before 0.2 saved, when classes had other modules: read, or refused with a sentence."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import jimpact as ji
+
+SAVED = Path(__file__).parents[1] / "data" / "saved_0_1"
+
+
+def test_a_fit_is_read_and_saved_by_public_names(tmp_path):
+    fit = ji.load(SAVED / "fit.json")
+    assert type(fit.law) is ji.LZB
+    np.testing.assert_allclose(
+        fit.value, [0.8912947587740866, 0.8102045696860172, 2.088638444090552]
+    )
+    assert fit.verdict.startswith("restitution[1] and restitution[2] and the stiffness ratio")
+    again = fit.save(tmp_path / "fit.json")
+    assert str(ji.load(again)) == str(fit)
+    assert "jimpact." not in json.dumps(json.loads(again.read_text())["result"])
+
+
+def test_a_motion_is_read():
+    motion = ji.load(SAVED / "ball.npz")
+    assert float(motion.event_times()[0]) == pytest.approx(np.sqrt(2 / 9.80665))
+
+
+def test_a_run_is_not_continued(tmp_path):
+    """Its identity named modules, so that nobody can tell whether it is the same."""
+    folder = shutil.copytree(SAVED, tmp_path / "run")
+    with pytest.raises(ValueError, match="holds a run that an earlier build of jimpact began"):
+        ji.monte_carlo(
+            ji.Compliant(ji.Hertz(1e9)), ji.chain([0.1] * 3), [1.0, 0, 0],
+            gaps=ji.Uniform(0.0, 1e-5), samples=1000, folder=folder,
+        )  # fmt: skip
+
+
+def test_an_unknown_law_is_named(tmp_path):
+    text = (SAVED / "fit.json").read_text().replace("jimpact.laws.lzb:LZB", "ji.Zorn")
+    (tmp_path / "fit.json").write_text(text)
+    with pytest.raises(ValueError, match="Zorn is no class of jimpact"):
+        ji.load(tmp_path / "fit.json")
