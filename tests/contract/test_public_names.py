@@ -13,7 +13,6 @@ PUBLIC = {
     "jimpact.theory": set(ji.theory.__all__),
     "jimpact.data": set(ji.data.__all__),
     "jimpact.tracks": set(ji.tracks.__all__),
-    "jimpact.tracks": set(ji.tracks.__all__),
 }
 MOST = 100  # names at the top
 FILES = sorted(Path(__file__).parent.glob("*.py"))
