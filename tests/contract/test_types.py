@@ -17,7 +17,7 @@ import jimpact as ji
 
 ROOT = Path(__file__).parents[2]
 SCRIPT = Path(__file__).parents[1] / "typed_script.py"
-PACKAGES = (ji, ji.plot, ji.theory, ji.data)
+PACKAGES = (ji, ji.plot, ji.theory, ji.data, ji.tracks)
 
 
 def names_in_stub(package):
