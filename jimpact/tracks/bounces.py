@@ -31,7 +31,7 @@ def bounce_times(times: Any, sigma: Any, gravity: float = 9.80665) -> Experiment
 
     >>> import jimpact as ji
     >>> shots = ji.tracks.bounce_times([0.0, 0.5, 0.9, 1.22], sigma=0.001)
-    >>> [round(-float(after / before), 3) for before, after in zip(shots.pre, shots.post)]
+    >>> [round(-float(v[1] / v[0]), 3) for v in zip(shots.pre[:, 0], shots.post[:, 0])]
     [0.8, 0.8]
     """
     for name, value in (("times", times), ("sigma", sigma), ("gravity", gravity)):
