@@ -48,7 +48,7 @@ STATUS = (
     Status(
         "max_steps",
         "the step limit, or steps that vanish, ended the impact or the motion before it was over; "
-        "for LZB and Compliant try method='implicit'",
+        "for an impact by LZB or Compliant try method='implicit'",
         True,
     ),
     Status("penetration", "a gap is negative at the start", True),
