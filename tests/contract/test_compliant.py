@@ -215,6 +215,7 @@ def test_restitution_of_a_damped_spring():
     assert float(closed[-1]) == pytest.approx(np.exp(-2), rel=1e-13)  # critical
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("zeta", [0.89, 0.99995, 1.0, 1.12])
 def test_derivatives_of_restitution_about_critical_damping(zeta):
     """First to third, beside Cauchy's integrals of the formula around a circle."""
@@ -276,6 +277,7 @@ def test_user_forces():
     assert float(out.energy_change) == pytest.approx(0, abs=1e-7)
 
 
+@pytest.mark.slow
 def test_a_force_that_is_cut_at_0_keeps_the_tolerance():
     """Hunt-Crossley, while a heavy ball drives a light one: the cut is an event."""
     k, d, gaps = np.array([1.0, 4.0]), np.array([2.5, 1.0]), np.array([0.0, 0.03])
@@ -288,6 +290,7 @@ def test_a_force_that_is_cut_at_0_keeps_the_tolerance():
     np.testing.assert_allclose(after.velocity, expected, atol=1.5e-8 * 11)
 
 
+@pytest.mark.slow
 def test_forces_that_are_positive_at_touch():
     """A contact ends at x = 0 with the force that it has there, elastic or damped.
 

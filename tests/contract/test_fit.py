@@ -311,6 +311,7 @@ def test_derivatives_that_are_no_numbers_are_left_out_or_refused():
         ji.fit(problem, bounds={"restitution": (0.5, 1.0)})
 
 
+@pytest.mark.slow
 def test_one_shot_that_gains_energy_is_named():
     """Twelve collisions of gliders of mass 1 and 2 with e = .9; the seventh is misread by a fifth of v-."""
     rng = np.random.default_rng(8)

@@ -188,6 +188,7 @@ def redundant(number):
     return [x[number] for x in (mass, normals, tangents, v, e, mu)]
 
 
+@pytest.mark.slow
 def test_poisson_depends_on_how_redundant_contacts_share_compression():
     """Whether v+ differs among the extreme shares of all 8 x 27 modes, by linear programs.
 

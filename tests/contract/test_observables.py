@@ -41,7 +41,7 @@ def test_a_study_of_a_motion_is_fitted(tmp_path):
 def test_motions_that_cannot_be_read(tmp_path):
     (tmp_path / "study.toml").write_text(MOTION)
     for text, message in (
-        ("t[s],q_1[m]\n0,1\n1,1\n3,1\n", "rising in equal steps"),
+        ("t[s],q_1[m]\n0,1\n1,1\n3,1\n", "must rise in equal steps"),
         ("t[s],q_2[m]\n0,1\n1,1\n", "the columns must be `q_1`, `q_2` and `t`"),
         ("t[s],v_1[m/s]\n0,1\n1,1\n", r"column 2 must be one of `t\[s\]`, `q_1\[unit\]`"),
         ("t[s],q_1[m],sigma_q_1[m]\n0,1,1\n1,1,0\n", "must be > 0, but is 0"),

@@ -201,6 +201,7 @@ def test_statement_of_jia(wall, e, before):
     np.testing.assert_allclose(lzb.velocity[0, : len(before)], after, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_slopes_of_routh_in_each_restitution_at_zero():
     """Only contact 2 does work: dv+/de_2 = M^-1 N p_c for every e_2, at 0, too; e_1, e_3 have no part."""
     masses = np.array([1.0, 2.0, 0.5, 1.5])

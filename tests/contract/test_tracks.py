@@ -141,6 +141,7 @@ def test_time_is_linear_and_impacts_many():
     np.testing.assert_allclose(times, starts[1 : len(times) + 1], atol=0.5 / fps)
 
 
+@pytest.mark.slow
 def test_a_square_that_lands_on_a_corner_is_a_shot_in_its_pose():
     rng, body = np.random.default_rng(7), ji.Block(0.1, 0.1)
     t, q = np.arange(60) / 240, np.zeros((60, 3))

@@ -22,6 +22,7 @@ def block_and_its_pictures():
     return block, scene, after, pictures
 
 
+@pytest.mark.slow
 def test_metres_and_radians_a_second_have_axes_of_their_own():
     block, scene, after, pictures = block_and_its_pictures()
     root = np.sqrt(np.diag(np.asarray(scene.mass)) if scene.mass.ndim == 2 else scene.mass)
