@@ -46,6 +46,7 @@ API = {  # a page, and the modules whose public names it holds: the longest matc
 
 DATA = {
     "REGISTRY": "All laws by name: `REGISTRY[name].law` is the class. `register` adds a law.",
+    "data.ENGINE_SCENES": "Scenes of `engine_impacts` by name: masses [kg], wall, the e asked for.",
     "STATUS": "Rows `(name, message, failure)` of the status codes, listed below.",
 }
 
