@@ -181,6 +181,7 @@ def test_equality_constraints_are_bilateral_constraints(storage):
     assert v[2] == pytest.approx(-1.0, abs=2e-3)
 
 
+@pytest.mark.slow
 def test_a_welded_foot_and_a_locked_joint_at_its_stop_take_no_part():
     hinge = '<joint name="hinge" axis="0 1 0" range="-40 0" limited="true"/>'
     arm = body("0 2 .5", 'type="sphere" size=".05" pos=".3 0 0" mass="2"', hinge, name="arm")
