@@ -58,6 +58,7 @@ from jimpact.motion.tables import (
 )
 from jimpact.motion.transitions import (
     REST_SPEED,
+    STOPPED,
     After,
     Passed,
     no_jump,
@@ -82,6 +83,7 @@ class _CompliantRun(NamedTuple):
     event_count: jax.Array
     status: jax.Array
     apart: jax.Array  # whether all contacts are open and none closes
+    vanished: jax.Array  # () [s] when steps last vanished at an end of slip, -inf before
 
 
 def compliant_motion(problem: MotionProblem, max_events: int, until_apart: bool) -> Course:
@@ -143,6 +145,7 @@ def _begin(problem: MotionProblem, max_events: int) -> _CompliantRun:
         jnp.int32(0),
         status_at_start(system, state, times[-1], jnp.inf),
         jnp.all((phase[:m] == Phase.OPEN) & (gamma >= 0)),
+        jnp.full_like(state.t, -jnp.inf),
     )
 
 
@@ -220,9 +223,11 @@ def _one_pass(max_events: int, problem: MotionProblem, run: _CompliantRun) -> _C
     closed, opened = was_open & ~is_open, ~was_open & is_open
     gamma, slip = _rates(problem, flown.state)
     fastest, none = jnp.maximum(-gamma, 0.0), jnp.zeros(m, bool)
-    turned, stopped = none, none
+    turned, stopped, vanished = none, none, run.vanished
     if problem.mu is not None:
-        side, fired = phases_of(flight.aim.modes, flown.state).side, flown.event[2 * m :]
+        side = phases_of(flight.aim.modes, flown.state).side
+        flown, vanished = _ended_slip(problem, run, flown, side, slip)
+        fired = flown.event[2 * m :]
         stopped = slip_stops(settings, side, fired, slip, flow.scales.slip)
         turned, fastest = (fired & side.stick) | stopped, jnp.concatenate([fastest, slip])
         flown = flown._replace(state=flow.stopped(stopped, flown.state))
@@ -249,7 +254,27 @@ def _one_pass(max_events: int, problem: MotionProblem, run: _CompliantRun) -> _C
         run.event_count + written.astype(jnp.int32),
         status.astype(jnp.int32),
         jnp.all((after == Phase.OPEN) & (gamma >= 0)),
+        vanished,
     )
+
+
+def _ended_slip(
+    problem: MotionProblem, run: _CompliantRun, flown: Flight, side: Modes, slip: jax.Array
+) -> tuple[Flight, jax.Array]:
+    """Slip (m,) that has nearly ended where steps vanish ends, and when () [s] that last was so.
+
+    A body that turns on one corner drags another through its end of slip. There friction turns
+    round at once, and with it the force that holds the first corner: no step lands on its cone.
+    """
+    m, most = problem.contacts, problem.settings.max_steps
+    scale = jnp.maximum(jnp.max(run.fastest), jnp.max(slip))
+    ends = side.active & ~side.stick & (slip <= STOPPED * scale)
+    vanished = flown.stuck & (flown.steps < most) & (flown.state.t > run.vanished)
+    here = vanished & jnp.any(ends)
+    event = flown.event.at[2 * m :].set(ends)
+    goes_on = flown._replace(event=event, stuck=jnp.asarray(False))
+    again = toward_sample(goes_on, problem.times, flown.free)
+    return selected(here, again, flown), jnp.where(here, flown.state.t, run.vanished)
 
 
 def _event(problem: MotionProblem, at: State, opened: jax.Array) -> jax.Array:

@@ -44,6 +44,10 @@ from jimpact.tools.loops import any_lane
 AHEAD = 1e-2
 # Of the speed scale of the motion: less slip is none yet. Ten times more is still rounding.
 NO_SLIP = 1e-13
+# Of the speed scale of the motion: slip that starts keeps its first direction as long as it is
+# less: friction turns it within less time than a step. Ten times more: it turns ten times later; a
+# thousandth: an error of the first step in its direction ends it again.
+FIRST = 1e-9
 # Of the speed scale of the motion: slip that is left for the landing. Ten times more: derivatives
 # of motions err by ten times as much where slip ends, ten times less: by rounding.
 LAST = 1e-8
@@ -87,7 +91,7 @@ def slip_axes(contacts: Contacts, mu: jax.Array, modes: Modes, speed_scale: jax.
     kept = (last & (speed > 0))[:, None]
     along = jnp.where(kept, jax.lax.stop_gradient(along), along)
     least = jnp.where(last, 1.0, AHEAD) * jax.lax.stop_gradient(speed)
-    return SlipAxes(along, speed, jnp.where(starts, NO_SLIP * speed_scale, least), last)
+    return SlipAxes(along, speed, jnp.where(starts, FIRST * speed_scale, least), last)
 
 
 def slip_within(axes: SlipAxes, modes: Modes, rate: jax.Array) -> jax.Array:

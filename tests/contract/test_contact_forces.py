@@ -1,5 +1,7 @@
 """Motions under contact forces: a ball on a spring in closed form, losses, bad input."""
 
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -182,6 +184,23 @@ def test_a_box_strikes_on_its_corners_with_friction():
     assert int(motion.events.count) > 10
     assert float(jnp.max(jnp.diff(motion.energy))) < 1e-9
     np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_box_that_lands_flat_drags_a_corner_through_its_end_of_slip():
+    """Beside Radau with regularized friction, eps = 1e-7 m/s (scipy), of which 1e-6 are left."""
+    size, turn = [0.2, 0.14, 0.1], 0.26
+    system = ji.System(ji.Box(size, mass=1.7), gravity=True)
+    law = ji.Compliant(ji.HuntCrossley(3.56e4, 0.83), friction=0.24)
+    q = [0, 0, 0.0501, math.cos(turn), 0, 0, math.sin(turn)]
+    v = [0.26, 0.12, -0.86, 0.39, 0.52, -3.57]
+    motion = ji.simulate(
+        system, law, q, v, 0.03, method=ji.ContactForces(max_steps=5000), samples=3, max_events=50
+    )
+    ji.raise_on_failure(motion)
+    end = [-0.015664, -0.00104, 0.498739, -0.127854, -0.290198, -0.000231]
+    np.testing.assert_allclose(motion.velocity[-1], end, atol=3e-6)
+    np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-11)
 
 
 def test_what_contact_forces_need():
