@@ -42,6 +42,7 @@ from jimpact.fits.uncertainty import Profile, check_level, uncertainty
 from jimpact.tools.checks import as_whole, check_choice, check_kind, check_values
 from jimpact.tools.progress import progress_bar
 from jimpact.tools.records import listed
+from jimpact.tools.threads import as_workers
 
 
 def fit(
@@ -249,6 +250,7 @@ def fit_many(
     starts: int = 1,
     seed: int = 0,
     max_steps: int = DEFAULT_STEPS["levenberg-marquardt"],
+    workers: int | None = None,
     progress: float | None = None,
 ) -> "Fits[AnyLaw]":
     """`fit` of one law to each of many data sets, side by side in one compiled program.
@@ -267,6 +269,7 @@ def fit_many(
         starts: of each data set.
         seed: of the random starts.
         max_steps: iterations per start.
+        workers: threads >= 1, which change no bit; None: one for each core.
         progress: a bar on stderr; None: on a terminal.
 
     Returns:
@@ -283,6 +286,7 @@ def fit_many(
     [0.4, 0.8]
     """
     as_whole("starts", starts, 1)
+    as_workers(workers)
     check_kind("many", many, Sequence)
     choice = (free, bounds, priors, ties)
     for k, data in enumerate(many):
@@ -298,7 +302,8 @@ def fit_many(
     each: dict[int, Ends] = {}  # where its starts ended
     with progress_bar(progress) as show:
         for members in _alike(problems):
-            first, solver = problems[members[0]], Solver(max_steps=max_steps, show=show)
+            first = problems[members[0]]
+            solver = Solver(max_steps=max_steps, show=show, workers=workers)
             points = start_points(first, starts, np.random.default_rng(seed))
             points = np.tile(points, (len(members), 1))
             some = [problems[k] for k in members]
@@ -374,7 +379,12 @@ class Refits:
 
 
 def bootstrap(
-    fit: Fit, samples: int = 200, *, seed: int = 0, progress: float | None = None
+    fit: Fit,
+    samples: int = 200,
+    *,
+    seed: int = 0,
+    workers: int | None = None,
+    progress: float | None = None,
 ) -> Refits:
     """Fits to data that the fitted law made, with the noise of the fit (parametric bootstrap).
 
@@ -385,6 +395,7 @@ def bootstrap(
         fit: with a known noise.
         samples: data sets B.
         seed: of z.
+        workers: threads >= 1, which change no bit; None: one for each core.
         progress: a bar on stderr; None: on a terminal.
 
     Returns:
@@ -402,6 +413,7 @@ def bootstrap(
     """
     as_whole("samples", samples, 1)
     as_whole("seed", seed, 0)
+    as_workers(workers)
     check_squares("fit", fit)
     if not np.isfinite(fit.noise):
         raise ValueError("Argument `fit` must have a known noise, but its noise is not finite.")
@@ -417,10 +429,12 @@ def bootstrap(
     dtype = problem.low.dtype
     pairs = zip(measured.astype(dtype), means)
     again = [replace(problem, measured=values, prior_mean=mean) for values, mean in pairs]
-    return _refits(fit, again, progress)
+    return _refits(fit, again, workers, progress)
 
 
-def leave_one_out(fit: Fit, *, progress: float | None = None) -> Refits:
+def leave_one_out(
+    fit: Fit, *, workers: int | None = None, progress: float | None = None
+) -> Refits:
     """A fit without each of the K shots in turn; `predicted` (K, n) is of the shot left out.
 
     `measured - predicted` is an honest error of prediction: laws with different numbers of
@@ -428,6 +442,7 @@ def leave_one_out(fit: Fit, *, progress: float | None = None) -> Refits:
 
     Args:
         fit: of K >= 2 shots.
+        workers: threads >= 1, which change no bit; None: one for each core.
         progress: a bar on stderr; None: on a terminal.
 
     Returns:
@@ -442,19 +457,23 @@ def leave_one_out(fit: Fit, *, progress: float | None = None) -> Refits:
     >>> ji.leave_one_out(result).value.round(6).tolist()
     [[0.4], [0.8]]
     """
+    as_workers(workers)
     check_squares("fit", fit)
     shots = 0 if fit.experiments is None else len(fit.predicted)
     if shots < 2:
         raise ValueError(f"Argument `fit` must be of at least 2 shots, but has {shots}.")
     each = np.eye(shots)[:, :, None] * np.ones(fit.predicted.shape)
-    refits = _refits(fit, [fit.problem.weighed(1 - shot) for shot in each], progress)
+    refits = _refits(fit, [fit.problem.weighed(1 - shot) for shot in each], workers, progress)
     return replace(refits, predicted=refits.predicted[np.arange(shots), np.arange(shots)])
 
 
-def _refits(fit: Fit, problems: list[FitProblem], progress: float | None) -> Refits:
+def _refits(
+    fit: Fit, problems: list[FitProblem], workers: int | None, progress: float | None
+) -> Refits:
     """Minima of these problems next to a fit."""
     points = np.tile(fit.problem.point(fit.value), (len(problems), 1))
     with progress_bar(progress) as show:
-        _, ends = settled(problems, points, Solver(show=show), FINE_OF_MANY)
+        solver = Solver(show=show, workers=workers)
+        _, ends = settled(problems, points, solver, FINE_OF_MANY)
     predicted = ends.predicted[:, : len(fit.predicted)] if fit.predicted.ndim else ends.predicted
     return Refits(fit.names, fit.problem.values_at(ends.y), predicted, ends.converged)

@@ -20,6 +20,7 @@ import numpy as np
 from jimpact.tools.checks import suggestion
 from jimpact.tools.compiling import quick_jit
 from jimpact.tools.progress import Show
+from jimpact.tools.threads import in_threads
 
 if TYPE_CHECKING:
     import optax  # which takes long to import
@@ -287,6 +288,7 @@ class Solver(NamedTuple):
     max_steps: int = DEFAULT_STEPS["levenberg-marquardt"]
     show: Show = lambda step, done, total: None
     deadline: float = np.inf  # of `time.monotonic`, after which no pass is begun
+    workers: int | None = None  # threads, None: one for each core
     damping: float = DAMPING  # at first, of Levenberg-Marquardt: less where a minimum is near
 
 
@@ -341,8 +343,8 @@ def minimize(
         if not moved.any():
             break
         inside = np.empty_like(y)
-        every = np.arange(len(y)), many.lanes(len(y))
-        for rows, nearest in in_lanes(best_inside, *every, matrix, states):
+        every = np.arange(len(y)), many.lanes(len(y)), matrix, states
+        for rows, nearest in in_lanes(best_inside, *every, workers=solver.workers):
             inside[rows] = nearest
         states, _ = _descended(many, inside, once, *rule)
         moved, y = np.abs(inside - y).max(axis=1) > SETTLED, inside
@@ -369,13 +371,31 @@ def outcome_at(problem: LeastSquares, x: Any) -> Ends:
 
 
 def in_lanes(
-    compiled: Callable[..., Any], which: np.ndarray, lanes: int, *trees: Any
+    function: Callable[..., Any],
+    which: np.ndarray,
+    lanes: int,
+    *trees: Any,
+    compiles: bool = True,
+    workers: int | None = None,
 ) -> Iterator[tuple[np.ndarray, Any]]:
-    """Which rows of the trees, so many side by side, and what a compiled function makes of them."""
-    for first in range(0, len(which), lanes):
-        rows = which[np.minimum(np.arange(first, first + lanes), len(which) - 1)]
-        pick = partial(jax.tree.map, lambda x, rows=rows: x[rows] if eqx.is_array(x) else x)
-        yield rows, compiled(*map(pick, trees))
+    """Which rows of the trees, so many side by side, and what a function makes of them.
+
+    In threads, as many as `workers`; the first lanes alone where they compile the function.
+    """
+
+    def chosen(first: int) -> np.ndarray:
+        """Rows (lanes,) from this one of `which` on; the last one again where there are fewer."""
+        return which[np.minimum(np.arange(first, first + lanes), len(which) - 1)]
+
+    def result(first: int) -> Any:
+        """What the function makes of them."""
+        rows = chosen(first)
+        pick = partial(jax.tree.map, lambda x: x[rows] if eqx.is_array(x) else x)
+        return jax.device_get(function(*map(pick, trees)))
+
+    starts = range(0, len(which), lanes)
+    results = in_threads(result, starts, workers, compiles)
+    yield from zip(map(chosen, starts), results)
 
 
 @quick_jit
@@ -409,11 +429,13 @@ def _descended(
     advance, states = partial(advance_all, **rule), begin(problems, points, solver)
     converged = np.zeros(count, bool)
     active, lanes = np.arange(count), problems.lanes(count)
+    first = True
     while len(active):
-        before = states.cost.copy()
-        for rows, some in in_lanes(advance, active, lanes, problems, states):
+        before, every = states.cost.copy(), (active, lanes, problems, states)
+        for rows, some in in_lanes(advance, *every, compiles=first, workers=solver.workers):
             for leaf, value in zip(jax.tree.leaves(states), jax.tree.leaves(some)):
                 leaf[rows] = value
+        first = False
         converged = _converged(states, DESCENDED if descends else CONVERGED)
         ended = states.done | (states.steps >= solver.max_steps)
         if not descends:

@@ -5,6 +5,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
+from itertools import chain, islice
 from typing import Any, TypeVar
 
 import jax
@@ -32,18 +33,23 @@ def as_workers(workers: Any) -> int:
 
 
 def in_threads(
-    function: Callable[[Task], Result], tasks: Iterable[Task], workers: Any = None
+    function: Callable[[Task], Result],
+    tasks: Iterable[Task],
+    workers: Any = None,
+    compiles: bool = False,
 ) -> Generator[Result]:
     """`function(task)` of each task, in their order, whatever the number of threads.
 
-    JAX releases Python's lock while a program runs, and most programs of impacts use one core. So
-    call the compiled function once before, lest each thread compiles it. An error of a task is
-    raised where its result would come; tasks that have not begun are then dropped.
+    JAX releases Python's lock while a program runs, and most programs of impacts use one core. An
+    error of a task is raised where its result would come; tasks that have not begun are then
+    dropped.
 
     Args:
         function: of one task; it sees the caller's settings of JAX.
         tasks: any iterable; some `workers` of them are taken ahead.
         workers: threads >= 1; None: one for each core that the process may use.
+        compiles: whether the first task compiles what the others run: they wait for it, lest each
+            thread compiles the same program.
 
     Yields:
         The results.
@@ -55,9 +61,12 @@ def in_threads(
     >>> list(in_threads(lambda x: x**2, range(4), workers=2))
     [0, 1, 4, 9]
     """
-    count = as_workers(workers)
-    if count == 1:
-        yield from map(function, tasks)
+    count, tasks = as_workers(workers), iter(tasks)
+    if compiles or count == 1:
+        yield from map(function, islice(tasks, None if count == 1 else 1))
+    first = list(islice(tasks, 2))
+    if len(first) < 2:  # one task needs no thread
+        yield from map(function, first)
         return
     as_here = _settings()
 
@@ -69,7 +78,7 @@ def in_threads(
     waiting: deque[Future[Result]] = deque()
     with ThreadPoolExecutor(count, thread_name_prefix="jimpact") as pool:
         try:
-            for task in tasks:
+            for task in chain(first, tasks):
                 waiting.append(pool.submit(one, task))
                 if len(waiting) > (1 + _AHEAD) * count:
                     yield waiting.popleft().result()

@@ -1055,6 +1055,10 @@ def test_bootstrap_scatters_as_much_as_the_standard_error():
         np.testing.assert_allclose(many.value.mean(), found.value[0], atol=0.005)
         low, high = many.interval()[0]
         assert low < found.value[0] < high
+    np.testing.assert_array_equal(ji.bootstrap(found, samples=400, workers=1).value, many.value)
+    for workers in (0, -1, "all"):
+        with pytest.raises(ValueError, match="`workers` must be an int >= 1"):
+            ji.bootstrap(found, workers=workers)
     exact = ji.Experiments(SHOTS[:1], [[np.nan, 0.6]])
     with pytest.raises(ValueError, match="must have a known noise"):
         ji.bootstrap(ji.fit(ji.Newton(0.9), PAIR, exact, starts=1))
