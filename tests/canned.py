@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jimpact as ji
+from jimpact.fits.findings import Finding
 from jimpact.fits.report import Fit
 from jimpact.fits.search import FitMinimum
 from jimpact.laws.histories import History
@@ -42,7 +43,7 @@ def canned(shots, value=(0.6, 2.0), **change):
         "converged": True,
         "steps": 17,
         "lost_starts": 0,
-        "warnings": ("The data gain energy.",),
+        "findings": (Finding("energy_gain", "The data gain energy."),),
         "problem": ji.FitProblem.from_shots(
             ji.LZB([0.6], [2.0], exponent=jnp.asarray(1.5)),
             ji.chain([1.0, 1.0]),

@@ -179,7 +179,7 @@ def _fits_of(
     if all_free:  # fits of one law share one compiled program
         study, with_all_free = _per_contact(study)
     yield RAW, study
-    if any("conservation of momentum" in line for line in fits[RAW].warnings):
+    if fits[RAW].found("momentum"):
         assert study.experiments is not None  # it was fitted
         data = study.experiments.momentum_corrected(study.scene)
         yield CORRECTED, replace(study, experiments=data)

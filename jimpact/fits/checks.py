@@ -13,7 +13,8 @@ from scipy.sparse import block_diag
 from scipy.special import chdtrc, fdtrc
 
 from jimpact.fits.data import ROUNDING, kept_by_corrections
-from jimpact.fits.data_checks import DATA_CHECKS, LISTED, DataBalances, Finding, findings
+from jimpact.fits.data_checks import DATA_CHECKS, LISTED, DataBalances
+from jimpact.fits.findings import Finding, findings
 from jimpact.fits.matrices import boundary, encloses
 from jimpact.fits.observables import UNUSABLE, Shots
 from jimpact.fits.problem import FitProblem
@@ -184,8 +185,15 @@ def _range(problem: FitProblem, matrix: np.ndarray, size: float | None = None) -
 
 def _left_out(judged: Judged) -> Iterator[Finding]:
     """Shots that were left out."""
-    for line in judged.problem.left_out:
-        yield Finding(line, line.removeprefix("Left out: ").split(" (")[0] + " are left out")
+    if labels := judged.problem.left_out:
+        count = f"{len(labels)} of {len(judged.problem.measured)} shots"
+        yield Finding(
+            "left_out",
+            f"Left out: {count} ({listed(labels)}), whose impacts fail, or whose derivatives "
+            "cannot be used.",
+            f"{count} are left out",
+            labels,
+        )
 
 
 def _unknown_corrections(judged: Judged) -> Iterator[Finding]:
@@ -196,11 +204,14 @@ def _unknown_corrections(judged: Judged) -> Iterator[Finding]:
     whole = kept_by_corrections(data, judged.problem.scene) == np.eye(data.pre.shape[1])
     unknown = np.flatnonzero((np.array(data.lost) > 0) & whole.all(axis=(1, 2)))
     if unknown.size:
+        labels = tuple(data.shots[k] for k in unknown)
         yield Finding(
-            f"The fit weighs shots {listed([data.shots[k] for k in unknown])} as if they were not "
+            "unknown_correction",
+            f"The fit weighs shots {listed(labels)} as if they were not "
             "corrected: they have `lost_freedom`, but do not conserve momentum, so that the errors "
             "that `sigma_pre` leaves in them are unknown; chi^2 and standard errors are "
-            "approximate."
+            "approximate.",
+            shots=labels,
         )
 
 
@@ -208,12 +219,14 @@ def _search(judged: Judged) -> Iterator[Finding]:
     """A kink for a minimum; a search that has not ended."""
     if judged.solution.stuck:
         yield Finding(
+            "kink",
             "The minimum is a kink of the law (the sequence of contacts changes there, or its "
-            "derivatives are wrong): standard errors do not hold."
+            "derivatives are wrong): standard errors do not hold.",
         )
     if not judged.solution.converged:
         yield Finding(
-            "The fit has not converged: allow more `max_steps`, `starts` or time (`limit`)."
+            "not_converged",
+            "The fit has not converged: allow more `max_steps`, `starts` or time (`limit`).",
         )
 
 
@@ -222,10 +235,11 @@ def _statuses(judged: Judged) -> Iterator[Finding]:
     data, status = judged.problem.experiments, judged.solution.status
     for code in np.unique(status) if data is not None else ():
         if STATUS[code].failure:
-            labels = [data.shots[k] for k in np.flatnonzero(status == code)]  # type: ignore[union-attr]
+            labels = tuple(data.shots[k] for k in np.flatnonzero(status == code))  # type: ignore[union-attr]
             count = f"{len(labels)} of {len(status)} shots ({listed(labels)})"
             name, message = STATUS[code].name, STATUS[code].message
-            yield Finding(f"The fitted law fails in {count}: {name}, {message}.")
+            line = f"The fitted law fails in {count}: {name}, {message}."
+            yield Finding("law_fails", line, shots=labels)
 
 
 def _matrix(judged: Judged) -> Iterator[Finding]:
@@ -233,15 +247,17 @@ def _matrix(judged: Judged) -> Iterator[Finding]:
     problem, law, data = judged.problem, judged.problem.law, judged.problem.experiments
     if edges := boundary(problem.matrix, problem.point(judged.solution.value)):
         yield Finding(
+            "matrix_edge",
             f"The matrix ends at the edge of the admissible ones ({'; '.join(edges)}): the errors "
-            "hold for the side inside."
+            "hold for the side inside.",
         )
     if data is None or not isinstance(law, RestitutionMatrix):
         return
     if not encloses(law, data.largest_scene(problem.scene).contacts):
         yield Finding(
+            "matrix_free",
             "Nothing keeps this matrix consistent for other approach velocities than the measured: "
-            "the conditions are for (m, m) matrices with admissible=True."
+            "the conditions are for (m, m) matrices with admissible=True.",
         )
 
 
@@ -252,9 +268,10 @@ def _not_finite(judged: Judged) -> Iterator[Finding]:
     if problem.experiments is None and lost.any():
         which, values = np.flatnonzero(lost), problem.values - len(problem.priors)
         yield Finding(
+            "law_fails",
             f"The fitted law fails in {len(which)} of {values} values "
             f"({listed([str(i + 1) for i in which])}): they are not finite there and count as "
-            "large errors."
+            "large errors.",
         )
 
 
@@ -263,9 +280,11 @@ def _beyond_sigma(judged: Judged) -> Iterator[Finding]:
     if judged.inexact and judged.stretch > 1:
         how = "are those of the loss" if judged.robust else "are stretched by that"
         yield Finding(
+            "lack_of_fit",
             f"Lack of fit: the residuals are {judged.stretch:.2g} times what sigma allows (chi^2 = "
             f"{judged.squares:.4g} with {judged.freedom} degrees of freedom): the law or "
-            f"the stated errors are wrong, or the parameters scatter; the standard errors {how}."
+            f"the stated errors are wrong, or the parameters scatter; the standard errors {how}.",
+            numbers={"ratio": judged.stretch, "chi_squared": judged.squares},
         )
 
 
@@ -282,9 +301,11 @@ def _beyond_noise(judged: Judged) -> Iterator[Finding]:
     ratio = left / rest / max(noise / count, _reading_variance(problem))
     if fdtrc(rest, count, ratio) < LEVEL:
         yield Finding(
+            "lack_of_fit",
             f"Lack of fit: the residuals are {np.sqrt(ratio):.2g} times the noise that momentum "
             f"and repeated shots show ({rest} and {count} degrees of freedom): the law does not "
-            "fit, and the standard errors mean little."
+            "fit, and the standard errors mean little.",
+            numbers={"ratio": float(np.sqrt(ratio))},
         )
 
 
@@ -314,8 +335,10 @@ def _pattern(judged: Judged) -> Iterator[Finding]:
     ratio = explained / count / (left / rest)
     if fdtrc(count, rest, ratio) < LEVEL:
         yield Finding(
+            "lack_of_fit",
             f"Lack of fit: the residuals follow the velocities before the impact (F = {ratio:.3g} "
-            f"with {count} and {rest} degrees of freedom): the law does not fit."
+            f"with {count} and {rest} degrees of freedom): the law does not fit.",
+            numbers={"F": ratio},
         )
 
 
@@ -333,9 +356,11 @@ def _contradicted_priors(judged: Judged) -> Iterator[Finding]:
         if chdtrc(1, far**2) < LEVEL / len(problem.priors):
             name = problem.names[prior.parameter]
             yield Finding(
+                "prior",
                 f"The data contradict the prior {name} = {prior.mean:g} ± {prior.std:g}: what they "
                 f"say without it is {far:.2g} standard errors off.",
                 f"the prior of {name} contradicts the data",
+                numbers={name: far},
             )
 
 
@@ -356,9 +381,11 @@ def _suspicious(judged: Judged) -> Iterator[Finding]:
     shots, are = (f"shots {worst}", "are") if len(suspects) > 1 else (f"shot {worst}", "is")
     advice = "" if judged.robust else ", or fit with loss='huber'"
     yield Finding(
+        "suspicious",
         f"Suspicious: {shots}, which the others do not expect (of {count}); look there for "
         f"errors{advice}.",
         f"{shots} {are} suspicious",
+        tuple(label for _, label in suspects),
     )
 
 
@@ -391,7 +418,9 @@ def _units(judged: Judged) -> Iterator[Finding]:
     data = judged.problem.experiments
     if data is not None and data.sigma is None and len(set(data.units)) > 1:
         yield Finding(
-            "Without sigma, velocities in rad/s weigh like those in m/s of the same kinetic energy."
+            "mixed_units",
+            "Without sigma, velocities in rad/s weigh like those in m/s of the same kinetic "
+            "energy.",
         )
 
 
@@ -402,8 +431,10 @@ def _at_bounds(judged: Judged) -> Iterator[Finding]:
         upper = value >= judged.problem.domains[i, 1]
         end, towards = ("upper", "smaller") if upper else ("lower", "larger")
         yield Finding(
+            "at_bound",
             f"{name} is at its {end} bound {value:g}; its standard error only holds towards "
-            f"{towards} values."
+            f"{towards} values.",
+            numbers={name: value},
         )
 
 
@@ -415,11 +446,14 @@ def _choices(judged: Judged) -> Iterator[Finding]:
     several = sum(end.sum_of_squares <= minima[0].sum_of_squares + more for end in minima)
     if rank < count:
         yield Finding(
+            "undetermined",
             f"The data determine {rank} of {count} parameters (rank {rank} of {count}); the values "
-            "given are one choice of many."
+            "given are one choice of many.",
+            numbers={"rank": rank, "parameters": count},
         )
     elif several > 1:
-        yield Finding(f"{several} different minima fit equally well: see the starts.")
+        line = f"{several} different minima fit equally well: see the starts."
+        yield Finding("several_minima", line, numbers={"minima": several})
 
 
 def _unknown_errors(judged: Judged) -> Iterator[Finding]:
@@ -428,12 +462,14 @@ def _unknown_errors(judged: Judged) -> Iterator[Finding]:
         return
     if judged.freedom < 1:
         yield Finding(
-            "No degree of freedom is left to estimate the noise: errors are unknown without sigma."
+            "unknown_errors",
+            "No degree of freedom is left to estimate the noise: errors are unknown without sigma.",
         )
     elif judged.solution.starts[0].sum_of_squares <= judged.problem.exact_squares:
         yield Finding(
+            "unknown_errors",
             "The data are reproduced to the last digit and do not show their noise: errors are "
-            "unknown without `sigma` or `resolution`."
+            "unknown without `sigma` or `resolution`.",
         )
 
 
@@ -441,8 +477,9 @@ def _precision(judged: Judged) -> Iterator[Finding]:
     """Fits in single precision."""
     if judged.problem.precision == "float32":
         yield Finding(
+            "single_precision",
             "Computed in float32: values are good to about 1e-3, and the rank is judged coarsely. "
-            'jax.config.update("jax_enable_x64", True) gives float64.'
+            'jax.config.update("jax_enable_x64", True) gives float64.',
         )
 
 
@@ -453,8 +490,8 @@ FIT_CHECKS = (
 )
 
 
-def fit_warnings(judged: Judged) -> list[Finding]:
-    """All warnings, those about the data first."""
+def fit_findings(judged: Judged) -> list[Finding]:
+    """All findings, those about the data first."""
     problem, data = judged.problem, judged.problem.experiments
     found = list(_left_out(judged))
     if data is not None:

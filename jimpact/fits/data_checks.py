@@ -1,7 +1,7 @@
 """What is wrong with measured shots: tests, each with the sentence that the report has for it."""
 
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import ndtri, stdtr, stdtrit
@@ -9,6 +9,7 @@ from scipy.special import ndtri, stdtr, stdtrit
 from jimpact.core.scene import Scene, dense_mass
 from jimpact.fits.covariances import diagonal_blocks
 from jimpact.fits.data import ROUNDING, Experiments, closed_normals, possible_normals
+from jimpact.fits.findings import Finding
 from jimpact.tools.records import listed
 
 # ------------------------------------------------------------------ thresholds of the data
@@ -38,18 +39,6 @@ UNIT_FACTORS, UNIT_NEAR = {10.0: "a decimal point", 100.0: "cm/s", 1000.0: "mm/s
 _SIGMA_OVER_HALF, _EFFICIENCY_OF_HALF = 1.4826, 0.37
 
 LISTED = 6  # shots named one by one (with their ratios); of more, how many there are
-
-
-class Finding(NamedTuple):
-    """A line of the warnings, and what a sentence that quotes the fit has to say about it."""
-
-    line: str
-    reservation: str = ""
-
-
-def findings(checks: Sequence[Callable[[Any], Iterator[Finding]]], judged: Any) -> list[Finding]:
-    """What these checks find, one after the other."""
-    return [found for check in checks for found in check(judged)]
 
 
 def share(count: int, total: int) -> str:
@@ -129,6 +118,10 @@ class DataBalances:
             error = _error(np.append(-mass @ pre, mass @ post), covariance)
             self.energies.append(_Defect(k, gain, t_minus, t_minus, ratio, error))
 
+    def labels(self, shots: Iterable[int]) -> tuple[str, ...]:
+        """Of these shots."""
+        return tuple(self.experiments.shots[k] for k in shots)
+
     def listed(self, ratios: dict[int, float]) -> str:
         """Shots with their ratios, or the range of the ratios of many."""
         if len(ratios) <= LISTED:
@@ -193,9 +186,11 @@ def _units(data: DataBalances) -> Iterator[Finding]:
         near = (factor, 1 / factor) if what == "momentum" else (factor,)
         if any(abs(ratio / value - 1) < UNIT_NEAR for value in near):
             yield Finding(
+                "units",
                 f"Units? The {what} after is {ratio:.3g} times that before: {unit} in one of the "
                 "columns?",
                 "the units are suspect",
+                numbers={"ratio": ratio, "factor": factor},
             )
             return
 
@@ -212,9 +207,11 @@ def _momentum(data: DataBalances) -> Iterator[Finding]:
         change = np.asarray(experiments.post) - np.asarray(corrected.post)
         floor = f" (rms {np.sqrt(np.nanmean(change**2)):.3g} m/s)"
     yield Finding(
+        "momentum",
         f"The data violate conservation of momentum (1 = conserved): {data.listed(ratios)}; no law "
         f"can reproduce that part{floor}.",
         f"the data violate conservation of momentum in {share(len(ratios), data.total)}",
+        data.labels(ratios),
     )
 
 
@@ -222,21 +219,25 @@ def _energy(data: DataBalances) -> Iterator[Finding]:
     """Shots that gain energy beyond their noise."""
     if ratios := data.beyond(data.energies, DEFECT_LEVEL, gains=True):
         yield Finding(
+            "energy_gain",
             f"The data gain energy (1 = conserved): {data.listed(ratios)}.",
             f"kinetic energy grows in {share(len(ratios), data.total)}",
+            data.labels(ratios),
         )
 
 
 def _resting(data: DataBalances) -> Iterator[Finding]:
     """Shots in which no contact approaches."""
     if count := len(data.resting):
-        labels = listed([data.experiments.shots[k] for k in data.resting])
+        labels = data.labels(data.resting)
         why = "are pre and post swapped, or is a sign wrong?"
         if data.only_open:
             why = "only open ones do, which take part in `Compliant` and `Binary` alone."
         yield Finding(
-            f"No contact approaches in {count} of {data.total} shots ({labels}): {why}",
+            "no_approach",
+            f"No contact approaches in {count} of {data.total} shots ({listed(labels)}): {why}",
             f"no contact approaches in {share(count, data.total)}",
+            labels,
         )
 
 
@@ -254,10 +255,12 @@ def _copies(data: DataBalances) -> Iterator[Finding]:
     if 2 * count > total > 1:
         every = count == total
         yield Finding(
+            "copies",
             f"{f'All {total}' if every else f'{count} of {total}'} shots are equal to the last "
             "digit, but for a factor: they carry no more information than one of them, and none "
             "on the noise; without `sigma` or `resolution` the errors are meaningless.",
             f"{'the' if every else f'{count} of'} {total} shots are copies of one",
+            data.labels(np.flatnonzero(same)),
         )
 
 

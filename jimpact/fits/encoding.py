@@ -2,6 +2,7 @@
 
 import dataclasses
 import platform
+from collections.abc import Mapping
 from importlib import import_module
 from operator import attrgetter
 from typing import Any
@@ -13,6 +14,7 @@ import numpy as np
 import jimpact
 from jimpact.core.law import StaticNumber, StaticNumbers
 from jimpact.core.scene import PairNormals
+from jimpact.fits.findings import Finding
 from jimpact.fits.matrices import AdmissibleMatrices
 from jimpact.fits.observables import Shots
 from jimpact.fits.parameters import LawInScene, Parameters, Prior
@@ -31,8 +33,8 @@ _LATER = {"covariance"}  # fields that files of format 1 may lack: they had no s
 _PARTS = {
     kind.__name__: kind
     for kind in (
-        *(AdmissibleMatrices, FitMinimum, FitProblem, LawInScene, Neighbours, PairNormals),
-        *(Parameters, Profile, Shots),
+        *(AdmissibleMatrices, Finding, FitMinimum, FitProblem, LawInScene, Neighbours),
+        *(PairNormals, Parameters, Profile, Shots),
     )
 }
 
@@ -58,7 +60,7 @@ def encoded(value: Any) -> Any:
     if dataclasses.is_dataclass(value):
         fields = {f.name: encoded(getattr(value, f.name)) for f in dataclasses.fields(value)}
         return {"class": _name_of(type(value)), "fields": fields}
-    if isinstance(value, dict):
+    if isinstance(value, Mapping):
         return {"dict": {key: encoded(each) for key, each in value.items()}}
     if isinstance(value, list | tuple):
         return {type(value).__name__: [encoded(each) for each in value]}

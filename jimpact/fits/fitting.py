@@ -10,8 +10,9 @@ import jax
 import numpy as np
 
 from jimpact.core.scene import Scene
-from jimpact.fits.checks import Judged, fit_warnings, unusable
+from jimpact.fits.checks import Judged, fit_findings, unusable
 from jimpact.fits.data import Experiments
+from jimpact.fits.findings import Finding
 from jimpact.fits.observables import COARSE_RTOL
 from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw
 from jimpact.fits.problem import FitProblem, of_shots
@@ -166,9 +167,8 @@ def _with_profiles(result: Fit[AnyLaw], profiles: tuple[Profile, ...]) -> Fit[An
     if (better := profiles[0].better) is not None:
         values = ", ".join(f"{name} {x:.4g}" for name, x in zip(result.names, better))
         line = f"A profile found a lower minimum than the fit ({values}): allow more `starts`."
-        short = "a profile found a lower minimum"
-        result = replace(result, warnings=(*result.warnings, line))
-        result = replace(result, reservations=(*result.reservations, short))
+        found = Finding("lower_minimum", line, "a profile found a lower minimum")
+        result = replace(result, findings=(*result.findings, found))
     return replace(result, profiles=profiles)
 
 
@@ -195,13 +195,9 @@ def rms(problem: FitProblem, residual: np.ndarray) -> float:
 def _without(problem: FitProblem, lost: np.ndarray) -> FitProblem:
     """The problem without these shots (K,), which it names."""
     assert problem.experiments is not None
-    labels = [problem.experiments.shots[k] for k in np.flatnonzero(lost)]
-    line = (
-        f"Left out: {len(labels)} of {len(lost)} shots ({listed(labels)}), whose impacts fail, or "
-        "whose derivatives cannot be used."
-    )
+    labels = (problem.experiments.shots[k] for k in np.flatnonzero(lost))
     used = np.broadcast_to(~lost[:, None], problem.measured.shape).astype(float)
-    return replace(problem.weighed(used), left_out=(*problem.left_out, line))
+    return replace(problem.weighed(used), left_out=(*problem.left_out, *labels))
 
 
 def as_fit(
@@ -212,7 +208,7 @@ def as_fit(
     `robust`: noise times the root of the degrees of freedom, of a loss that outliers move little.
     """
     judged = Judged(replace(problem, scene=problem.to_scene(found.value)), found, robust)
-    errors, findings = judged.errors, fit_warnings(judged)
+    errors = judged.errors
     residual = np.asarray(problem.measured, float) - found.predicted
     starts, limit = [], found.starts[0].sum_of_squares + HARDLY_WORSE * errors.noise**2
     for end in found.starts:
@@ -228,8 +224,7 @@ def as_fit(
         rms=rms(problem, residual),
         **vars(errors),
         **vars(replace(found, starts=tuple(starts))),
-        warnings=tuple(each.line for each in findings),
-        reservations=tuple(each.reservation for each in findings if each.reservation),
+        findings=tuple(fit_findings(judged)),
         problem=problem,
         jacobian=problem.derivatives(found.starts[0]),
     )
@@ -432,9 +427,7 @@ def bootstrap(
     return _refits(fit, again, workers, progress)
 
 
-def leave_one_out(
-    fit: Fit, *, workers: int | None = None, progress: float | None = None
-) -> Refits:
+def leave_one_out(fit: Fit, *, workers: int | None = None, progress: float | None = None) -> Refits:
     """A fit without each of the K shots in turn; `predicted` (K, n) is of the shot left out.
 
     `measured - predicted` is an honest error of prediction: laws with different numbers of

@@ -104,6 +104,7 @@ class Parameters:
     names: tuple[str, ...]
     groups: tuple[tuple[int, ...], ...]
     log: np.ndarray  # (P,) whether a parameter is fitted in its logarithm
+    ratios: bool = False  # whether the stiffness of contact 1 is held: only ratios matter
 
     @property
     def first(self) -> list[int]:
@@ -153,7 +154,8 @@ def free_parameters(
         raise ValueError("Argument `free` must name a parameter to fit, but leaves none free.")
     log = np.array([domain_of(law, entry_of(name)[0]).log for name in names])
     note = f"{fixed} is fixed at its start: with equal exponents only stiffness ratios matter."
-    return Parameters(tuple(labels), tuple(names), tuple(groups), log), [note] if fixed else []
+    found = Parameters(tuple(labels), tuple(names), tuple(groups), log, fixed == "stiffness[1]")
+    return found, [note] if fixed else []
 
 
 def _labels(law: Law, free: Any) -> dict[str, np.ndarray]:

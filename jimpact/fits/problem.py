@@ -118,7 +118,7 @@ class FitProblem:
         priors: of parameters.
         notes: in words, what was fixed instead of fitted.
         experiments, scene: of shots, or None.
-        left_out: in words, which shots were left out.
+        left_out: labels of shots that were left out.
         mixing: (K, n, n), makes correlated errors of a shot independent, or None.
 
     >>> import jimpact as ji

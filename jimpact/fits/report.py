@@ -10,7 +10,8 @@ import numpy as np
 
 import jimpact
 from jimpact.core.law import AnyLaw, value_of
-from jimpact.fits.encoding import encoded, instance_of, versions
+from jimpact.fits.encoding import decoded, encoded, instance_of, versions
+from jimpact.fits.findings import of_sentences
 from jimpact.fits.uncertainty import FitResult, pieces_in_words
 from jimpact.tools.checks import check_kind
 from jimpact.tools.records import as_data, with_error
@@ -55,7 +56,7 @@ def _values_in_words(fit: "Fit") -> str:
         parts[-1] += f", assuming {joined_words(assumed)}"
     if others:
         parts.append(f"{others} cannot be determined from {data}")
-    if any("different minima fit equally well" in line for line in fit.warnings):
+    if fit.found("several_minima"):
         parts.append("other values fit equally well")
     return "; ".join(parts)
 
@@ -65,7 +66,7 @@ def _objection(fit: "Fit") -> str:
     data = _data_name(fit)
     if fit.shows_lack_of_fit:
         return f"does not fit {data}"
-    if not any(line.startswith("The fitted law fails") for line in fit.warnings):
+    if not fit.found("law_fails"):
         return ""
     if fit.experiments is None:
         lost = ~np.isfinite(fit.predicted[np.isfinite(fit.problem.measured)])
@@ -107,8 +108,8 @@ def _data_name(fit: "Fit") -> str:
 def _full_name(fit: "Fit", i: int) -> str:
     """The name of a parameter; a stiffness is a ratio if that of contact 1 is fixed."""
     name = fit.names[i]
-    fixed = any(note.startswith("stiffness[1] is fixed") for note in fit.problem.notes)
-    return f"the stiffness ratio {name} / stiffness[1]" if "stiffness" in name and fixed else name
+    ratio = name.startswith("stiffness[") and fit.problem.parameters.ratios
+    return f"the stiffness ratio {name} / stiffness[1]" if ratio else name
 
 
 def _with_error(fit: "Fit", i: int) -> str:
@@ -335,7 +336,7 @@ def as_record(fit: "Fit") -> dict[str, Any]:
     """`Fit.to_dict`."""
     as_they_are = (
         *("method", "rms", "noise", "degrees_of_freedom", "rank", "identifiability"),
-        *("warnings", "verdict", "reservations", "seed", "converged", "covariance"),
+        *("findings", "warnings", "verdict", "reservations", "seed", "converged", "covariance"),
         *("correlation", "predicted", "residual"),
     )
     parameters = [
@@ -412,12 +413,23 @@ def load_fit(path: str | Path) -> "Fit":
             f"{record['format']} (written by jimpact {writer}; this is {jimpact.__version__})."
         )
     try:
-        return instance_of(Fit, record["result"])
+        return instance_of(Fit, _with_findings(record["result"]))
     except (KeyError, AttributeError, ImportError, TypeError) as error:
         raise ValueError(
             f"{path}: the fit, saved by jimpact {writer}, cannot be read: {error!r}. A law of your "
             "own must be imported before."
         ) from error
+
+
+def _with_findings(result: dict[str, Any]) -> dict[str, Any]:
+    """The fields of a fit; those that a build before 0.2 saved had sentences in their place."""
+    if "findings" in result:
+        return result
+    lines, reservations = (decoded(result.pop(name)) for name in ("warnings", "reservations"))
+    problem = result["problem"]["fields"]
+    fixed = any(note.startswith("stiffness[1] is fixed") for note in decoded(problem["notes"]))
+    problem["parameters"]["fields"]["ratios"] = fixed
+    return result | {"findings": encoded(of_sentences(lines, reservations))}
 
 
 # ---------------------------------------------------------------------------- the result
@@ -457,7 +469,8 @@ class Fit(FitResult[AnyLaw], Generic[AnyLaw]):
         lost_starts: how many were given up far above the best, or did not converge.
         stuck: whether no step lowers the sum of squares, although derivatives promise it.
         slopes: `dv+/dv-` (K, n, n) of the shots, where errors of v- are passed on, else None.
-        warnings: what is wrong with data or fit, in words.
+        findings: what is wrong with data or fit, by kind, shots and numbers.
+        warnings: the same in words.
         problem: what was solved.
         jacobian: derivatives of what was measured in the parameters (K, n, P), NaN where no
             value was measured.

@@ -13,6 +13,7 @@ from scipy.special import ndtri, stdtrit
 from jimpact.core.law import parameters_of
 from jimpact.core.scene import Scene
 from jimpact.fits.data import Experiments
+from jimpact.fits.findings import Finding
 from jimpact.fits.parameters import AnyLaw, LawInScene, tied_names, tied_value
 from jimpact.fits.problem import FitProblem
 from jimpact.fits.search import FitMinimum, Solution, solution
@@ -100,16 +101,17 @@ def _in_words(problem: FitProblem, direction: np.ndarray, scale: np.ndarray) -> 
     """A direction that leaves all predictions as they are, as small changes of parameters."""
     names, log = problem.names, problem.parameters.log
     value_name = "value" if problem.experiments is None else "velocity"
-    parts = []
+    parts, taking_part = [], []
     step = SMALL_CHANGE * direction / np.abs(direction).max()
     for i in np.argsort(-np.abs(step), kind="stable"):
         if abs(step[i]) > TAKES_PART * SMALL_CHANGE:
             change = f"{100 * abs(step[i]):.2g} %" if log[i] else f"{abs(step[i] * scale[i]):.2g}"
+            taking_part.append(names[i])
             parts.append(f"{names[i]} goes {'up' if step[i] > 0 else 'down'} by {change}")
     if len(parts) == 1:
-        name = parts[0].split(" ")[0]
         return (
-            f"The data cannot see {name}: no measured {value_name} depends on it (to first order)."
+            f"The data cannot see {taking_part[0]}: no measured {value_name} depends on it (to "
+            "first order)."
         )
     return (
         f"The data cannot see a combination: no measured {value_name} changes (to first order) "
@@ -232,14 +234,27 @@ class FitResult(Solution, Uncertainty, Tabular, Generic[AnyLaw]):
     bounds: tuple[np.ndarray, np.ndarray]
     residual: np.ndarray
     rms: float
-    warnings: tuple[str, ...]
+    findings: tuple[Finding, ...]
     problem: FitProblem
     jacobian: np.ndarray
     loss: str = "squares"
     seed: int = 0
     profiles: tuple[Profile, ...] = ()
-    reservations: tuple[str, ...] = ()
     picture = "fit"
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is wrong with data or fit, in words."""
+        return tuple(each.line for each in self.findings if each.line)
+
+    @property
+    def reservations(self) -> tuple[str, ...]:
+        """In words, what has to be said where a value is quoted."""
+        return tuple(each.reservation for each in self.findings if each.reservation)
+
+    def found(self, kind: str) -> bool:
+        """Whether there is a finding of this kind, one of `jimpact.fits.findings.KINDS`."""
+        return any(each.kind == kind for each in self.findings)
 
     @property
     def table(self) -> Table:
@@ -464,7 +479,7 @@ class FitResult(Solution, Uncertainty, Tabular, Generic[AnyLaw]):
     @property
     def shows_lack_of_fit(self) -> bool:
         """Whether a test rejects the law."""
-        return any(line.startswith("Lack of fit") for line in self.warnings)
+        return self.found("lack_of_fit")
 
     @property
     def can_be_profiled(self) -> bool:

@@ -1,11 +1,14 @@
 """Reading shots, what is refused, and what the data break."""
 
+import re
 from importlib.resources import files
+from pathlib import Path
 
 import numpy as np
 
 import jimpact as ji
-from jimpact.fits.data_checks import DATA_CHECKS, DataBalances, findings
+from jimpact.fits.data_checks import DATA_CHECKS, DataBalances
+from jimpact.fits.findings import KINDS, findings
 
 DATA = files("jimpact") / "data"
 
@@ -128,3 +131,11 @@ def test_honest_momentum_is_seldom_reported():
     sets = [ji.Experiments(a, b) for a, b in zip(pre, post)]
     alarms = sum("momentum" in " ".join(data_defects(data, pair)) for data in sets)
     assert 1 <= alarms <= 10
+
+
+def test_kinds_of_findings_are_those_of_the_table():
+    folder = Path(ji.__file__).parent / "fits"
+    used = set(
+        re.findall(r'Finding\(\s*"(\w+)"', "".join(p.read_text() for p in folder.glob("*.py")))
+    )
+    assert used == set(KINDS)

@@ -15,6 +15,7 @@ from PIL import Image
 from programs import CODE
 
 import jimpact as ji
+from jimpact.fits.findings import Finding
 from jimpact.fits.selection import LawFit, LawFits
 from jimpact.fits.uncertainty import Profile
 from jimpact.motion.record import KIND_CODE, Motion, no_events
@@ -63,7 +64,7 @@ def test_report_of_a_fit():
 
 
 def test_a_fit_in_one_sentence():
-    seen = {"names": ("restitution",), "value": np.array([0.9912]), "warnings": ()}
+    seen = {"names": ("restitution",), "value": np.array([0.9912]), "findings": ()}
     seen |= {"standard_error": np.array([0.0042]), "at_bound": np.array([False]), "rank": 1}
     assert canned(4, **seen).verdict == "restitution = 0.991 ± 0.004."
     assert str(canned(4)).startswith(f"{canned(4).verdict}\n\n")
@@ -71,11 +72,12 @@ def test_a_fit_in_one_sentence():
     assert both.verdict == (
         "restitution[1] = 0.600 ± 0.010; stiffness[1] cannot be determined from this shot."
     )
-    held = replace(both.problem, notes=("stiffness[1] is fixed at its start.",))
+    held = replace(both.problem.parameters, ratios=True)
+    held = replace(both.problem, parameters=held)
     ratio = canned(1, problem=held, names=("restitution[1]", "stiffness[2]"))
     assert "the stiffness ratio stiffness[2] / stiffness[1] cannot be determined" in ratio.verdict
     assert canned(4, converged=False).verdict.startswith("No answer")
-    bad = canned(4, warnings=("Lack of fit: the residuals are large.",))
+    bad = canned(4, findings=(Finding("lack_of_fit", "Lack of fit: the residuals are large."),))
     assert bad.verdict.startswith("LZB does not fit these 4 shots; it comes nearest with restit")
     open_end = Profile("restitution[1]", *np.zeros((2, 1)), 4.0, 0.95, ((0.97, 1.0),), (0.0, 1.0))
     flat = replace(open_end, name="stiffness[1]", intervals=((0.0, 1.0),))
@@ -91,10 +93,11 @@ def test_a_sentence_to_quote_holds_its_reservations():
     shots, balls = ji.Experiments(pre, pre), ji.chain([1.0, 1.0, 1.0])
     problem = ji.FitProblem.from_shots(ji.LZB(0.6), balls, shots)
     one = {"names": ("restitution",), "value": np.array([0.77]), "at_bound": np.array([False])}
-    one |= {"standard_error": np.array([0.017]), "rank": 1, "problem": problem, "warnings": ()}
+    one |= {"standard_error": np.array([0.017]), "rank": 1, "problem": problem, "findings": ()}
     broken = "the data violate conservation of momentum in all 4 shots"
     shared = "one restitution for both contacts, equal stiffnesses and the exponent 1.5 (Hertz)"
-    assert canned(4, **one, reservations=(broken, "shot 3 is suspicious")).verdict == (
+    known = [Finding("momentum", "", broken), Finding("suspicious", "", "shot 3 is suspicious")]
+    assert canned(4, **(one | {"findings": known})).verdict == (
         f"restitution = 0.770 ± 0.017, assuming {shared}; but {broken} and shot 3 is suspicious."
     )
     mixed = replace(problem, parameters=replace(problem.parameters, names=("restitution[1]",)))
@@ -104,7 +107,8 @@ def test_a_sentence_to_quote_holds_its_reservations():
     assert own.verdict.endswith(
         ", assuming the stiffness of each contact and the exponent of each contact."
     )
-    fails = {"warnings": ("The fitted law fails in all.",), "status": np.full(4, CODE["max_steps"])}
+    fails = {"findings": (Finding("law_fails", "The fitted law fails in all."),)}
+    fails["status"] = np.full(4, CODE["max_steps"])
     assert canned(4, **fails).verdict.startswith("LZB fails in all of these 4 shots; it comes near")
     fails["status"] = fails["status"] * [1, 0, 1, 0]
     assert canned(4, **fails).verdict.startswith("LZB fails in 2 of these 4 shots; it comes near")
