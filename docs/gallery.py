@@ -344,7 +344,7 @@ ENGINE_LABELS = {
     ("mujoco", "default solref and solimp, step 2 ms"): (0.45, 0.28, "soft contacts: "),
     ("pybullet", "step 1/2400 s"): (0.82, 0.38, ""),
     ("newton-XPBD", "step 1/60 s"): (0.51, 0.47, ""),
-    ("drake", "SAP, dissipation 0, relaxation time 0, step .1 ms"): (
+    ("drake", "SAP, dissipation 0, relaxation time 0, step .1 ms"): (0.64, 1.16, "step .1 ms: "),
         0.64,
         1.16,
         "in steps of .1 ms: ",
