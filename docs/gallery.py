@@ -345,10 +345,6 @@ ENGINE_LABELS = {
     ("pybullet", "step 1/2400 s"): (0.82, 0.38, ""),
     ("newton-XPBD", "step 1/60 s"): (0.51, 0.47, ""),
     ("drake", "SAP, dissipation 0, relaxation time 0, step .1 ms"): (0.64, 1.16, "step .1 ms: "),
-        0.64,
-        1.16,
-        "in steps of .1 ms: ",
-    ),
 }
 
 
