@@ -48,8 +48,8 @@ def test_an_unknown_engine_or_scene_is_named(name, value):
         ji.data.engine_impacts(**{name: value})
 
 
-# e of pairs that come from a distance, as the engines gave it (LAMMPS 2025-07-22 at 1 us, Exudyn 1.13.6
-# at 10 us, Drake 1.58.0 continuous and by SAP at 1 us): their steps cost up to 8e-4
+# e of pairs, as the engines gave it (`tests/validation/engines/pairs.py`; LAMMPS 2025-07-22 at 1 us,
+# Exudyn 1.13.6 at 10 us, Drake 1.58.0 continuous and by SAP at 1 us): their steps cost up to 8e-4
 MEASURED = {
     "lammps": {0.1: 0.0999, 0.5: 0.5, 0.9: 0.9},
     "lammps_limit_damping": {0.1: 0.2527, 0.5: 0.5503, 0.9: 0.902},

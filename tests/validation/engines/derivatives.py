@@ -1,13 +1,14 @@
 # /// script
 # dependencies = ["mujoco-mjx==3.17.0", "mujoco==4.0.0", "diffrax==0.7.2"]
 # ///
-"""Derivatives of a bounce by MJX, diffrax and jimpact: `python tests/validation/engines/derivatives.py`.
+"""Derivatives of a bounce by MJX, diffrax and jimpact: a table of docs/engines.md.
 
-It runs where jimpact and these packages are installed (a minute).
+Run `python tests/validation/engines/derivatives.py` where jimpact and these packages are installed (a
+minute).
 
 A ball of radius R = .1 m, 5 mm above the ground, falls at s = 1 m/s, with gravity and e = 1, and is
-seen at t = 20 ms. Closed form, with the impact speed w = sqrt(s^2 + 2 g h): v(t) = 2 w - g t - s, so
-that dv/ds = 2 s / w - 1 and dv/dR = -2 g / w. Each row: v, its derivatives by automatic
+seen at t = 20 ms. Closed form, with the impact speed w = sqrt(s^2 + 2 g h): v(t) = 2 w - g t - s,
+so that dv/ds = 2 s / w - 1 and dv/dR = -2 g / w. Each row: v, its derivatives by automatic
 differentiation, and central differences of the same program.
 """
 

@@ -1,7 +1,7 @@
 # /// script
 # dependencies = ["brax==0.14.2"]
 # ///
-"""Brax: `elasticity` of a geom (a custom numeric of the MJCF model); a pair has the mean of both."""
+"""Brax: `elasticity` of geoms (a custom numeric of the MJCF model); a pair has the mean of both."""
 
 from importlib.metadata import version
 

@@ -22,24 +22,24 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from rows import RADIUS, print_rows
 
-TIME = 0.1  # [s]
+TIME = 0.05  # [s]
 STIFFNESS = 1e6  # Drake's default [N/m]
 
 
-def after(masses, wall, restitution, step, approximation="sap"):
+def after(masses, wall, restitution, step, dissipation=0.0, relaxation=0.0, stiffness=STIFFNESS):
     if restitution != 1:
         return None
     builder = DiagramBuilder()
     config = MultibodyPlantConfig(
-        time_step=step, discrete_contact_approximation=approximation, contact_model="point"
+        time_step=step, discrete_contact_approximation="sap", contact_model="point"
     )
     plant, _ = AddMultibodyPlant(config, builder)
     plant.mutable_gravity_field().set_gravity_vector([0, 0, 0])
 
     def solid(body, pose, shape, name):
         made = ProximityProperties()
-        AddContactMaterial(made, 0.0, STIFFNESS, CoulombFriction(0.0, 0.0))
-        made.AddProperty("material", "relaxation_time", 0.0)
+        AddContactMaterial(made, dissipation, stiffness, CoulombFriction(0.0, 0.0))
+        made.AddProperty("material", "relaxation_time", relaxation)
         plant.RegisterCollisionGeometry(body, pose, shape, name, made)
 
     joints = []

@@ -15,12 +15,12 @@ from rows import RADIUS, print_rows
 TIME = 0.1  # [s]
 
 
-def after(masses, wall, restitution, model, exponent, stiffness, step):
+def after(masses, wall, restitution, model, exponent, stiffness, step, gap=0.0):
     container = exudyn.SystemContainer()
     system = container.AddSystem()
     bodies = []
     for k, mass in enumerate(masses):
-        place, velocity = [2 * RADIUS * k, 0, 0], [1.0 if k == 0 else 0.0, 0, 0]
+        place, velocity = [(2 * RADIUS + gap) * k, 0, 0], [1.0 if k == 0 else 0.0, 0, 0]
         start = {"referencePosition": place, "initialVelocity": velocity}
         bodies.append(system.CreateMassPoint(mass=mass, **start))
     solids = list(bodies)

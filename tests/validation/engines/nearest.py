@@ -1,8 +1,8 @@
-"""Which law a velocity after an impact is nearest to, and the columns of laws in the table of engines.
+"""The laws nearest to a velocity after an impact, and their columns in the table of engines.
 
-The velocities in `jimpact/data/engine_impacts.csv` were measured with the engines. Beside each stand
-the two nearest laws, in the energy norm, among those of `LAWS` with every coefficient of restitution
-from 0 to 1 in steps of .01. `run.py` calls it; `python tests/validation/engines/nearest.py` writes
+The velocities in `jimpact/data/engine_impacts.csv` were measured with the engines. Beside each
+stand the two nearest laws, in the energy norm, among those of `LAWS` with every coefficient of
+restitution from 0 to 1 in steps of .01. `run.py` calls it; `python tests/validation/engines/nearest.py` writes
 these columns anew, `--check` fails if that changes one.
 """
 

@@ -1,4 +1,4 @@
-"""What the programs of engines share: scenes come on standard input, velocities go to standard output.
+"""What the programs of engines share: scenes on standard input, velocities on standard output.
 
 A program `engine_NAME.py` imports its engine and this file only, so that it runs in an environment
 without jimpact. Its first lines name the packages it needs, as PEP 723 has it. It defines
