@@ -57,7 +57,11 @@ def measured(name, python):
     )
     if "ModuleNotFoundError" in done.stderr:
         wanted = " ".join(f'"{package}"' for package in packages(PROGRAMS[name]))
-        print(f"{name} is not installed: python -m pip install {wanted}, or give --env FOLDER.")
+        python = re.search(r'^# requires-python = "(.*)"$', PROGRAMS[name].read_text(), re.M)
+        where = f" with a Python {python[1]}" if python else ""
+        print(
+            f"{name} is not installed: python -m pip install {wanted}{where}, or give --env FOLDER."
+        )
         return []
     if done.returncode:
         raise SystemExit(f"{name} failed:\n{done.stderr}")
