@@ -5,7 +5,9 @@ Run by hand, from a clone; `chart_three_balls` takes minutes. A docstring is the
 
 import subprocess
 import sys
+import textwrap
 from collections.abc import Callable
+from importlib.resources import files
 from pathlib import Path
 
 import jax
@@ -14,7 +16,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jimpact as ji
-from jimpact.plot.style import COLOURS, legend_below, logarithmic, new_figure, styled
+from jimpact.plot.style import COLOURS, GREY, SMALL, legend_below, logarithmic, new_figure, styled
 
 PICTURES = Path(__file__).parent / "pictures"
 DRAWN: dict[str, Callable] = {}
@@ -322,6 +324,75 @@ def drops():
         axes.set_xlabel("time after the hit [ms]")
     figure.axes[0].set_ylabel("error of the angle [deg]")
     legend_below(figure, 2)
+    return figure
+
+
+# An engine of each group -> where its label stands (energy ratio, dispersion), what it begins with
+ENGINE_LABELS = {
+    ("siconos", "MoreauJeanOSI, step 10 ms"): (1.07, 0.40, "all contacts at once: "),
+    ("chipmunk", "step 1/60 s, 1 m/s"): (0.53, 1.58, "one contact after another: "),
+    ("simbody", "HuntCrossleyForce, accuracy 1e-6"): (1.16, 1.28, "Hertz contacts: "),
+    ("drake", "continuous, dissipation 0"): (1.0, 1.10, "linear springs: "),
+    ("jolt", "step 1/60 s, 1 m/s"): (0.42, 0.03, "below a threshold: "),
+    ("rapier2d", "step 1/60 s, 1 m/s"): (0.87, 0.95, ""),
+    ("box2d3-wasm", "step 1/60 s, 1 m/s"): (0.54, 0.80, ""),
+    ("havok", "step 1/60 s, 1 m/s"): (0.80, 0.72, ""),
+    ("cannon-es", "step 1/60 s, 1 m/s"): (1.30, 1.50, ""),
+    ("brax-spring", "step 2 ms"): (1.13, 1.58, ""),
+    ("matter-js", "step 1/60 s, 3 m/s"): (0.62, 1.46, ""),
+    ("phaser-box2d", "step 1/60 s, 1 m/s"): (0.42, 0.14, ""),
+    ("mujoco", "default solref and solimp, step 2 ms"): (0.45, 0.28, "soft contacts: "),
+    ("pybullet", "step 1/2400 s"): (0.82, 0.38, ""),
+    ("newton-XPBD", "step 1/60 s"): (0.51, 0.47, ""),
+    ("drake", "SAP, dissipation 0, relaxation time 0, step .1 ms"): (0.64, 1.16, "step .1 ms: "),
+}
+
+
+def energy_and_dispersion(velocity: np.ndarray) -> np.ndarray:
+    """Energy ratio and dispersion (..., 2) of velocities (..., 3) of the cradle."""
+    share = np.asarray(velocity) ** 2
+    return np.stack([share.sum(-1), share.std(-1) / share.mean(-1)], axis=-1)
+
+
+def engine_groups() -> list[tuple[np.ndarray, str, tuple[float, float]]]:
+    """Point, label and its place for each group of engines; every row is in the nearest one."""
+    rows = {(row.engine, row.setting): row for row in ji.data.engine_impacts(scene="S1").rows}
+    points = energy_and_dispersion([row.velocity for row in rows.values()])
+    centres = energy_and_dispersion([rows[key].velocity for key in ENGINE_LABELS])
+    nearest = np.linalg.norm(points[:, None] - centres, axis=2).argmin(1)
+    groups = []
+    for k, (x, y, head) in enumerate(ENGINE_LABELS.values()):
+        names = dict.fromkeys(engine for (engine, _), group in zip(rows, nearest) if group == k)
+        groups.append((centres[k], head + ", ".join(names), (x, y)))
+    return groups
+
+
+@picture
+@styled()
+def engines() -> Figure:
+    """Three balls at e = 1: what thirty engines make of them, beside laws and a measured shot."""
+    figure, axes = new_figure(6.4)
+    laws = {
+        "Moreau": ji.Moreau,
+        "Binary": ji.Binary,
+        "LZB, Hertz": ji.LZB,
+        "LZB, linear springs": lambda e: ji.LZB(e, exponent=1.0),
+    }
+    for k, (name, make) in enumerate(laws.items()):
+        run = jax.jit(jax.vmap(lambda e, make=make: ji.impact(make(e), CRADLE, STRIKER).velocity))
+        line = energy_and_dispersion(run(jnp.linspace(0.1, 1, 91)))
+        axes.plot(*line.T, color=COLOURS[k], lw=1.4, label=f"{name}, e from .1 to 1", zorder=0)
+    for point, text, place in engine_groups():
+        axes.plot(*point, "o", color="black", ms=4)
+        words = textwrap.fill(text, 32, break_on_hyphens=False)
+        style = {"fontsize": SMALL, "va": "center", "ha": "left"}
+        arrow = {"arrowstyle": "-", "color": GREY, "lw": 0.6, "shrinkB": 3}
+        axes.annotate(words, point, place, arrowprops=arrow, **style)
+    measured = ji.read_experiments(files("jimpact") / "data" / "three_balls.csv").post[0]
+    axes.plot(*energy_and_dispersion(measured), "*", color=COLOURS[5], ms=12, label="measured")
+    axes.set(xlim=(0.2, 1.55), ylim=(-0.05, 1.65))
+    axes.set(xlabel="energy ratio K_ER = T+/T-", ylabel="energy dispersion C_KE (0: equal shares)")
+    legend_below(figure, 3)
     return figure
 
 

@@ -14,7 +14,8 @@
 # %% [markdown]
 # # Measured drops: an ellipse and a square
 #
-# *Course, part 17. Before: [the chapter](16_the_chapter.ipynb).*
+# *Course, part 17. Before: [the chapter](16_the_chapter.ipynb). Next: [which law does your engine
+# realise?](18_which_law_does_your_engine_realise.ipynb)*
 #
 # You will see in two sets of measured impacts whether *any* law of contact at a point can fit them,
 # fit a law to those that allow it, and predict whole drops that were not used in the fit. The data
@@ -256,5 +257,4 @@ assert fits["ellipse"].shows_lack_of_fit
 print(f"run time {time.perf_counter() - began:.0f} s")
 
 # %% [markdown]
-# You have finished the course. [Your own CSV file](02_your_own_csv.ipynb) is the notebook to copy
-# for your own data.
+# *Next: [which law does your engine realise?](18_which_law_does_your_engine_realise.ipynb)*

@@ -90,7 +90,7 @@ def engine_impacts(engine: str | None = None, scene: str | None = None) -> Engin
         ValueError: no such engine or scene.
 
     Source: own measurements, 28 November 2026, of the versions in the table; nearest laws by
-    `tests/validation/engines.py`.
+    `tests/validation/engines/nearest.py`.
 
     >>> import jimpact as ji
     >>> row = ji.data.engine_impacts("rapier2d", "S1").rows[0]

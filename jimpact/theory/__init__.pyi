@@ -20,6 +20,10 @@ from .dispersion import (
     energy_dispersion as energy_dispersion,
     energy_ratio as energy_ratio,
 )
+from .engine_parameters import (
+    engine_parameter as engine_parameter,
+    engine_restitution as engine_restitution,
+)
 from .friction import (
     FrictionBounds as FrictionBounds,
     InclusionOutcome as InclusionOutcome,
