@@ -336,8 +336,12 @@ class ContactFlow(Flow):
 
     # ---- the protocol
 
-    def constants(self, modes: jax.Array) -> Frozen:
-        """Factors of the field in the phases of the contacts."""
+    def constants(self, modes: jax.Array) -> Any:
+        """What the field needs of the modes; without friction the normal factors alone."""
+        return self.normal_constants(modes)
+
+    def normal_constants(self, modes: jax.Array) -> Frozen:
+        """Factors of the normal field in the phases of the contacts."""
         phase, s = modes[: self.contacts], self.scales(modes)
         # the least one makes e = 0 regular; of several one of them, whole: min() would share its
         # derivative among them
@@ -381,6 +385,10 @@ class ContactFlow(Flow):
         return jnp.ones_like(y[:, :1]).at[-2].set(WATCHED)
 
     def margins(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
+        """What stays positive until a contact changes its mode; without friction its phase."""
+        return self.normal_margins(const, modes, y)
+
+    def normal_margins(self, const: Frozen, modes: jax.Array, y: jax.Array) -> jax.Array:
         """By indentation (an opening, a gap that closes, the onset of a force), by velocity."""
         x, g, _ = self.rows(y)
         phase = modes[: self.contacts]
@@ -410,6 +418,12 @@ class ContactFlow(Flow):
         return jnp.concatenate([opens, by_g])
 
     def switch(
+        self, modes: jax.Array, y: jax.Array, which: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Modes and state after an event; without friction those of the normal motion."""
+        return self.normal_switch(modes, y, which)
+
+    def normal_switch(
         self, modes: jax.Array, y: jax.Array, which: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
         """Phases and closings after events by indentation and by velocity."""
@@ -467,7 +481,7 @@ class ContactFlow(Flow):
 
     def contact_states(self, modes: jax.Array, y: jax.Array) -> ContactStates:
         """Forces, velocities and the rate of time in a state."""
-        const, none = ContactFlow.constants(self, modes), y[:0]
+        const, none = self.normal_constants(modes), y[:0]
         x, g, p = self.rows(y)
         force = self.force(const, x, g)
         return ContactStates(force, x, p, const.scale * g, none, none, none, const.unit)

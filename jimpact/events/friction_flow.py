@@ -142,7 +142,7 @@ class FrictionFlow(ContactFlow):
         drag = -slip.astype(self.friction.dtype) * self.friction
         k = jnp.where(stick[:, None] & stick[None], self.tangent, 0.0)
         return FrictionConstants(
-            frozen=super().constants(modes),
+            frozen=self.normal_constants(modes),
             stick=stick,
             drag=drag,
             pull=jnp.swapaxes(self.normal_tangent, 0, 1) + self.tangent * drag[None],
@@ -187,7 +187,7 @@ class FrictionFlow(ContactFlow):
         slides = (modes[2 * m :] != 0) & self.loaded(modes)
         return jnp.concatenate(
             [
-                super().margins(const.frozen, modes, y),
+                self.normal_margins(const.frozen, modes, y),
                 jnp.where(slides, modes[2 * m :].astype(y.dtype) * self.slip(y), 1.0),
                 self.forces(const, y).room,
             ]
@@ -206,7 +206,7 @@ class FrictionFlow(ContactFlow):
         stopped, broke = which[2 * m : 3 * m], which[3 * m :]
         side = self.forces(self.constants(modes), y).side
         turned = jnp.where(broke, -jnp.sign(side).astype(modes.dtype), modes[2 * m :])
-        after, y = super().switch(modes, y, which[: 2 * m])
+        after, y = self.normal_switch(modes, y, which[: 2 * m])
         after = jnp.concatenate([after[: 2 * m], turned])
         closed = after[m : 2 * m] > modes[m : 2 * m]
         return self.decided(after, y, stopped, closed)
@@ -235,7 +235,7 @@ class FrictionFlow(ContactFlow):
 
     def soon(self, modes: jax.Array, y: jax.Array) -> jax.Array:
         """Forces (m, B) a moment later, in parts of the largest."""
-        const = ContactFlow.constants(self, modes)
+        const = self.normal_constants(modes)
         x, g, _ = self.rows(y)
         f = self.force(const, jnp.maximum(x + MOMENT * const.closing * g, 0.0), g)
         top = jnp.max(f, axis=0, keepdims=True)

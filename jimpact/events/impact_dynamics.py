@@ -27,7 +27,8 @@ from jimpact.events.contact_flow import (
 )
 from jimpact.events.friction_flow import FrictionFlow
 from jimpact.events.implicit_steps import ImplicitSteps
-from jimpact.events.plastic_limit import final_impulses, to_the_end
+from jimpact.events.plastic_limit import final_impulses, inspect
+from jimpact.events.run import run
 from jimpact.events.slip import SlipFlow
 from jimpact.numerics.dense import unit
 from jimpact.numerics.derive import Arrays, in_lanes, without_derivatives
@@ -259,7 +260,7 @@ class ImpulseProgram:
             results = pushforward(lambda y: (y[rows - 1 : rows], y[sides], y[-1:]), state)
             none = jnp.full(gamma.shape, CODE["ok"], jnp.int32)
             return *results, none, none
-        end = to_the_end(flow, gamma, modes, y, self.most, self.checkpoints)
+        end = run(flow, gamma, modes, y, self.most, inspect, self.checkpoints)
         state = end.carry.y
         p = value_of(state)[rows - len(gamma) : rows] + end.impulse
         if self.finely:
@@ -315,7 +316,7 @@ class ImplicitProgram(ImpulseProgram):
         values = value_of(leaves) if self.checkpoints else self.only_first(value_of(leaves))
         first_only = [Dual(v, x.tangents) if is_dual(x) else v for x, v in zip(leaves, values)]
         flow, start = pushforward(self.steps, jax.tree.unflatten(self.tree, first_only))
-        run = implicit_steps.to_the_end(flow, start, self.most, self.checkpoints)
+        run = implicit_steps.run(flow, start, self.most, self.checkpoints)
         m = len(value_of(start.indentation))
         impulses = pushforward(lambda p: (p[:m], p[m:]), run.state.impulse)
         return *impulses, run.state.time, self.code(flow, run), run.passes

@@ -10,10 +10,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jimpact.events import implicit_steps, plastic_limit
+from jimpact.events import implicit_steps
 from jimpact.events.contact_flow import ContactStates
 from jimpact.events.impact_dynamics import ImplicitProgram, ImpulseProgram
 from jimpact.events.implicit_steps import ImplicitState
+from jimpact.events.plastic_limit import inspect
+from jimpact.events.run import run
 from jimpact.numerics import stepper
 
 
@@ -58,7 +60,7 @@ class HistoryProgram:
         flow, modes, y = self.outcome.flow(problem, 1.0)
         gamma, most, checkpoints = problem.gamma, self.outcome.most, self.outcome.checkpoints
         still = jax.lax.stop_gradient((flow, gamma, modes, y))
-        duration = plastic_limit.to_the_end(*still, most, checkpoints).reached[-1:]
+        duration = run(*still, most, inspect, checkpoints).reached[-1:]
         t = self.parts(y.dtype)[:, None, None] * jax.lax.stop_gradient(duration)[None]
 
         def observe(seen: Seen, now: stepper.StepperState, accept: jax.Array) -> Seen:
@@ -75,9 +77,7 @@ class HistoryProgram:
         first = flow.contact_states(modes, y).force
         clock = jnp.zeros((4, *y.shape[1:]), y.dtype)
         seen = Seen(self.each(y), self.each(modes), self.each(clock), first)
-        end = plastic_limit.to_the_end(
-            flow, gamma, modes, y, most, checkpoints, observe=observe, seen=seen
-        )
+        end = run(flow, gamma, modes, y, most, inspect, checkpoints, observe, seen)
         last = flow.contact_states(end.carry.step.modes, end.reached).force
         no_target = jnp.zeros(end.carry.step.target.shape, bool)
 
@@ -117,7 +117,7 @@ class ImplicitHistoryProgram(HistoryProgram):
         flow, start = outcome.steps(jax.tree.unflatten(outcome.tree, leaves))
         m, most, checkpoints = flow.contacts, outcome.most, outcome.checkpoints
         still = jax.lax.stop_gradient((flow, start))
-        duration = implicit_steps.to_the_end(*still, most, checkpoints).state.time
+        duration = implicit_steps.run(*still, most, checkpoints).state.time
         t = self.parts(duration.dtype)[:, None, None] * jax.lax.stop_gradient(duration)[None]
 
         def force(s: ImplicitState) -> jax.Array:
@@ -132,7 +132,7 @@ class ImplicitHistoryProgram(HistoryProgram):
             return kept, jnp.where(accept, jnp.maximum(force(now), largest), largest)
 
         seen = jax.tree.map(self.each, start), force(start)
-        run = implicit_steps.to_the_end(flow, start, most, checkpoints, observe, seen)
+        run = implicit_steps.run(flow, start, most, checkpoints, observe, seen)
         states, largest = run.seen
 
         def at(sample: Any) -> tuple[jax.Array, jax.Array, ContactStates]:

@@ -442,7 +442,7 @@ def with_tangents_of(flow: Any, state: ImplicitState) -> ImplicitState:
     return dual._replace(rate=value_of(state.rate))
 
 
-def to_the_end(
+def run(
     flow: ImplicitSteps,
     start: ImplicitState,
     most: int,
@@ -458,7 +458,7 @@ def to_the_end(
     """
     start = with_tangents_of((flow, start), start)
     length = FIRST * jnp.ones_like(value_of(flow.tolerance))
-    run = ImplicitRun(start, length, jnp.zeros(length.shape, jnp.int32), seen)
+    first = ImplicitRun(start, length, jnp.zeros(length.shape, jnp.int32), seen)
 
     def goes_on(flow: ImplicitSteps, run: ImplicitRun) -> jax.Array:
         """Which impacts (1, B) are not over."""
@@ -471,7 +471,7 @@ def to_the_end(
         seen = run.seen if observe is None else observe(run.seen, run.state, accepted)
         return ImplicitRun(state, length, run.passes + live.astype(jnp.int32), seen)
 
-    return until_over(goes_on, attempt_all, flow, run, checkpoints, queues=observe is None)
+    return until_over(goes_on, attempt_all, flow, first, checkpoints, queues=observe is None)
 
 
 def between(flow: ImplicitSteps, s: ImplicitState, ahead: jax.Array) -> ImplicitState:

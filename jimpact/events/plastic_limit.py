@@ -15,20 +15,18 @@ them apart in the end; meanwhile its states are no multiples of each other.
 The states of many contacts return in no order. There a look ahead decides (`look_ahead.py`).
 """
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from jimpact.events.contact_flow import OFTEN, ContactFlow
 from jimpact.events.look_ahead import comes_to_rest
+from jimpact.events.run import Rest
 from jimpact.numerics import stepper
-from jimpact.numerics.driver import until_over
 from jimpact.numerics.stepper import Mark, any_of, total
-from jimpact.numerics.tangents import dual_like, pushforward, value_of
+from jimpact.numerics.tangents import value_of
 from jimpact.tools.loops import cond, fori_loop, scan
-from jimpact.tools.status import CODE
 
 # Velocity in tolerances, below which a contact that re-closed often is at rest once the rest of its
 # bounces is neglected. Ten times more: slow contacts of long chains count as plastic ones.
@@ -42,134 +40,28 @@ CHOICES = 8
 SHAPE = 0.02
 
 
-class Rest(NamedTuple):
-    """Which contacts (m, B) come to rest, and the state of the impact at its last pause."""
-
-    contacts: jax.Array  # whose closings have no end
-    carries: jax.Array  # those of them that carry an impulse
-    # (3, m, B): gamma, root of the energy stored, impulse that takes what is left of the approach
-    rows: jax.Array
-    closings: jax.Array
-    ended: jax.Array  # (1, B): by a state that returned as a part of itself
-
-
-class ImpactEnd(NamedTuple):
-    """An impact at its end, finished but for the impulse of the contacts at rest."""
-
-    carry: stepper.StepperState
-    reached: Any  # the state (n, B) before it was finished
-    rest: Rest
-    seen: Any  # what its steps showed
-
-    @property
-    def carries(self) -> jax.Array:
-        """Contacts at rest that carry an impulse (m, B); uses both, see it."""
-        return self.rest.carries & self.rest.contacts
-
-    @property
-    def impulse(self) -> jax.Array:
-        """Of the contacts at rest (m, B)."""
-        return jnp.where(self.carries, self.rest.rows[2], 0.0)
-
-    @property
-    def over(self) -> jax.Array:
-        """Whether (1, B) the impact has ended, not given up."""
-        return self.carry.progress[2:3] == Mark.OVER
-
-    @property
-    def finishes(self) -> jax.Array:
-        """Ended by the flow itself (1, B)."""
-        return self.over & ~self.rest.ended
-
-    @property
-    def status(self) -> jax.Array:
-        """Status (1, B) of the run."""
-        code = jnp.where(any_of(self.rest.contacts), CODE["plastic_limit"], CODE["ok"])
-        return jnp.where(self.over, code, CODE["max_steps"]).astype(jnp.int32)
-
-
-class _Run(NamedTuple):
-    """An impact on its way."""
-
-    carry: stepper.StepperState
-    rest: Rest
-    seen: Any
-
-
-Observe = Callable[[Any, stepper.StepperState, jax.Array], Any]
-
-
-def to_the_end(
-    flow: Any,
-    gamma: jax.Array,
-    modes: jax.Array,
-    y: Any,
-    most: int,
-    checkpoints: bool = False,
-    observe: Observe | None = None,
-    seen: Any = None,
-) -> ImpactEnd:
-    """From gap velocities gamma (m, B) to the end, in at most so many passes.
-
-    What of `flow` and y has tangents (see `tangents.py`) gives a state with tangents. With
-    `checkpoints` the loop has a reverse mode, and no forward mode. `observe(seen, state, accept)`
-    follows the states before each step, and which impacts (1, B) accept it.
-    """
-    no = jnp.zeros(gamma.shape, bool)
-    rows = jnp.zeros((3, *gamma.shape), gamma.dtype)
-    rest = Rest(no, no, rows, jnp.zeros(gamma.shape, modes.dtype), no[:1])
-
-    def one_pass(at: tuple[Any, jax.Array], run: _Run) -> _Run:
-        """One step tried; impacts that pause are inspected."""
-        flow, gamma = at
-        carry, accept = stepper.advance(flow, run.carry, most)
-        if observe is not None:
-            run = run._replace(seen=observe(run.seen, run.carry, accept))
-        paused = carry.progress[2:3] == Mark.PAUSED
-        if not value_of(flow).self_similar:
-            return run._replace(carry=carry)
-        rest = _inspected(flow, gamma, carry, run.rest, paused, jnp.zeros_like(run.rest.contacts))
-        settled = jnp.where(rest.ended, Mark.OVER, Mark.GOES_ON)
-        mark = jnp.where(paused, settled, carry.progress[2:3])
-        progress = carry.progress.at[2:3].set(jax.lax.stop_gradient(mark))
-        return _Run(carry._replace(progress=progress), rest, run.seen)
-
-    start = _Run(stepper.begin(flow, modes, y), rest, seen)
-    run = until_over(
-        lambda _, run: stepper.goes_on(run.carry, most), one_pass, (flow, gamma), start,
-        checkpoints, value_of(flow).queues and observe is None,
-    )  # fmt: skip
-    return _finished(flow, gamma, run)
-
-
-def _finished(flow: Any, gamma: jax.Array, run: _Run) -> ImpactEnd:
-    """The end of a run; the flow finishes the state where it has ended by itself."""
-    carry, rest, seen = run
-    over = (carry.progress[2:3] == Mark.OVER) & ~rest.ended
-    quiet = over & at_rest(*_values(flow, carry))
-
-    def at_end(flow: ContactFlow, y: jax.Array) -> jax.Array:
-        """The state, finished where the impact is over."""
-        return jnp.where(over, flow.finish(carry.step.modes, y)[1], y)
-
-    y = dual_like(carry.y, pushforward(at_end, flow, carry.y))
-    end = carry._replace(y=y)
-    rest = _inspected(flow, gamma, end, rest, jnp.any(quiet, axis=0, keepdims=True), quiet)
-    return ImpactEnd(end, carry.y, rest, seen)
-
-
 def _values(flow: Any, carry: stepper.StepperState) -> tuple[Any, stepper.StepperState]:
     """Flow and state without tangents."""
     values = value_of(flow), carry._replace(y=value_of(carry.y))
     return jax.lax.stop_gradient(values)
 
 
-def _inspected(
-    flow: Any, gamma: jax.Array, carry: Any, rest: Rest, due: jax.Array, quiet: jax.Array
+def inspect(
+    flow: Any,
+    gamma: jax.Array,
+    carry: stepper.StepperState,
+    rest: Rest,
+    which: jax.Array,
+    at_end: bool,
 ) -> Rest:
-    """`contacts_at_rest` where any impact (1, B) is `due`, otherwise `rest`."""
+    """`rest` anew for impacts `which` (1, B) pause, or are over: see `run`.
+
+    Of those that are over, where contacts that closed often hardly move.
+    """
     flow, values = _values(flow, carry)
     gamma, rest = jax.lax.stop_gradient((gamma, rest))
+    quiet = which & at_rest(flow, values) if at_end else jnp.zeros_like(rest.contacts)
+    due = any_of(quiet) if at_end else which
     rest = cond(
         jnp.any(due),
         lambda: contacts_at_rest(flow, gamma, values, rest, quiet),

@@ -29,7 +29,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.events.contact_flow import ContactFlow, ContactStates, Frozen, as_pytree
+from jimpact.events.contact_flow import ContactStates, Frozen, as_pytree
 from jimpact.events.friction_flow import FrictionFlow
 from jimpact.numerics.dense import product, pseudoinverse, solve, times, unit
 from jimpact.numerics.friction import distribute
@@ -225,7 +225,7 @@ class SlipFlow(FrictionFlow):
         pull = up - product(self.tangent, held)
         tangent = self.tangent - product(self.tangent, carried)
         return Reduced(
-            frozen=ContactFlow.constants(self, modes),
+            frozen=self.normal_constants(modes),
             coupling=coupling - product(self.normal_tangent, held),
             normal_tangent=self.normal_tangent - product(self.normal_tangent, carried),
             pull=jnp.where(free[:, None], pull, 0.0),
@@ -399,7 +399,7 @@ class SlipFlow(FrictionFlow):
         creep = jnp.where(creeps, r, 0.0) - 2 * floor
         slow = (slow - creep) / (slow + jnp.abs(creep))
         ends = jnp.where(stick, room, jnp.where(creeps, slow, 1.0))
-        return jnp.concatenate([ContactFlow.margins(self, const.frozen, modes, y), stops, ends])
+        return jnp.concatenate([self.normal_margins(const.frozen, modes, y), stops, ends])
 
     def margins_with_rates(
         self, const: Reduced, modes: jax.Array, y: jax.Array, dy: jax.Array, target: jax.Array
@@ -452,7 +452,7 @@ class SlipFlow(FrictionFlow):
         q = jnp.where(breaks[:, None], jnp.stack([jnp.zeros_like(away), away], 1), q)
         q = jnp.where(grows[:, None], jnp.stack([logarithm, q[:, 1]], 1), q)
         slip = jnp.where(breaks, Slip.CREEPS, jnp.where(grows, Slip.SLIPS, slip))
-        after, y = ContactFlow.switch(self, modes, y, which[: 2 * m])
+        after, y = self.normal_switch(modes, y, which[: 2 * m])
         after = jnp.concatenate([after[: 2 * m], slip.astype(after.dtype)])
         remains = self.loaded(after)
         q = jnp.where((loaded & ~remains)[:, None], cartesian, q)

@@ -1,0 +1,152 @@
+"""The loop of every impact: a flow is advanced step by step, from event to event, to its end.
+
+FLOW    contacts without or with friction (`contact_flow.py`, `friction_flow.py`, `slip.py`)
+STEP    `numerics/stepper.py` tries one, which ends at an event if one lies within it
+PAUSE   where a flow asks for it, `inspect` judges whether the impact will come to rest by itself
+        (`plastic_limit.py`), and ends it there
+END     all contacts are open and none approaches: the flow finishes the state in closed form
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jimpact.events.contact_flow import ContactFlow
+from jimpact.numerics import stepper
+from jimpact.numerics.driver import until_over
+from jimpact.numerics.stepper import Mark, any_of
+from jimpact.numerics.tangents import dual_like, pushforward, value_of
+from jimpact.tools.status import CODE
+
+
+class Rest(NamedTuple):
+    """Which contacts (m, B) come to rest, and the state of the impact at its last inspection."""
+
+    contacts: jax.Array  # whose closings have no end
+    carries: jax.Array  # those of them that carry an impulse
+    # (3, m, B): gamma, root of the energy stored, impulse that takes what is left of the approach
+    rows: jax.Array
+    closings: jax.Array
+    ended: jax.Array  # (1, B): by a state that returned as a part of itself
+
+    @classmethod
+    def none(cls, gamma: jax.Array, modes: jax.Array) -> "Rest":
+        """Before the first inspection."""
+        no = jnp.zeros(gamma.shape, bool)
+        rows = jnp.zeros((3, *gamma.shape), gamma.dtype)
+        return cls(no, no, rows, jnp.zeros(gamma.shape, modes.dtype), no[:1])
+
+
+class ImpactEnd(NamedTuple):
+    """An impact at its end, finished but for the impulse of the contacts at rest."""
+
+    carry: stepper.StepperState
+    reached: Any  # the state (n, B) before it was finished
+    rest: Rest
+    seen: Any  # what its steps showed
+
+    @property
+    def carries(self) -> jax.Array:
+        """Contacts at rest that carry an impulse (m, B); uses both, see it."""
+        return self.rest.carries & self.rest.contacts
+
+    @property
+    def impulse(self) -> jax.Array:
+        """Of the contacts at rest (m, B)."""
+        return jnp.where(self.carries, self.rest.rows[2], 0.0)
+
+    @property
+    def over(self) -> jax.Array:
+        """Whether (1, B) the impact has ended, not given up."""
+        return self.carry.progress[2:3] == Mark.OVER
+
+    @property
+    def finishes(self) -> jax.Array:
+        """Ended by the flow itself (1, B)."""
+        return self.over & ~self.rest.ended
+
+    @property
+    def status(self) -> jax.Array:
+        """Status (1, B) of the run."""
+        code = jnp.where(any_of(self.rest.contacts), CODE["plastic_limit"], CODE["ok"])
+        return jnp.where(self.over, code, CODE["max_steps"]).astype(jnp.int32)
+
+
+class _OnItsWay(NamedTuple):
+    """An impact on its way."""
+
+    carry: stepper.StepperState
+    rest: Rest
+    seen: Any
+
+
+# of flow, gamma, state, rest, which impacts (1, B), whether at the end: see `plastic_limit.inspect`
+Inspect = Callable[..., Rest]
+Observe = Callable[[Any, stepper.StepperState, jax.Array], Any]
+
+
+def run(
+    flow: Any,
+    gamma: jax.Array,
+    modes: jax.Array,
+    y: Any,
+    most: int,
+    inspect: Inspect,
+    checkpoints: bool = False,
+    observe: Observe | None = None,
+    seen: Any = None,
+) -> ImpactEnd:
+    """From gap velocities gamma (m, B) to the end, in at most so many passes.
+
+    What of `flow` and y has tangents (see `tangents.py`) gives a state with tangents.
+
+    Args:
+        flow: of the contacts, with the batch B of impacts in the last axis of its arrays.
+        gamma: gap velocities (m, B) before the impact.
+        modes: of the contacts at first, rows (k, B).
+        y: the state at first (n, B).
+        most: passes.
+        inspect: asked where a self-similar flow pauses, and at the end of each.
+        checkpoints: the loop has a reverse mode, and no forward mode.
+        observe: `observe(seen, state, accept)` follows the states before each step, and which
+            impacts (1, B) accept it.
+        seen: what `observe` begins with.
+    """
+
+    def one_pass(at: tuple[Any, jax.Array], now: _OnItsWay) -> _OnItsWay:
+        """One step tried; impacts that pause are inspected."""
+        flow, gamma = at
+        carry, accept = stepper.advance(flow, now.carry, most)
+        if observe is not None:
+            now = now._replace(seen=observe(now.seen, now.carry, accept))
+        paused = carry.progress[2:3] == Mark.PAUSED
+        if not value_of(flow).self_similar:
+            return now._replace(carry=carry)
+        rest = inspect(flow, gamma, carry, now.rest, paused, False)
+        settled = jnp.where(rest.ended, Mark.OVER, Mark.GOES_ON)
+        mark = jnp.where(paused, settled, carry.progress[2:3])
+        progress = carry.progress.at[2:3].set(jax.lax.stop_gradient(mark))
+        return _OnItsWay(carry._replace(progress=progress), rest, now.seen)
+
+    start = _OnItsWay(stepper.begin(flow, modes, y), Rest.none(gamma, modes), seen)
+    last = until_over(
+        lambda _, now: stepper.goes_on(now.carry, most), one_pass, (flow, gamma), start,
+        checkpoints, value_of(flow).queues and observe is None,
+    )  # fmt: skip
+    return _finished(flow, gamma, last, inspect)
+
+
+def _finished(flow: Any, gamma: jax.Array, last: _OnItsWay, inspect: Inspect) -> ImpactEnd:
+    """The end; the flow finishes the state where it has ended by itself."""
+    carry, rest, seen = last
+    over = (carry.progress[2:3] == Mark.OVER) & ~rest.ended
+
+    def at_end(flow: ContactFlow, y: jax.Array) -> jax.Array:
+        """The state, finished where the impact is over."""
+        return jnp.where(over, flow.finish(carry.step.modes, y)[1], y)
+
+    y = dual_like(carry.y, pushforward(at_end, flow, carry.y))
+    end = carry._replace(y=y)
+    return ImpactEnd(end, carry.y, inspect(flow, gamma, end, rest, over, True), seen)
