@@ -67,12 +67,12 @@ KINEMATIC = (
 
 # fmt: off
 MUTATIONS = [
-    Mutation("sign in the flow", "ContactFlow.constants", "-ratio", "ratio", FLOW),
+    Mutation("sign in the flow", "ContactFlow.normal_constants", "-ratio", "ratio", FLOW),
     Mutation("wrong exponent of the force", "ContactFlow.force", "self.exponent", "plus_one(self.exponent)", FLOW),
     Mutation("missing square of e", "ContactFlow.scales", "self.restitution", "jnp.sqrt(self.restitution)", FLOW),
-    Mutation("(eta + 1)/2 becomes eta/2", "ContactFlow.constants", "per_row(self.exponent, self.omega) + 1", "per_row(self.exponent, self.omega)", FLOW),
-    Mutation("no recompression", "ContactFlow.switch", "after = jnp.where(by_g & (phase == Phase.EXPANSION), Phase.COMPRESSION, after)", "pass", FLOW),
-    Mutation("no re-closing", "ContactFlow.switch", "by_x | by_g", "by_x", FLOW),
+    Mutation("(eta + 1)/2 becomes eta/2", "ContactFlow.normal_constants", "per_row(self.exponent, self.omega) + 1", "per_row(self.exponent, self.omega)", FLOW),
+    Mutation("no recompression", "ContactFlow.normal_switch", "after = jnp.where(by_g & (phase == Phase.EXPANSION), Phase.COMPRESSION, after)", "pass", FLOW),
+    Mutation("no re-closing", "ContactFlow.normal_switch", "by_x | by_g", "by_x", FLOW),
     Mutation("gaps forgotten", "first_indentation", "-problem.gap", "-0.5 * problem.gap", ("test_compliant.py",)),
     Mutation("crossings are missed", "_intentions", "-zero", "-1000.0 * zero", FLOW),
     Mutation("every step accepted", "advance", "error2 <= 1", "error2 <= 1000000.0", FLOW),
@@ -146,8 +146,8 @@ MUTATIONS = [
     Mutation("correlated contacts that separate", "_correlated", "pressed & (at.qn <= rest_of(inputs))", "pressed", ("test_contract.py::test_promises[correlation]", "test_other_laws.py",)),
     Mutation("ratios up to the arithmetic mean", "interval", "-linear", "linear", ("test_other_laws.py::test_the_interval_ends_where_a_contact_stays_closed",)),
     Mutation("coefficients of Routh averaged", "Routh.impulses", "e ** 2", "e", ("test_other_laws.py::test_unequal_coefficients_of_routh_are_one",)),
-    Mutation("yielding that is stored", "ContactFlow.constants", "moves & (phase != Phase.YIELD)", "moves", ("test_yielding.py",)),
-    Mutation("a force above its bound", "ContactFlow.margins", "self.limit - x", "1.0", ("test_yielding.py",)),
+    Mutation("yielding that is stored", "ContactFlow.normal_constants", "moves & (phase != Phase.YIELD)", "moves", ("test_yielding.py",)),
+    Mutation("a force above its bound", "ContactFlow.normal_margins", "self.limit - x", "1.0", ("test_yielding.py",)),
     Mutation("plastic trees that end", "han_gilmore", "ROUNDING < approach <= ZERO", "ZERO < approach <= ZERO", ("test_han_gilmore.py::test_plastic_balls_collide_without_end_and_it_says_so",)),
     Mutation("trees with restitution beside one contact", "_impact", "1 + problem.restitution[at]", "1 + problem.restitution[0] ** 2", ("test_han_gilmore.py::test_losses_in_exact_arithmetic",)),
     Mutation("trees that stick beyond the cone", "_impact", "mu[at] * pushes + ZERO", "np.inf", ("test_han_gilmore.py::test_friction_of_one_contact",)),
