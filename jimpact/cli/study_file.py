@@ -25,7 +25,7 @@ from jimpact.laws.kinematic import RestitutionMatrix
 from jimpact.tools.checks import check_word, suggestion
 
 STUDY = "study.toml"  # in a folder that `jimpact new` has made
-NO_DATA = "a study must have a [data] table to be fitted, but has none."
+NO_DATA = "a study must have shots to be fitted, of [data], [track] or [bounces], but has none."
 # classes of bodies by name, which a study writes in any case
 BODIES = {name: getattr(bodies, name) for name in dir(bodies) if name in dir(ji)}
 # Units of the bodies' arguments, which a study writes behind their names. Words and directions have
@@ -114,7 +114,7 @@ def check_keys(where: str, table: Any, allowed: Any, required: tuple[str, ...] =
             )
 
 
-def check_kind(where: str, key: str, value: Any, kind: type, words: str) -> None:
+def check_kind(where: str, key: str, value: Any, kind: Any, words: str) -> None:
     """Raise a ValueError for a value of another kind, which `words` name."""
     if not isinstance(value, kind):
         raise ValueError(f"`{key}` in {where} must be {words}, but is {value!r}.")

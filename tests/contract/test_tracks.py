@@ -1,7 +1,10 @@
 """From the camera to a fit: impacts in tracks, bounce times, tables of trackers, bad input."""
 
+import json
+
 import numpy as np
 import pytest
+from commands_cases import call
 
 import jimpact as ji
 
@@ -275,3 +278,89 @@ def test_tables_of_trackers_loggers_and_capture_systems(tmp_path):
 def test_a_picture_of_a_track():
     t, y, _ = ball(np.random.default_rng(1))
     assert len(ji.tracks.find_impacts(t, y, acceleration=-G).plot().axes) == 2
+
+
+SEEN = """
+[scene]
+masses_kg = [0.1]
+wall = "left"
+[law]
+name = "Newton"
+restitution = 0.6
+[fit]
+starts = 1
+[track]
+file = "ball.txt"
+columns = "height"
+unit = "cm"
+rate = 120
+acceleration = -9.80665
+"""
+
+
+def written(folder, old="", new=""):
+    """A study of a ball that a camera saw."""
+    _, y, _ = ball(np.random.default_rng(11))
+    (folder / "ball.txt").write_text("height\n" + "\n".join(f"{100 * x:.3f}" for x in y))
+    path = folder / "study.toml"
+    path.write_text(SEEN.replace(old, new))
+    return path
+
+
+def test_a_study_of_a_track_finds_its_impacts(tmp_path):
+    study = ji.read_study(written(tmp_path))
+    (impact,) = study.track.impacts
+    assert abs(restitution(impact)[0] - 0.8) < 5 * restitution(impact)[1]
+    np.testing.assert_allclose(study.experiments.pre[0], impact.pre)
+    np.testing.assert_allclose(study.experiments.covariance[0], impact.covariance)
+    free = ji.read_study(written(tmp_path, "acceleration = -9.80665", 'acceleration = "unknown"'))
+    np.testing.assert_allclose(free.track.acceleration, -G, atol=0.1)
+    assert ji.read_study("ball_track.toml").experiments.pre.shape == (3, 1)
+
+
+@pytest.mark.slow
+def test_the_command_prints_impacts_and_then_the_fit(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert call(capsys, "new", "fit", "seen", "--like", "ball_track.toml")[0] == 0
+    code, said = call(capsys, "fit", "seen")
+    assert code == 0
+    assert said.out.index("impact 3 at") < said.out.index("std. error")
+    assert (tmp_path / "jimpact-fit-seen-track.png").exists()
+    code, said = call(capsys, "fit", "seen", "--json", "--starts", "1")
+    assert len(json.loads(said.out)["track"]["impacts"]) == 3
+
+
+def test_a_study_of_bounces(tmp_path):
+    scene = SEEN[: SEEN.index("[track]")]
+    path = tmp_path / "study.toml"
+    path.write_text(scene + "[bounces]\ntimes = [0.0, 0.5, 0.9, 1.22]\nsigma = 0.001\n")
+    shots = ji.read_study(path).experiments
+    np.testing.assert_allclose(-shots.post / shots.pre, 0.8)
+    assert shots.covariance.shape == (4, 4)
+    path.write_text(scene + "[bounces]\ntimes = [0.0, 0.5, 0.4]\nsigma = 0.001\n")
+    with pytest.raises(ValueError, match=r"\[bounces\].*`times` must rise"):
+        ji.read_study(path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('unit = "cm"\n', "", "the key `unit`"),
+        ('unit = "cm"', 'unit = "px"', "`unit` must be one of"),
+        ("rate = 120", "", "`rate`"),
+        ("rate = 120", 'rate = "fast"', "`rate` in .* must be a number"),
+        ("rate = 120", "framerate = 120", "Did you mean rate"),
+        ('columns = "height"', 'columns = "hight"', "`hight` is missing"),
+        ('columns = "height"', "columns = 3", "`columns` in .* must be a text or a list"),
+        ("acceleration = -9.80665", "acceleration = true", "`acceleration` in"),
+        ("acceleration = -9.80665", "sigma = -1.0", "`sigma` must"),
+        ("acceleration = -9.80665", "contact = -0.1", "`contact` must"),
+        ("acceleration = -9.80665", "shortest = 2", "`shortest` must"),
+        ("acceleration = -9.80665", "near_m = 0.001", "`near_m` in .* for bodies"),
+        ("masses_kg = [0.1]", "masses_kg = [0.1, 0.1]", "`columns` in .* 2 coordinates"),
+        ("rate = 120", 'rate = 120\n[data]\nfile = "x.csv"', r"one table of shots"),
+    ],
+)
+def test_studies_of_tracks_name_the_key_that_is_wrong(tmp_path, old, new, words):
+    with pytest.raises(ValueError, match=words):
+        ji.read_study(written(tmp_path, old, new))
