@@ -91,6 +91,35 @@ def test_good_tracks_have_few_warnings_and_bad_ones_have():
         assert any(words in line for line in lines), lines
 
 
+def test_signs_units_and_gravity_that_are_wrong_are_told():
+    rng = np.random.default_rng(14)
+    t, y, first = ball(rng)
+    angle = np.where(t < first, 8.0, -5.0) * (t - first) + 0.005 * rng.normal(size=t.size)
+    for sigma in (1e-3, None):
+        for bad, words in (
+            (dict(q=-y), "curves the other way"),
+            (dict(acceleration=0.0), "may be none"),
+            (dict(q=np.degrees(angle), acceleration=0.0, units="rad"), "degrees"),
+        ):
+            arguments = {"t": t, "q": y, "sigma": sigma, "acceleration": -G} | bad
+            if "units" in bad and sigma:
+                arguments["sigma"] = 0.3
+            lines = ji.tracks.find_impacts(**arguments).warnings
+            assert any(words in line for line in lines), lines
+    both = np.column_stack([0.3 * t, -y])
+    lines = ji.tracks.find_impacts(t, both, 1e-3, acceleration=[0.0, -G]).warnings
+    assert "Coordinate 2 curves the other way" in lines[0]
+    good = ji.tracks.find_impacts(t, np.radians(angle), 1e-4, units="rad")
+    assert good.warnings == ()
+
+
+def test_known_values_are_kept_to_the_last_digit():
+    t, y, _ = ball(np.random.default_rng(1))
+    track = ji.tracks.find_impacts(t, y, sigma=1e-3, acceleration=-G)
+    assert track.acceleration.tolist() == [-G]
+    assert track.sigma.tolist() == [1e-3]
+
+
 def test_gliders_of_unknown_acceleration_and_two_impacts():
     rng = np.random.default_rng(6)
     t = np.arange(300) / 100
@@ -197,6 +226,10 @@ def test_bounce_times_reach_the_bound():
         ({"t": [0.0, 0.1, np.nan, 0.3, 0.4, 0.5]}, "finite"),
         ({"sigma": 0.0}, "sigma"),
         ({"sigma": -1.0}, "sigma"),
+        ({"sigma": np.nan}, "sigma"),
+        ({"sigma": [0.1, 0.1]}, "sigma"),
+        ({"t": [0.0, 0.1, 0.2, 0.2, 0.3, 0.4]}, "rise"),
+        ({"acceleration": np.nan}, "acceleration"),
         ({"q": np.full(6, np.nan)}, "NaN in all"),
         ({"q": np.zeros((5, 1))}, "shapes"),
         ({"units": "deg"}, "'rad'"),
