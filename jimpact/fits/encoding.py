@@ -26,7 +26,7 @@ _PACKAGES = ("jimpact", "jax", "jaxlib", "equinox", "numpy", "scipy")
 _KINDS: dict[str, Any] = {
     kind.__name__: kind for kind in (StaticNumber, StaticNumbers, float, tuple, list)
 } | {"Prior": Prior._make}
-_LATER = {"covariance"}  # fields that files of format 1 may lack: they had no such thing
+_LATER = {"covariance", "curve"}  # that files of format 1 may lack: they had no such thing
 # classes of a fit that have no public name, by their own
 _PARTS = {
     kind.__name__: kind
