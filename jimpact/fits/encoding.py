@@ -16,6 +16,7 @@ from jimpact.core.scene import PairNormals
 from jimpact.fits.matrices import AdmissibleMatrices
 from jimpact.fits.observables import Shots
 from jimpact.fits.parameters import LawInScene, Parameters, Prior
+from jimpact.fits.parts_of_motion import LawInMotion
 from jimpact.fits.problem import FitProblem
 from jimpact.fits.search import FitMinimum
 from jimpact.fits.uncertainty import Profile
@@ -31,8 +32,8 @@ _LATER = {"covariance", "curve"}  # that files of format 1 may lack: they had no
 _PARTS = {
     kind.__name__: kind
     for kind in (
-        *(AdmissibleMatrices, FitMinimum, FitProblem, LawInScene, Neighbours, PairNormals),
-        *(Parameters, Profile, Shots),
+        *(AdmissibleMatrices, FitMinimum, FitProblem, LawInMotion, LawInScene, Neighbours),
+        *(PairNormals, Parameters, Profile, Shots),
     )
 }
 
