@@ -254,6 +254,13 @@ def test_a_track_without_an_impact_says_so():
         track.experiments()
 
 
+def test_a_body_in_space_is_refused_with_advice():
+    t, q, _ = ball(np.random.default_rng(1), coordinates=3)
+    track = ji.tracks.find_impacts(t, q, 1e-3, acceleration=[0, 0, -G])
+    with pytest.raises(ValueError, match=r"body in space.*body\.scenes"):
+        track.experiments(ji.Box([0.1, 0.1, 0.1]))
+
+
 def test_an_impact_in_the_first_frames_is_told():
     t = np.arange(40) / 100
     track = ji.tracks.find_impacts(t, np.abs(t - 0.025), sigma=1e-4)
