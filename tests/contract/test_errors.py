@@ -366,20 +366,6 @@ SYSTEMS = [
     (lambda: samples(key=2**70), "`key` must have at most 64 bits"),
     (lambda: samples(folder=3), "`folder` must be a path, but is 3"),
     (lambda: fit_of_a_ball(q0=[-1.0]), r"`q0` must have no penetration"),
-    (
-        lambda: ji.fit_motion(
-            *(ji.System(ji.Column([1.0])), ji.Newton(0.8), np.ones((3, 1)), [1.0], [0.0], 0.3),
-            free=["gravity"],
-        ),
-        "`gravity` only of a system whose one potential is its weight",
-    ),
-    (
-        lambda: ji.fit_motion(
-            *(ji.System(lambda q: q, [1.0]), ji.Newton(0.8), np.ones((3, 1)), [1.0], [0.0], 0.3),
-            free=["floor"],
-        ),
-        "`floor` only of bodies over a floor at rest",
-    ),
     (lambda: fit_of_a_ball(t_end=-0.5), "`t_end` must be after the start"),
     (lambda: fit_of_a_ball(measured="a"), "`measured` must be numeric"),
     (lambda: fit_of_a_ball(observe=lambda m: [m.q[0, 0]]), "`observe` must give an array"),

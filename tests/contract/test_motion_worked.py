@@ -300,6 +300,12 @@ def test_start_gravity_and_floor_of_a_motion_are_fitted_by_name():
     )  # fmt: skip
     values = dict(zip(both.names, both.value))
     assert set(values) == {"restitution", "v0[1,1]", "v0[2,1]", "q0[2,1]", "floor", "gravity"}
+    for system, name, words in (
+        (ji.System(ji.Column([1.0])), "gravity", "whose one potential is its weight"),
+        (ji.System(lambda q: q, [1.0]), "floor", "over a floor at rest"),
+    ):
+        with pytest.raises(ValueError, match=f"`{name}` only of .*{words}"):
+            ji.fit_motion(system, guess, np.ones((3, 1)), [1.0], [0.0], 0.3, [name])
 
 
 @pytest.mark.release
