@@ -119,7 +119,7 @@ def _impact_of(command: options.ShotCommand) -> tuple[Study, np.ndarray, np.ndar
         return study, before, None
     data = study.experiments
     if data is None:
-        raise ValueError("--velocity must be given, because the study has no [data].")
+        raise ValueError("--velocity must be given, because the study has no shots.")
     if not 0 <= shot < len(data.shots):
         raise ValueError(f"--shot must lie in [1, {len(data.shots)}], but is {command.shot}.")
     study = replace(study, scene=data.scene_of(study.scene, shot))
@@ -166,9 +166,11 @@ def fit(command: options.FitCommand, steps: Steps) -> CommandResult:
         limit = None if command.limit is None else left
         fits[name] = each.run(**chosen, profiles=profiles, limit=limit)
         steps(_fit_in_words(name, fits[name]))
-        steps.show_finished = lambda: _show(command, _fits_result(study.title, fits), steps)
+        steps.show_finished = lambda: _show(
+            command, _with_track(_fits_result(study.title, fits), study, command), steps
+        )
     steps.show_finished = None
-    return _fits_result(study.title, fits)
+    return _with_track(_fits_result(study.title, fits), study, command)
 
 
 def _fits_of(
@@ -200,6 +202,18 @@ def _fits_result(title: str, fits: dict[str, "Fit"]) -> CommandResult:
     return CommandResult(title, {"fits": dict(fits)}, picture, _plain(heads, rows), text)
 
 
+def _with_track(result: CommandResult, study: Study, command: options.FitCommand) -> CommandResult:
+    """The result with the track that the shots are of: its impacts and warnings, its picture."""
+    if study.track is None:
+        return result
+    text = str(result.data) if result.text is None else result.text
+    found = {"impacts": study.track.impacts, "warnings": study.track.warnings}
+    data = as_data(result.data) | {"track": found}
+    place = command.picture()
+    picture = {place.with_stem(f"{place.stem}-track"): study.track.plot(study.title)}
+    return result._replace(data=data, text=f"{study.track}\n\n{text}", more=picture)
+
+
 def _plain(heads: Iterable[str], rows: Sequence[Sequence[Any]]) -> Table:
     """A table for CSV only."""
     return Table([Column(name) for name in heads], rows)
@@ -213,7 +227,8 @@ def _fit_every_law(command: options.FitCommand, steps: Steps) -> CommandResult:
     fits = _laws_fitted(study, steps, starts=command.starts, seed=command.seed)
     best = fits.best
     picture = ji.plot.fit(best.fit, None, f"{study.title}: {best.name}")
-    return CommandResult(study.title, fits, picture, fits.table)
+    result = CommandResult(study.title, fits, picture, fits.table)
+    return _with_track(result, study, command)
 
 
 def _laws_fitted(study: Study, steps: Steps, **chosen: int | None) -> "LawFits":

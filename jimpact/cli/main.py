@@ -37,7 +37,8 @@ jimpact: differentiable laws for impacts with several contacts.
   jimpact laws         what each law assumes, and when it is right
 
 Your own data: `jimpact new fit` writes a study, a CSV file and a notebook to
-start from; then `jimpact fit my_fit`.
+start from; then `jimpact fit my_fit`. From the places that a camera saw:
+`jimpact new fit --like ball_track.toml`.
 
 `jimpact COMMAND --help` lists all options, `jimpact --version` the version.
 """

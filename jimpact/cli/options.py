@@ -131,7 +131,7 @@ class ShotCommand(DrawingCommand):
 class FitCommand(DrawingCommand):
     """Fit a law to measured velocities or a motion: what the study says, nothing else."""
 
-    # Study file, its folder, or a bundled one (three_balls.toml, air_track.toml, tossed_cube.toml,
+    # Study file, its folder, or a bundled one (three_balls.toml, ball_track.toml, tossed_cube.toml,
     # ...); also the study of a motion with [data].
     study: StudyFile = Path("three_balls.toml")
     law: Name = None
@@ -309,7 +309,8 @@ class NewCommand:
     """Where it is written; default: ./my_<kind>. Files that exist are never replaced."""
 
     like: Annotated[str | None, _option("STUDY.toml", str)] = None
-    """Bundled study to begin with (rocking_block.toml, ...); default: three balls, or a cradle."""
+    """Bundled study to begin with (rocking_block.toml, ball_track.toml: a ball that a camera saw,
+    ...); default: three balls, or a cradle."""
 
     light: ClassVar[bool] = True
 

@@ -11,7 +11,8 @@ from typing import Any
 from jimpact.cli.study_file import STUDY, located
 
 WIDEST = 100  # characters; longer lines of prose are hard to read
-TEMPLATES, DATA = Path(__file__).with_name("new_studies.toml"), "shots.csv"
+TEMPLATES = Path(__file__).with_name("new_studies.toml")
+FILES = {"data": "shots.csv", "track": "track.csv"}  # of the tables of a study that name one
 
 
 def begin(kind: str, folder: Path, like: str | None = None) -> list[Path]:
@@ -24,11 +25,13 @@ def begin(kind: str, folder: Path, like: str | None = None) -> list[Path]:
     template = templates[kind]
     path = located(Path(like or template["study"]), template["table"])
     study = path.read_text(encoding="utf-8")
-    data = tomllib.loads(study).get("data", {}).get("file")
     texts = {folder / STUDY: templates["head"].format(kind=kind) + "\n" + study}
-    if data is not None:
-        texts[folder / STUDY] = texts[folder / STUDY].replace(data, DATA)
-        texts[folder / DATA] = (path.parent / data).read_text(encoding="utf-8")
+    tables = tomllib.loads(study)
+    for table, name in FILES.items():
+        data = tables.get(table, {}).get("file")
+        if data is not None:
+            texts[folder / STUDY] = texts[folder / STUDY].replace(data, name)
+            texts[folder / name] = (path.parent / data).read_text(encoding="utf-8")
     cells = [templates["setup"], *template["cells"]]
     texts[folder / "study.ipynb"] = _notebook(template["title"], cells)
     existing = [str(path) for path in texts if path.exists()]

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import jimpact as ji
 from jimpact.bodies.base import CLOSED_BELOW, Body
@@ -21,6 +21,7 @@ from jimpact.cli.study_file import (
     without_none,
 )
 from jimpact.cli.study_motion import MotionStudy, motion_study_of
+from jimpact.cli.study_track import shots_of_bounces, shots_of_track, track_of
 from jimpact.core.distributions import Distribution, RandomLaw
 from jimpact.core.law import Law, free_parameters_of
 from jimpact.core.scene import Scene, chain
@@ -30,11 +31,15 @@ from jimpact.fits.parameters import OF_SPEED, default_free
 from jimpact.fits.problem import FitProblem, of_shots
 from jimpact.fits.search import Search
 
+if TYPE_CHECKING:
+    from jimpact.tracks.track import Track
+
 # Keys of the tables, and the arguments that they are: of `chain`, of `Body.scene`, of
 # `read_experiments`, of `monte_carlo`.
 CHAIN = {"masses_kg": "masses", "wall": "wall", "gaps_m": "gaps"}
 CONFIGURATION = {"q": "q", "closed_below_m": "closed_below"}
 DATA = ("file", "momentum_corrected", "near_m", "contacts")
+SHOTS = ("data", "track", "bounces")  # tables of shots, of which a study has one at most
 SAMPLING = {
     **{"velocity_m_per_s": "velocity", "gaps_m": "gaps", "law": "law", "samples": "samples"},
     **{"seed": "key", "chunk": "chunk", "bins": "bins"},
@@ -58,11 +63,12 @@ class Study:
         free: names -> masks of the parameters that `run` fits.
         bounds: names -> (low, high).
         priors: names -> (mean, standard deviation).
-        experiments: the shots, None without `[data]`.
+        experiments: the shots, None without `[data]`, `[track]` and `[bounces]`.
         parameters: the law's values as the file states them.
         options: of `fit`, by name.
         monte_carlo: arguments of `monte_carlo`, empty without `[monte_carlo]`.
         velocities: names of the velocities of a body with their units; empty of a chain.
+        track: that of `[track]` with its impacts and warnings, else None.
     """
 
     title: str
@@ -76,6 +82,7 @@ class Study:
     priors: dict[str, Any] = field(default_factory=dict)
     monte_carlo: dict[str, Any] = field(default_factory=dict)
     velocities: tuple[str, ...] = ()
+    track: "Track | None" = None
 
     def run(self, **options: Any) -> Fit:
         """`fit` with the study's options, or with those that are passed and not None."""
@@ -115,8 +122,13 @@ def read_study(path: str | Path, law: str | None = None) -> Study | MotionStudy:
     - `[fit]`: free (a list of names, or a table of masks), method, loss, starts, seed, max_steps,
       profiles.
     - `[data]`: file (relative to the study, see `read_experiments`), momentum_corrected; of shots
-      with scenes of their own near_m, contacts (only shots with that many). Without data a study
+      with scenes of their own near_m, contacts (only shots with that many). Without shots a study
       can be compared, not fitted.
+    - `[track]`, in the place of `[data]`: file (relative to the study), and the arguments of
+      `ji.tracks.read` and `ji.tracks.find_impacts` by their names (columns, unit, time or rate,
+      decimal; sigma, acceleration, contact, shortest, window); acceleration = "unknown" is None;
+      of a body near_m. The study's `track` holds the impacts.
+    - `[bounces]`, in the place of `[data]`: times, sigma, gravity, see `ji.tracks.bounce_times`.
     - `[monte_carlo]`: velocity_m_per_s, gaps_m, law, samples, seed, chunk, bins; see
       `monte_carlo`.
 
@@ -177,24 +189,25 @@ def _built(
 
 def _impact_study(tables: Mapping[str, Any], place: Path, law_name: str | None) -> Study:
     """The study of these tables."""
-    check_tables(tables, ("scene", "law"), ("fit", "data", "monte_carlo"))
+    check_tables(tables, ("scene", "law"), ("fit", *SHOTS, "monte_carlo"))
     scene, body = _scene(tables["scene"])
     law, values, fitted = law_of(tables, law_name, place.parent, scene)
     fittable = free_parameters_of(law)
     bounce = [name for name in ("restitution", *OF_SPEED) if name in fittable]
-    data = tables.get("data")
+    track, experiments = _shots(tables, place, body or scene)
     return Study(
         str(tables.get("title", place.stem)),
         scene,
         law,
         free=fitted.free or dict.fromkeys(bounce or default_free(law), True),
         bounds=fitted.bounds,
-        experiments=None if data is None else _experiments(data, place, body or scene),
+        experiments=experiments,
         parameters=values,
         options=fitted.options,
         priors=fitted.priors,
         monte_carlo=_sampling(tables["monte_carlo"], law, scene) if "monte_carlo" in tables else {},
         velocities=() if body is None else tuple(body.velocity_names),
+        track=track,
     )
 
 
@@ -206,6 +219,23 @@ def _scene(table: Mapping[str, Any]) -> tuple[Scene, Body | None]:
     body = body_of("[scene]", table, tuple(CONFIGURATION))
     check_keys("[scene]", table, tuple(table), ("q",))
     return body.scene(**arguments_of(table, CONFIGURATION)), body
+
+
+def _shots(
+    tables: Mapping[str, Any], study: Path, place: Scene | Body
+) -> tuple["Track | None", Experiments | None]:
+    """The shots of a study, if it has any, and the track of which they are."""
+    given = [name for name in SHOTS if name in tables]
+    if len(given) > 1:
+        raise ValueError(
+            f"the study must have one table of shots, but has {', '.join(f'[{x}]' for x in given)}."
+        )
+    if "track" in tables:
+        track = track_of(tables["track"], study)
+        return track, shots_of_track(track, tables["track"], place)
+    if "bounces" in tables:
+        return None, shots_of_bounces(tables["bounces"])
+    return None, _experiments(tables["data"], study, place) if "data" in tables else None
 
 
 def _experiments(table: Mapping[str, Any], study: Path, place: Scene | Body) -> Experiments:

@@ -19,13 +19,14 @@ from jimpact.core.law import Law
 from jimpact.core.scene import Scene
 from jimpact.fits.matrices import admissible_start
 from jimpact.fits.parameters import OF_A_SCENE, entry_of, free_parameters
+from jimpact.fits.parts_of_motion import OF_A_MOTION
 from jimpact.fits.search import Search
 from jimpact.laws import REGISTRY
 from jimpact.laws.kinematic import RestitutionMatrix
 from jimpact.tools.checks import check_word, suggestion
 
 STUDY = "study.toml"  # in a folder that `jimpact new` has made
-NO_DATA = "a study must have a [data] table to be fitted, but has none."
+NO_DATA = "a study must have shots to be fitted, of [data], [track] or [bounces], but has none."
 # classes of bodies by name, which a study writes in any case
 BODIES = {name: getattr(bodies, name) for name in dir(bodies) if name in dir(ji)}
 # Units of the bodies' arguments, which a study writes behind their names. Words and directions have
@@ -114,7 +115,7 @@ def check_keys(where: str, table: Any, allowed: Any, required: tuple[str, ...] =
             )
 
 
-def check_kind(where: str, key: str, value: Any, kind: type, words: str) -> None:
+def check_kind(where: str, key: str, value: Any, kind: Any, words: str) -> None:
     """Raise a ValueError for a value of another kind, which `words` name."""
     if not isinstance(value, kind):
         raise ValueError(f"`{key}` in {where} must be {words}, but is {value!r}.")
@@ -178,7 +179,8 @@ def law_of(
         check_word("the law", word, REGISTRY)
     others = ("name", "module", "bounds", "priors")
     check_keys("[law]", table, (*REGISTRY[study_law].arguments, *others))
-    allowed = (*REGISTRY[study_law].parameters, *OF_A_SCENE)
+    not_of_law = (*OF_A_SCENE, *OF_A_MOTION)
+    allowed = (*REGISTRY[study_law].parameters, *not_of_law)
     for key in ("bounds", "priors"):
         pairs = table.get(key, {})
         fields = {entry_of(x)[0]: x for x in pairs} if isinstance(pairs, dict) else pairs
@@ -194,11 +196,11 @@ def law_of(
 
     def kept(pairs: Mapping[str, Any]) -> dict[str, Any]:
         """What belongs to this law, where it stands in the place of the study's."""
-        fields = (*row.parameters, *OF_A_SCENE)
+        fields = (*row.parameters, *not_of_law)
         return {x: y for x, y in pairs.items() if other_law is None or entry_of(x)[0] in fields}
 
     law, free = row.build(**values), kept(free)
-    own = {x: choice for x, choice in free.items() if entry_of(x)[0] not in OF_A_SCENE}
+    own = {x: choice for x, choice in free.items() if entry_of(x)[0] not in not_of_law}
     if own:  # refuse what this law does not have, whether or not it will be fitted
         free_parameters(law, own, absolute=True)
     bounds, priors = kept(table.get("bounds", {})), kept(table.get("priors", {}))

@@ -7,7 +7,6 @@ from typing import Any
 
 from jimpact.bodies.base import STANDARD_GRAVITY
 from jimpact.cli.study_file import (
-    NO_DATA,
     arguments_of,
     body_of,
     check_keys,
@@ -74,7 +73,7 @@ class MotionStudy:
     def fit(self, **options: Any) -> Fit:
         """`fit_motion` with the study's options, or with those that are passed and not None."""
         if self.measured is None:
-            raise ValueError(NO_DATA)
+            raise ValueError("a study of a motion must have a [data] table to be fitted.")
         start, _ = self.arguments["t_end"]
         times, q, sigma = self.measured
         if abs(times[0] - start) > UNEVEN_STEPS * (times[1] - times[0]):

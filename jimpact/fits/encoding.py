@@ -18,6 +18,7 @@ from jimpact.fits.findings import Finding
 from jimpact.fits.matrices import AdmissibleMatrices
 from jimpact.fits.observables import Shots
 from jimpact.fits.parameters import LawInScene, Parameters, Prior
+from jimpact.fits.parts_of_motion import LawInMotion
 from jimpact.fits.problem import FitProblem
 from jimpact.fits.search import FitMinimum
 from jimpact.fits.uncertainty import Profile
@@ -28,13 +29,13 @@ _PACKAGES = ("jimpact", "jax", "jaxlib", "equinox", "numpy", "scipy")
 _KINDS: dict[str, Any] = {
     kind.__name__: kind for kind in (StaticNumber, StaticNumbers, float, tuple, list)
 } | {"Prior": Prior._make}
-_LATER = {"covariance"}  # fields that files of format 1 may lack: they had no such thing
+_LATER = {"covariance", "curve"}  # that files of format 1 may lack: they had no such thing
 # classes of a fit that have no public name, by their own
 _PARTS = {
     kind.__name__: kind
     for kind in (
-        *(AdmissibleMatrices, Finding, FitMinimum, FitProblem, LawInScene, Neighbours),
-        *(PairNormals, Parameters, Profile, Shots),
+        *(AdmissibleMatrices, Finding, FitMinimum, FitProblem, LawInMotion, LawInScene),
+        *(Neighbours, PairNormals, Parameters, Profile, Shots),
     )
 }
 

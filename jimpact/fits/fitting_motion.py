@@ -11,6 +11,8 @@ import numpy as np
 from jimpact.core.law import Law
 from jimpact.fits.fitting import Fit, fit
 from jimpact.fits.observables import Prediction
+from jimpact.fits.parameters import as_names, entry_of
+from jimpact.fits.parts_of_motion import LawInMotion, with_parts_of_motion
 from jimpact.fits.problem import FitProblem
 from jimpact.fits.search import Search
 from jimpact.motion.methods import as_method
@@ -41,22 +43,25 @@ class MotionObservable(eqx.Module):
 
     def __call__(self, law: Law) -> Prediction:
         """What is observed of the motion with this law, and the status of the motion."""
+        parts = law if isinstance(law, LawInMotion) else LawInMotion(law)
+        system = parts.in_system(self.system)
+        start, speed = parts.start(system, self.q0, self.v0)
 
         def one(q0: jax.Array, v0: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
             """What is observed of one motion, whether it fails, and its status."""
-            motion = simulate(self.system, law, q0=q0, v0=v0, **self.options)
-            seen = self.observe(motion)
+            motion = simulate(system, parts.law, q0=q0, v0=v0, **self.options)
+            seen = self.observe(parts.seen(motion, system))
             if not eqx.is_array(seen):
                 raise TypeError(f"Argument `observe` must give an array, but gives {seen!r}.")
             return seen, jnp.asarray(_FAILS)[motion.status], motion.status
 
-        if self.q0.ndim == 1:
-            value, fails, status = one(self.q0, self.v0)
+        if start.ndim == 1:
+            value, fails, status = one(start, speed)
             return Prediction(value, fails | ~jnp.isfinite(value), status[None])
-        count = len(self.q0)
+        count = len(start)
         lanes = min(count, LANES)
         rows = np.minimum(np.arange(-(-count // lanes) * lanes), count - 1).reshape(-1, lanes)
-        some = jax.lax.map(lambda at: jax.vmap(one)(self.q0[at], self.v0[at]), jnp.asarray(rows))
+        some = jax.lax.map(lambda at: jax.vmap(one)(start[at], speed[at]), jnp.asarray(rows))
         value, fails, status = (x.reshape(-1, *x.shape[2:])[:count] for x in some)
         bad = fails.reshape(-1, *[1] * (value.ndim - 1)) | ~jnp.isfinite(value)
         return Prediction(value, bad, status[jnp.argmax(fails)][None])
@@ -81,7 +86,7 @@ def fit_motion(
     search: Search = MOTION_SEARCH,
     **options: Any,
 ) -> Fit:
-    """The parameters of `law` with which `simulate` comes nearest to one or more measured motions.
+    """The parameters with which `simulate` comes nearest to one or more measured motions.
 
     Equation: `min sum ((observe(motion) - measured) / sigma)^2` by Levenberg-Marquardt, with the
     exact derivatives of the simulated motion, event times included: forward ones, which cost less
@@ -97,7 +102,10 @@ def fit_motion(
         q0: (n,) at the start, (K, n) of K motions.
         v0: (n,) at the start, (K, n) of K motions.
         t_end: [s].
-        free: names of the law's parameters, or a mapping to masks over contacts, as in `fit`.
+        free: names of the law's parameters, or a mapping to masks over contacts, as in `fit`; also
+            of the motion: 'q0', 'v0' (or entries, 'v0[2]'; of K motions 'q0[2,1]'), 'gravity' of
+            a system that has it, 'floor', the height of the floor [m] above the heights' zero,
+            else 0. What is free starts at its value here.
         sigma: standard errors of the measurement, scalar or shaped like it; None: estimated.
         bounds, priors, ties: as in `fit`.
         observe: Motion -> array; None: the positions. E.g. `lambda m: m.events.time[:10]`.
@@ -142,6 +150,8 @@ def fit_motion(
         there, _, q, v = in_common_dtype(system, law, q, v)
         checked_start(there, q, v, t_end, method)  # in the fit `simulate` cannot raise
     observable = MotionObservable(system, q0, v0, {"t_end": t_end} | options, observe or _positions)
+    named = {entry_of(name)[0] for name in as_names("free", free)}
+    law = with_parts_of_motion(law, system, q0, v0, named)
     problem = FitProblem.from_observable(
         law, observable, measured, sigma, free, bounds, priors, ties
     )

@@ -27,6 +27,7 @@ from jimpact.core.law import (
     with_parameter,
 )
 from jimpact.core.scene import Scene, with_gaps
+from jimpact.fits.parts_of_motion import LawInMotion
 from jimpact.laws.kinematic import RestitutionMatrix
 from jimpact.tools.checks import ABBREVIATIONS, check_kind, suggestion
 
@@ -209,7 +210,7 @@ def default_free(law: Law, absolute: bool = False) -> tuple[str, ...]:
 
 def _unknown_field(law: Law, field: str, known: list[str]) -> str:
     """What is wrong with a field that is not free."""
-    name = type(law).__name__
+    name = type(plain_law(law)).__name__
     if isinstance(value_of(law, field), (float, tuple)):
         return (
             f"Argument `free` must not hold `{field}`: it is a fixed number of this {name}; "
@@ -527,8 +528,8 @@ def placed(law: Law, scenes: Scene) -> tuple[Law, Scene]:
 
 
 def plain_law(law: Any) -> Any:
-    """The law without parts of a scene."""
-    return law.law if isinstance(law, LawInScene) else law
+    """The law without parts of a scene or a motion."""
+    return law.law if isinstance(law, LawInScene | LawInMotion) else law
 
 
 def with_parts_of_scene(law: Law, scene: Scene | None, own_scenes: bool, free: Any) -> Law:

@@ -81,12 +81,13 @@ class LawFits(Tabular):
     """The result of `fit_laws`: `entries` by name, the simplest adequate law first.
 
     `left_out` says by name why a law was not tried; `speed` whether the first law's e depends on
-    the speed, if requested.
+    the speed, if requested, and `speed_fit` is the fit of its exponent.
     """
 
     entries: dict[str, LawFit]
     left_out: dict[str, str] = field(default_factory=dict)
     speed: "NestedTest | None" = None
+    speed_fit: Fit | None = None
 
     @property
     def best(self) -> LawFit:
@@ -116,7 +117,8 @@ class LawFits(Tabular):
     def to_dict(self) -> dict[str, Any]:
         """What a JSON file can hold."""
         record = {"best": self.best.name, "verdict": self.verdict, "left_out": self.left_out}
-        return record | as_data({"laws": self.entries, "speed": self.speed})
+        speed = {"speed": self.speed, "speed_fit": self.speed_fit}
+        return record | as_data({"laws": self.entries} | speed)
 
     def __str__(self) -> str:
         fits = [entry.fit for entry in self.entries.values()]
@@ -127,6 +129,12 @@ class LawFits(Tabular):
         notes += [f"{name} is left out: it {reason}" for name, reason in self.left_out.items()]
         if self.speed is not None:
             notes.append(f"Restitution that depends on the speed ({self.best.name}): {self.speed}")
+        if self.speed_fit is not None:
+            tier, against = _against(self.speed_fit)
+            so = "the data then fit" if tier == "fits" else f"still {against}"
+            found = zip(self.speed_fit.names, self.speed_fit.value, self.speed_fit.standard_error)
+            values = ", ".join(f"{name} = {x:.4g} ± {error:.2g}" for name, x, error in found)
+            notes.append(f"With it {values}: {so}.")
         columns = (*_COLUMNS, Column("values"))
         return str(Table(columns, rows, head=[self.verdict, ""], notes=notes))
 
@@ -294,11 +302,11 @@ def fit_laws(
         if needs_profiles(fits[best]):
             fits[best] = replace(fits[best], profiles=profile(fits[best], progress=False))
             entries[best] = replace(entries[best], fit=fits[best])
-        test = None
+        test = of_speed = None
         if speed:
             show(f"fit_laws: {best}, dependence on the speed", len(candidates), len(candidates))
-            test = _speed_test(fits[best], candidates[best], scene, data, options)
-    return LawFits(entries, left_out, test)
+            test, of_speed = _speed_test(fits[best], candidates[best], scene, data, options)
+    return LawFits(entries, left_out, test, of_speed)
 
 
 Candidate = tuple[Law, Any]  # and what is free in it
@@ -511,15 +519,15 @@ def _aicc(result: Fit) -> float:
 
 def _speed_test(
     constant: Fit, candidate: Candidate, scene: Scene | None, data: Experiments, options: Any
-) -> NestedTest | None:
-    """Whether e depends on the speed; None of a law without e, or of shots equally fast."""
+) -> tuple[NestedTest | None, Fit | None]:
+    """Whether e depends on the speed, and how; None of a law without e, or of one speed."""
     law, free = candidate
     known, speeds = free_parameters_of(law), data.approach_speed(scene)
     speeds = speeds[speeds > 0]
     constant_e = "restitution" in known and not known.keys() & set(OF_SPEED)
     if not constant_e or len(speeds) < 2 or np.ptp(speeds) == 0:
-        return None
+        return None, None
     typical = float(np.exp(np.mean(np.log(speeds))))
     falling = VelocityDependent(law, speed_exponent=SPEED_EXPONENT, reference_speed=typical)
     full = fit(falling, scene, data, {**free, "speed_exponent": True}, **options)
-    return nested_test(constant, full) if full.rank > constant.rank else None
+    return (nested_test(constant, full), full) if full.rank > constant.rank else (None, None)

@@ -1,5 +1,6 @@
 """Restitution that depends on the speed of the approach: an option of every law that has an e."""
 
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import jax
@@ -11,19 +12,43 @@ from jimpact.core.law import (
     Impulses,
     Law,
     OptionalValues,
+    StaticNumbers,
     Values,
     forwards_to_law,
     free_parameters_of,
+    option,
     parameter,
     with_parameter,
 )
 from jimpact.core.registry import REGISTRY
 from jimpact.events.impact_dynamics import Dynamics
 from jimpact.numerics.tridiagonal import as_matrix, diagonal
-from jimpact.tools.checks import as_float_array, check_kind
+from jimpact.tools.checks import as_float_array, check_kind, check_values
 from jimpact.tools.compiling import full_precision
 from jimpact.tools.loops import while_loop
 from jimpact.tools.precision import precision
+
+# Speeds [m/s] at which a user's function of the speed is tried once.
+TRIED = (0.1, 1.0, 10.0)
+
+
+def _curve(value: Any) -> Any:
+    """A function of the speed, or a table of it as two tuples: speeds, values."""
+    if value is None or callable(value):
+        return value
+    pair = [np.asarray(as_float_array("curve", each), float) for each in value]
+    if len(pair) != 2 or pair[0].ndim != 1 or pair[0].shape != pair[1].shape or len(pair[0]) < 2:
+        raise ValueError(
+            "Argument `curve` must be a function of the speed, or (speeds, values) of two or more "
+            f"rows, but has shapes {[each.shape for each in pair]}."
+        )
+    for each in pair:
+        check_values("curve", each, low=0.0)
+    if not (np.diff(pair[0]) > 0).all():
+        raise ValueError(
+            f"Argument `curve` must have speeds that rise, but has {pair[0].tolist()}."
+        )
+    return tuple(StaticNumbers(each.tolist()) for each in pair)
 
 
 @forwards_to_law
@@ -35,13 +60,18 @@ class VelocityDependent(Law):
     yield speed comes back whole, and e_j^2 of what exceeds it; with v_y = 0 it is a power law (k
     about 1/4 for metals well above their yield, 1/5 of 1 - e for viscoelastic spheres). v is the
     fastest approach of all contacts that contact j is coupled with: one at rest, which an impact
-    elsewhere loads, is as lossy as the others.
+    elsewhere loads, is as lossy as the others. With a `curve` c, f = min(1, e_j c(v)): of a law
+    with e = 1 it is e itself.
 
     Args:
         law: with `restitution` e_j, scalar or (m,): its value at `reference_speed`.
         speed_exponent: k in [-1, 1], scalar or (m,); None: no power law.
         yield_speed: v_y >= 0, scalar or (m,) [m/s]; None: no yield.
         reference_speed: v_ref > 0 [m/s], where e_j holds; cannot be fitted together with e_j and k.
+        curve: in the place of the power law: a table (speeds [m/s], values), between whose rows c
+            is linear, and constant beyond its ends; or a function of an array of speeds, in jnp,
+            the same object in each call, or all compiles anew. It is no parameter: a fit scales
+            it by e_j.
 
     Status: that of the law. Derivatives: forward and reverse; one-sided where e reaches 1 and where
     two contacts approach equally fast. In `yield_speed` at 0 the slope is 0: start a fit above.
@@ -56,6 +86,9 @@ class VelocityDependent(Law):
     >>> pair = ji.chain([1.0, 1.0])
     >>> [round(float(ji.impact(law, pair, [v, 0.0]).velocity[1] / v), 4) for v in (0.005, 16.0)]
     [1.0, 0.625]
+    >>> table = ji.VelocityDependent(ji.Newton(1.0), curve=([0.5, 1.0, 4.0], [0.9, 0.8, 0.5]))
+    >>> [round(float(e), 2) for e in table.restitution_at([0.1, 0.75, 2.5])]
+    [0.9, 0.85, 0.65]
     """
 
     joins_step: ClassVar[bool] = False  # its e is not a field
@@ -64,6 +97,7 @@ class VelocityDependent(Law):
     speed_exponent: OptionalValues = parameter(low=-1.0, high=1.0, default=None, kw_only=True)
     yield_speed: OptionalValues = parameter(low=0.0, default=None, kw_only=True)
     reference_speed: Values = parameter(low=0.0, open_low=True, default=1.0, kw_only=True)
+    curve: Any = option(None, converter=_curve)
 
     def __check_init__(self) -> None:
         """Raise a TypeError for a law without e, or that depends on the velocity already."""
@@ -76,6 +110,10 @@ class VelocityDependent(Law):
                 "Argument `law` must have `restitution`, one number or one per contact, but is "
                 f"{type(self.law).__name__}."
             )
+        if self.curve is not None and self.speed_exponent is not None:
+            raise ValueError("Arguments `curve` and `speed_exponent` must not both be given.")
+        if callable(self.curve):
+            _check_function(self.curve)
 
     @property
     def friction(self) -> jax.Array | None:
@@ -99,6 +137,9 @@ class VelocityDependent(Law):
             falls = e * ratio**-self.speed_exponent <= most
             falling = e * jnp.where(falls, ratio, 1.0) ** -self.speed_exponent
             power = jnp.where(falls, falling, most)
+        elif self.curve is not None:
+            power = e * self._curve_at(safe)
+            power = jnp.where(power <= most, power, most)
         if self.yield_speed is None:
             return power
         yields = safe >= self.yield_speed
@@ -106,6 +147,13 @@ class VelocityDependent(Law):
         some = moving & (y > 0)  # the root has no slope at 0
         square = jnp.where(some, y**2 + (1 - y**2) * power**2, 1.0)
         return jnp.where(some, jnp.sqrt(square), power)
+
+    def _curve_at(self, v: jax.Array) -> jax.Array:
+        """The curve at speeds v."""
+        if callable(self.curve):
+            return jnp.asarray(self.curve(v), v.dtype)
+        speeds, values = (jnp.asarray(each, v.dtype) for each in self.curve)
+        return jnp.interp(v, speeds, values)
 
     @full_precision
     def impulses(self, contact: Contact) -> Impulses:
@@ -121,6 +169,18 @@ class VelocityDependent(Law):
         restitution = self._at(approach_speed(contact))
         law: Law = with_parameter(self.law, "restitution", restitution)
         return law
+
+
+def _check_function(curve: Callable[[Any], Any]) -> None:
+    """Raise a ValueError for a function that gives no e at some speeds."""
+    speeds = jnp.asarray(TRIED)
+    values = as_float_array("curve", curve(speeds))
+    if values.shape != speeds.shape:
+        raise ValueError(
+            f"Argument `curve` must give an array of the shape of the speeds, {speeds.shape}, but "
+            f"gives {values.shape}."
+        )
+    check_values("curve", values, low=0.0)
 
 
 def approach_speed(contact: Contact) -> jax.Array:
@@ -160,6 +220,7 @@ def make_velocity_dependent(
     speed_exponent: Any = None,
     yield_speed: Any = None,
     reference_speed: Any = 1.0,
+    curve: Any = None,
     stiffness: Any = None,
     exponent: Any = None,
     friction: Any = None,
@@ -184,4 +245,5 @@ def make_velocity_dependent(
         speed_exponent=speed_exponent,
         yield_speed=yield_speed,
         reference_speed=reference_speed,
+        curve=curve,
     )

@@ -43,7 +43,10 @@ from .impulse_ratios import (
     distributing_rule as distributing_rule,
     precompression_energy as precompression_energy,
 )
-from .materials import hertz_stiffness as hertz_stiffness
+from .materials import (
+    hertz_stiffness as hertz_stiffness,
+    pair_restitution as pair_restitution,
+)
 from .quasi_velocities import (
     ContactPower as ContactPower,
     contact_power as contact_power,

@@ -1,11 +1,21 @@
-"""Material data to contact stiffness: Hertz's elastic spheres and planes."""
+"""Material data of two bodies to stiffness (Hertz) and restitution of their contact."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from jimpact.tools.checks import as_float_array, check_values
+from jimpact.tools.checks import as_float_array, check_choice, check_values
+
+# What engines make of the coefficients of two materials
+_RULES: dict[str, Callable[[jax.Array, jax.Array], jax.Array]] = {
+    "product": lambda e1, e2: e1 * e2,
+    "mean": lambda e1, e2: (e1 + e2) / 2,
+    "geometric_mean": lambda e1, e2: jnp.sqrt(e1 * e2),
+    "minimum": jnp.minimum,
+    "maximum": jnp.maximum,
+}
 
 
 def hertz_stiffness(
@@ -61,3 +71,60 @@ def hertz_stiffness(
     compliance = (1 - nu1**2) / e1 + (1 - nu2**2) / e2
     curvature = 1 / r1 + 1 / r2
     return 4 / 3 / (compliance * jnp.sqrt(curvature))
+
+
+def pair_restitution(
+    first: Any, second: Any, rule: str, stiffness: Any = None, stiffness2: Any = None
+) -> jax.Array:
+    """Restitution e of a contact from those of its two materials.
+
+    Equation: rule 'energy' is `e^2 = (e1^2 / k1 + e2^2 / k2) / (1 / k1 + 1 / k2)`. The bodies are
+    in series: at the same force F a deformation `x_i` proportional to `1 / k_i` gives body i the
+    share `(1 / k_i) / (1 / k1 + 1 / k2)` of the energy of compression, of which it returns `e_i^2`.
+    So a soft body decides, and equal bodies keep their e. The other rules are those of physics
+    engines, and have no derivation: 'product', 'mean', 'geometric_mean', 'minimum', 'maximum'.
+
+    Args:
+        first: e1 in [0, 1] of a material against itself (or against a rigid body).
+        second: e2 in [0, 1].
+        rule: one of the six names; there is no default, as they differ.
+        stiffness: k1 > 0 of the first body, for rule 'energy' only; in a Hertz contact
+            `E / (1 - nu^2)`. Only the ratio k1 / k2 matters.
+        stiffness2: k2 > 0; `inf` for a rigid body, which stores no energy, of either.
+
+    Returns:
+        e, of the common shape. Derivatives: of the geometric mean infinite at e = 0, of minimum and
+        maximum one-sided at equal values.
+
+    Raises:
+        ValueError: another rule, e outside [0, 1], stiffnesses not positive, missing, or given for
+            a rule that has none, both infinite.
+
+    Source: Coaplen, Stronge and Ravani, Int. J. Impact Engineering 30 (2004), 581 (energy).
+
+    >>> import jimpact as ji
+    >>> round(float(ji.theory.pair_restitution(0.9, 0.5, "geometric_mean")), 4)
+    0.6708
+    >>> stiff, soft = 100e9, 1e9
+    >>> round(float(ji.theory.pair_restitution(0.9, 0.5, "energy", stiff, soft)), 4)
+    0.5055
+    """
+    check_choice("rule", rule, (*_RULES, "energy"))
+    e1, e2 = as_float_array("first", first), as_float_array("second", second)
+    for name, e in (("first", e1), ("second", e2)):
+        check_values(name, e, low=0.0, high=1.0)
+    given = [
+        name for name, k in (("stiffness", stiffness), ("stiffness2", stiffness2)) if k is not None
+    ]
+    if rule != "energy":
+        if given:
+            raise ValueError(f"Argument `{given[0]}` must be left out for rule {rule!r}.")
+        return _RULES[rule](e1, e2)
+    if len(given) < 2:
+        raise ValueError("Arguments `stiffness` and `stiffness2` must be given for rule 'energy'.")
+    k1, k2 = as_float_array("stiffness", stiffness), as_float_array("stiffness2", stiffness2)
+    for name, k in (("stiffness", k1), ("stiffness2", k2)):  # infinite: rigid
+        check_values(name, jnp.minimum(k, jnp.finfo(k.dtype).max), low=0.0, open_low=True)
+    check_values("stiffness", jnp.minimum(k1, k2))  # one of them is finite
+    share = 1 / (1 + k1 / k2)  # of the energy, that of the first body
+    return jnp.sqrt(share * e1**2 + (1 - share) * e2**2)

@@ -8,7 +8,7 @@ import numpy as np
 from jimpact.fits.shots_file import ANGULAR, LINEAR
 from jimpact.tools.checks import as_float_array, check_concrete, check_values
 from jimpact.tracks.arcs import Arcs, fit_arcs
-from jimpact.tracks.judging import findings, findings_of_input
+from jimpact.tracks.judging import findings, findings_of_input, findings_of_signs
 from jimpact.tracks.segments import (
     SMALLEST_JUMP,
     common_acceleration,
@@ -71,14 +71,16 @@ def find_impacts(
     """
     t, q, names = _checked(t, q, shortest, units)
     n = q.shape[1]
-    notes = findings_of_input(t, q, names)
-    q = _unwrapped(q, names)
+    raw, q = q, _unwrapped(q, names)
     given = noise(q) if sigma is None else _of_coordinates("sigma", sigma, n)
     check_values("sigma", given, low=0.0, open_low=True)
+    notes = findings_of_input(raw, given, names)
     known = None if acceleration is None else _of_coordinates("acceleration", acceleration, n)
     for name, value in (("contact", contact), ("window", 1.0 if window is None else window)):
         check_values(name, np.asarray(value, float), low=0.0, open_low=name == "window")
     x = t - t.mean()
+    if known is not None:
+        notes += findings_of_signs(x, q, given, known, shortest)
     flights, a = flights_and_acceleration(x, q, given, known, shortest)
     flights = [f for f in flights if x[f[-1]] - x[f[0]] > contact]
     if not flights:
@@ -141,7 +143,8 @@ def _checked(t: Any, q: Any, shortest: int, units: Any) -> tuple[np.ndarray, np.
 def _of_coordinates(name: str, value: Any, n: int) -> np.ndarray:
     """A number for all coordinates, or one for each, as (n,)."""
     check_concrete(name, value)
-    array = np.asarray(as_float_array(name, value), float)
+    as_float_array(name, value)  # raises for what are no numbers
+    array = np.asarray(value, float)
     if array.shape not in ((), (n,)):
         raise ValueError(
             f"Argument `{name}` must be a number or have shape ({n},), one for each coordinate, "

@@ -1,9 +1,12 @@
 """Whether a track is one of ballistic flights: what its residuals and its frames show."""
 
+from itertools import pairwise
+
 import numpy as np
 from scipy.stats import chi2, norm
 
 from jimpact.tracks.arcs import Arcs
+from jimpact.tracks.segments import LOOK_BACK, cost_of_flights, curvature
 
 # Chance that a good track has a warning: half by curvatures, half by sizes of residuals. Ten times
 # more would warn of one good track in ten.
@@ -16,9 +19,16 @@ AT_AN_END = 2
 # Share of the moving frames that repeat the one before to the last digit; noise does it hardly
 # ever, but for positions in whole pixels.
 DOUBLED = 0.05
+# Error of an angle [rad], 6 degrees, from which on degrees are suspected: trackers have a tenth of
+# it and less. Ten times more is half a turn; ten times less would warn of many good tracks.
+COARSE_ANGLE = 0.1
+# chi^2 by which an impact must explain frames better than one parabola without it; by chance one
+# impact in a thousand gains less. Ten times more would doubt soft impacts; ten times less, and
+# drag or a wrong acceleration would pass as impacts.
+LEAST_GAIN = 10.8
 
 
-def findings_of_input(t: np.ndarray, q: np.ndarray, units: tuple[str, ...]) -> list[str]:
+def findings_of_input(q: np.ndarray, sigma: np.ndarray, units: tuple[str, ...]) -> list[str]:
     """What is suspect in the frames, before anything is fitted."""
     found, seen = [], np.isfinite(q).all(axis=1)
     places = q[seen]
@@ -38,12 +48,41 @@ def findings_of_input(t: np.ndarray, q: np.ndarray, units: tuple[str, ...]) -> l
                 f"Coordinate {c + 1} turns by more than a quarter of a turn from frame to frame: "
                 "is it in degrees, or do the frames miss turns?"
             )
+        elif sigma[c] > COARSE_ANGLE:
+            found.append(
+                f"Coordinate {c + 1} has a standard error of {sigma[c]:.2g} rad, or "
+                f"{np.degrees(sigma[c]):.0f} degrees: is it in degrees?"
+            )
+    return found
+
+
+def findings_of_signs(
+    t: np.ndarray, q: np.ndarray, sigma: np.ndarray, acceleration: np.ndarray, shortest: int
+) -> list[str]:
+    """Coordinates that curve the other way than their known acceleration, as y of pixels does.
+
+    By the cost of the flights of the first frames; only where their curvature has the other sign.
+    """
+    some, found = slice(0, LOOK_BACK), []
+    seen = np.isfinite(q[some]).any(axis=0).all()
+    measured = curvature(t[some], q[some], shortest) if seen else np.zeros(len(acceleration))
+    for c in np.flatnonzero(measured * acceleration < 0):
+        other = np.where(np.arange(len(acceleration)) == c, -acceleration, acceleration)
+        stated, mirrored = (
+            cost_of_flights(t[some], q[some], sigma, a, shortest) for a in (acceleration, other)
+        )
+        if mirrored < stated:
+            found.append(
+                f"Coordinate {c + 1} curves the other way than an acceleration of "
+                f"{acceleration[c]:.4g}: does it point down, as y of pixels? Then take -q of it."
+            )
     return found
 
 
 def findings(t: np.ndarray, q: np.ndarray, sigma: np.ndarray, arcs: Arcs) -> list[str]:
     """What is wrong with a fitted track, a sentence each."""
     found = [*_of_curvatures(t, sigma, arcs), *_of_sizes(arcs), *_unused(t, q, arcs)]
+    found += _of_bends(t, q, sigma, arcs)
     if len(arcs.instants) == 2:
         found.insert(0, "No impact was found: one flight explains all frames within sigma.")
     return found
@@ -76,6 +115,26 @@ def _of_curvatures(t: np.ndarray, sigma: np.ndarray, arcs: Arcs) -> list[str]:
             f"{excess[i, c]:.3g} ± {error[i, c]:.2g} beyond that of the fit. Perhaps {why}."
         )
     return found
+
+
+def _of_bends(t: np.ndarray, q: np.ndarray, sigma: np.ndarray, arcs: Arcs) -> list[str]:
+    """Impacts without which a parabola of another acceleration explains both flights as well."""
+    doubtful = []
+    for k, both in enumerate(map(np.concatenate, pairwise(arcs.members)), 1):
+        with_impact, without = np.nansum(arcs.residual[both] ** 2), 0.0
+        for c, scale in enumerate(sigma):
+            ok = both[np.isfinite(q[both, c])]
+            curve = np.linalg.qr(np.vander(t[ok] - t[ok].mean(), 3))[0]
+            rest = q[ok, c] - curve @ (curve.T @ q[ok, c])
+            without += float(rest @ rest) / scale**2
+        if without < with_impact + LEAST_GAIN:
+            doubtful.append(str(k))
+    if not doubtful:
+        return []
+    return [
+        f"Impact {', '.join(doubtful)} may be none: a flight of another acceleration explains its "
+        "frames as well. Perhaps drag, a rolling shutter, or the acceleration is wrong."
+    ]
 
 
 def _of_sizes(arcs: Arcs) -> list[str]:

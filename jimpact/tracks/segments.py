@@ -43,6 +43,26 @@ def flights_of(
     t: np.ndarray, q: np.ndarray, sigma: np.ndarray, acceleration: np.ndarray, shortest: int
 ) -> list[np.ndarray]:
     """The frames of each flight, at least `shortest` seen in every coordinate."""
+    _, come = _partition(t, q, sigma, acceleration, shortest)
+    ends = [len(q)]
+    while ends[-1] > 0:
+        ends.append(int(come[ends[-1]]))
+    pairs = list(zip(ends[1:], ends))[::-1]
+    flights = [np.arange(i, j) for i, j in pairs if j - i >= shortest]
+    return _joined(t, q, sigma, acceleration, flights, price(*q.shape))
+
+
+def cost_of_flights(
+    t: np.ndarray, q: np.ndarray, sigma: np.ndarray, acceleration: np.ndarray, shortest: int
+) -> float:
+    """What the cheapest partition costs: chi^2, the prices of flights and of lost frames."""
+    return float(_partition(t, q, sigma, acceleration, shortest)[0][-1])
+
+
+def _partition(
+    t: np.ndarray, q: np.ndarray, sigma: np.ndarray, acceleration: np.ndarray, shortest: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Cost (T + 1,) of the frames before each, and where their last flight begins."""
     frames, n = q.shape
     good = np.isfinite(q)
     lost, start = chi2.isf(LOST_SHARE, n) * good.any(axis=1), price(frames, n)
@@ -57,12 +77,7 @@ def flights_of(
         k = int(np.argmin(total))
         if total[k] + start < best[j]:
             best[j], come[j] = total[k] + start, first + k
-    ends = [frames]
-    while ends[-1] > 0:
-        ends.append(int(come[ends[-1]]))
-    pairs = list(zip(ends[1:], ends))[::-1]
-    flights = [np.arange(i, j) for i, j in pairs if j - i >= shortest]
-    return _joined(t, q, sigma, acceleration, flights, start)
+    return best, come
 
 
 def _costs(
@@ -129,17 +144,21 @@ def flights_and_acceleration(
     """Flights, and the acceleration (n,): known, or the one that all have in common."""
     if known is not None:
         return flights_of(t, q, sigma, known, shortest), known
-    # second differences over so many frames, of which most lie in one flight
-    step = max(shortest, 2)
-    step = step if len(q) > 2 * step else 1
-    second = q[2 * step :] - 2 * q[step:-step] + q[: -2 * step]
-    acceleration = np.nanmedian(second, axis=0) / (step * np.median(np.diff(t))) ** 2
+    acceleration = curvature(t, q, shortest)
     flights: list[np.ndarray] = []
     for _ in range(ROUNDS):
         flights = flights_of(t, q, sigma, acceleration, shortest)
         if flights:
             acceleration = common_acceleration(t, q, flights)
     return flights, acceleration
+
+
+def curvature(t: np.ndarray, q: np.ndarray, shortest: int) -> np.ndarray:
+    """A first value (n,) of the acceleration: the median of second differences."""
+    step = max(shortest, 2)  # over so many frames, of which most lie in one flight
+    step = step if len(q) > 2 * step else 1
+    second = q[2 * step :] - 2 * q[step:-step] + q[: -2 * step]
+    return np.nanmedian(second, axis=0) / (step * np.median(np.diff(t))) ** 2
 
 
 def common_acceleration(t: np.ndarray, q: np.ndarray, flights: list[np.ndarray]) -> np.ndarray:

@@ -111,7 +111,8 @@ class Track:
                 far from 0 [m].
 
         Raises:
-            ValueError: no impact, or none that the contacts can have made; as `Body.scenes`.
+            ValueError: no impact, or none that the contacts can have made; a body in space, whose
+                angular velocity is no rate of coordinates; as `Body.scenes`.
         """
         if not self.impacts:
             raise ValueError("No impact was found in the track: there are no shots.")
@@ -119,6 +120,13 @@ class Track:
         if scene is not None:
             check_kind("scene", scene, Scene | Body)  # type: ignore[arg-type]
             check_values("near", np.asarray(near, float), low=0.0)
+            if isinstance(scene, Body) and scene.coordinates is not None:
+                raise ValueError(
+                    "Argument `scene` must not be a body in space: its angular velocity is no rate "
+                    "of coordinates. Fit its places alone (`find_impacts` of x, y, z), take the "
+                    "turning from orientations yourself, and give `ji.Experiments` the scenes of "
+                    "`body.scenes(poses)`."
+                )
             at = _scenes(scene, np.array([each.q for each in self.impacts]), near)
             possible = [s is not None and _can_be_of(s, i) for s, i in zip(at, self.impacts)]
             kept = np.flatnonzero(possible)

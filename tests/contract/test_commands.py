@@ -62,6 +62,12 @@ def test_a_study_knows_priors_and_names_of_entries(tmp_path):
         ji.read_study(written(tmp_path, text.replace('"restitution[2]"', '"frictoin[2]"'), shots))
 
 
+def test_a_study_of_a_motion_may_fit_its_start(tmp_path):
+    path = tmp_path / "study.toml"
+    path.write_text(MOTION + '[fit]\nfree = ["restitution", "q0", "floor"]\n')
+    assert list(ji.read_study(path).free) == ["restitution", "q0", "floor"]
+
+
 def test_fit_of_a_study(tmp_path, capsys):
     picture = tmp_path / "deep" / "a.svg"
     options = ["--out", picture, "--seed", "1"]

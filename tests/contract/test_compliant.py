@@ -439,6 +439,23 @@ def test_a_contact_that_is_compressed_twice():
     assert [text.get_text() for text in marks] == ["O", "M1", "R1", "M2", "B"]
 
 
+def test_restitution_of_two_materials_in_series():
+    """Energy: by the work of two springs in series that unload with e^2 of their own energy."""
+    e1, e2, k1, k2, force = 0.9, 0.4, 3.0, 7.0, 2.0
+    stored = np.array([force**2 / k1, force**2 / k2]) / 2
+    expected = np.sqrt(stored @ [e1**2, e2**2] / stored.sum())
+    rule = ji.theory.pair_restitution
+    assert float(rule(e1, e2, "energy", k1, k2)) == pytest.approx(expected)
+    assert float(rule(e2, e1, "energy", k2, k1)) == pytest.approx(expected)
+    assert float(rule(e1, e2, "energy", k1, np.inf)) == pytest.approx(e1)
+    assert float(rule(e1, e2, "energy", np.inf, k2)) == pytest.approx(e2)
+    assert float(rule(0.7, 0.7, "energy", k1, k2)) == pytest.approx(0.7)
+    others = {"product": 0.36, "mean": 0.65, "geometric_mean": 0.6, "minimum": 0.4, "maximum": 0.9}
+    for name, value in others.items():
+        assert float(rule(e1, e2, name)) == pytest.approx(value)
+    np.testing.assert_allclose(rule([0.9, 0.1], [0.4, 0.4], "minimum"), [0.4, 0.1])
+
+
 def test_hertz_stiffness_of_the_steel_beads():
     """8 mm beads, E = 216 GPa, nu = 0.276: the constants of the bead column within 0.02 %."""
     radius = 4e-3

@@ -277,6 +277,37 @@ def test_derivatives_of_a_motion_against_differences(given, at, events, step, al
     np.testing.assert_allclose(forward, differences.T, rtol=allowed, atol=allowed / 10)
 
 
+@pytest.mark.slow
+def test_start_gravity_and_floor_of_a_motion_are_fitted_by_name():
+    """A ball over a floor 5 cm above the zero of its heights, in two motions too."""
+    rng, true = np.random.default_rng(0), ji.System(ji.Column([1.0]), gravity=9.7)
+    starts, speeds = np.array([[1.0], [0.8]]), np.array([[0.3], [-0.2]])
+    seen = [ji.simulate(true, ji.Newton(0.8), *x, 1.5, samples=46).q for x in zip(starts, speeds)]
+    seen = np.array(seen) + 0.05
+    seen += 1e-3 * rng.normal(size=seen.shape)
+    ball, guess = ji.System(ji.Column([1.0]), gravity=True), ji.Newton(0.76)
+    free = ("restitution", "q0", "v0", "gravity", "floor")
+    expected = {"restitution": 0.8, "q0[1]": 1.05, "v0[1]": 0.3, "gravity": 9.7, "floor": 0.05}
+    one = ji.fit_motion(ball, guess, seen[0], [1.03], [0.2], 1.5, free, sigma=1e-3)
+    assert one.names == tuple(expected)
+    assert one.rank == 5
+    assert (np.abs(one.value - [*expected.values()]) < 4 * one.standard_error).all()
+    assert isinstance(one.law, ji.Newton)
+    both = ji.fit_motion(
+        *(ball, guess, seen, starts + 0.04, speeds + 0.1, 1.5),
+        {"restitution": True, "v0": True, "q0[2,1]": True, "floor": True, "gravity": True},
+        sigma=1e-3, bounds={"gravity": (9.0, 10.5)},
+    )  # fmt: skip
+    values = dict(zip(both.names, both.value))
+    assert set(values) == {"restitution", "v0[1,1]", "v0[2,1]", "q0[2,1]", "floor", "gravity"}
+    for system, name, words in (
+        (ji.System(ji.Column([1.0])), "gravity", "whose one potential is its weight"),
+        (ji.System(lambda q: q, [1.0]), "floor", "over a floor at rest"),
+    ):
+        with pytest.raises(ValueError, match=f"`{name}` only of .*{words}"):
+            ji.fit_motion(system, guess, np.ones((3, 1)), [1.0], [0.0], 0.3, [name])
+
+
 @pytest.mark.release
 def test_fit_through_a_simulated_motion():
     """Restitutions and stiffness ratio of a cradle, from angles with (simulated) noise."""

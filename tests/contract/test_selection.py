@@ -127,6 +127,54 @@ def test_restitution_by_speed_is_what_it_says():
 
 
 @pytest.mark.release
+def test_restitution_by_a_table_and_by_a_function_of_the_speed():
+    speeds, values = [0.5, 1.0, 4.0], [0.9, 0.8, 0.5]
+    table = ji.VelocityDependent(ji.Newton(0.9), curve=(speeds, values))
+    v = np.array([0.1, 0.75, 2.5, 9.0])
+    np.testing.assert_allclose(table.restitution_at(v), 0.9 * np.interp(v, speeds, values))
+    above = ji.VelocityDependent(ji.Newton(0.9), curve=lambda v: 2.0 / (1.0 + v))
+    np.testing.assert_allclose(above.restitution_at(v), np.minimum(1.8 / (1 + v), 1.0))
+    slope = jax.grad(lambda v: table.restitution_at(v))(2.0)
+    assert float(slope) == pytest.approx(-0.09)
+
+
+def power(v):
+    return 0.8 * v**-0.1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("curve", [power, (PRE[:, 0], power(PRE[:, 0]))])
+def test_a_curve_of_the_speed_in_impacts_their_derivatives_and_fits(curve, tmp_path):
+    law = ji.VelocityDependent(ji.Newton(1.0), curve=curve)
+
+    def struck(v):
+        return ji.impact(law, PAIR, jnp.stack([v, jnp.zeros_like(v)])).velocity[1]
+
+    v = jnp.asarray(PRE[3, 0])
+    e = 0.8 * PRE[3, 0] ** -0.1
+    assert float(jax.jit(struck)(v)) == pytest.approx(PRE[3, 0] * (1 + e) / 3)
+    if callable(curve):  # a table has a kink there
+        assert float(jax.jit(jax.grad(struck))(v)) == pytest.approx((1 + 0.9 * e) / 3)
+    data = ji.Experiments(PRE, after(0.9 * 0.8 * PRE[:, 0] ** -0.1, 1e-6), sigma=0.01)
+    fit = ji.fit(law, PAIR, data)
+    assert fit.value[0] == pytest.approx(0.9, abs=1e-4)
+    if not callable(curve):
+        fit.save(tmp_path / "fit.json")
+        assert ji.load(tmp_path / "fit.json").law.curve == fit.law.curve
+
+
+@pytest.mark.slow
+def test_the_exponent_of_the_speed_is_said_with_its_error():
+    data = ji.Experiments(PRE, after(0.7 * PRE[:, 0] ** -0.1, 0.01), sigma=0.01)
+    laws = ji.fit_laws(PAIR, data, ["newton"], speed=True)
+    assert laws.speed.needed
+    at = laws.speed_fit.names.index("speed_exponent")
+    assert abs(laws.speed_fit.value[at] - 0.1) < 4 * laws.speed_fit.standard_error[at]
+    assert f"speed_exponent = {laws.speed_fit.value[at]:.4g} ± " in str(laws)
+    assert "the data then fit" in str(laws)
+    assert json.loads(json.dumps(laws.to_dict(), allow_nan=False))["speed_fit"]
+
+
 def test_slopes_of_restitution_by_speed_at_its_edges_are_whole():
     """Where e reaches 1, at the yield speed, at e = 0: one side's, not the mean of two."""
 
@@ -173,6 +221,19 @@ def test_a_study_names_the_option(tmp_path):
         (lambda: ji.VelocityDependent(ji.VelocityDependent(ji.Newton(0.5))), "already"),
         (lambda: ji.VelocityDependent(ji.Newton(0.5), speed_exponent=3.0), r"lie in \[-1, 1\]"),
         (lambda: ji.VelocityDependent(ji.Newton(0.5), yield_speed=-1.0), "`yield_speed`"),
+        (lambda: ji.VelocityDependent(ji.Newton(0.5), curve=([1, 2], [0.5])), "`curve`.*two or"),
+        (
+            lambda: ji.VelocityDependent(ji.Newton(0.5), curve=([2, 1], [0.5, 0.5])),
+            "speeds that rise",
+        ),
+        (lambda: ji.VelocityDependent(ji.Newton(0.5), curve=([1, 2], [0.5, -1])), "`curve`.*-1"),
+        (lambda: ji.VelocityDependent(ji.Newton(0.5), curve=lambda v: 1.0), "`curve`.*shape"),
+        (
+            lambda: ji.VelocityDependent(
+                ji.Newton(0.5), speed_exponent=0.1, curve=([1, 2], [0.5, 0.4])
+            ),
+            "must not both",
+        ),
         (
             lambda: ji.REGISTRY["velocity_dependent"].build(base="magic", restitution=0.9),
             "`base` must be one of",

@@ -1,7 +1,10 @@
 """From the camera to a fit: impacts in tracks, bounce times, tables of trackers, bad input."""
 
+import json
+
 import numpy as np
 import pytest
+from commands_cases import call
 
 import jimpact as ji
 
@@ -86,6 +89,35 @@ def test_good_tracks_have_few_warnings_and_bad_ones_have():
         arguments["t"] = np.sort(arguments["t"])
         lines = ji.tracks.find_impacts(**arguments).warnings
         assert any(words in line for line in lines), lines
+
+
+def test_signs_units_and_gravity_that_are_wrong_are_told():
+    rng = np.random.default_rng(14)
+    t, y, first = ball(rng)
+    angle = np.where(t < first, 8.0, -5.0) * (t - first) + 0.005 * rng.normal(size=t.size)
+    for sigma in (1e-3, None):
+        for bad, words in (
+            (dict(q=-y), "curves the other way"),
+            (dict(acceleration=0.0), "may be none"),
+            (dict(q=np.degrees(angle), acceleration=0.0, units="rad"), "degrees"),
+        ):
+            arguments = {"t": t, "q": y, "sigma": sigma, "acceleration": -G} | bad
+            if "units" in bad and sigma:
+                arguments["sigma"] = 0.3
+            lines = ji.tracks.find_impacts(**arguments).warnings
+            assert any(words in line for line in lines), lines
+    both = np.column_stack([0.3 * t, -y])
+    lines = ji.tracks.find_impacts(t, both, 1e-3, acceleration=[0.0, -G]).warnings
+    assert "Coordinate 2 curves the other way" in lines[0]
+    good = ji.tracks.find_impacts(t, np.radians(angle), 1e-4, units="rad")
+    assert good.warnings == ()
+
+
+def test_known_values_are_kept_to_the_last_digit():
+    t, y, _ = ball(np.random.default_rng(1))
+    track = ji.tracks.find_impacts(t, y, sigma=1e-3, acceleration=-G)
+    assert track.acceleration.tolist() == [-G]
+    assert track.sigma.tolist() == [1e-3]
 
 
 def test_gliders_of_unknown_acceleration_and_two_impacts():
@@ -194,6 +226,10 @@ def test_bounce_times_reach_the_bound():
         ({"t": [0.0, 0.1, np.nan, 0.3, 0.4, 0.5]}, "finite"),
         ({"sigma": 0.0}, "sigma"),
         ({"sigma": -1.0}, "sigma"),
+        ({"sigma": np.nan}, "sigma"),
+        ({"sigma": [0.1, 0.1]}, "sigma"),
+        ({"t": [0.0, 0.1, 0.2, 0.2, 0.3, 0.4]}, "rise"),
+        ({"acceleration": np.nan}, "acceleration"),
         ({"q": np.full(6, np.nan)}, "NaN in all"),
         ({"q": np.zeros((5, 1))}, "shapes"),
         ({"units": "deg"}, "'rad'"),
@@ -216,6 +252,13 @@ def test_a_track_without_an_impact_says_so():
     assert "No impact" in str(track)
     with pytest.raises(ValueError, match="No impact"):
         track.experiments()
+
+
+def test_a_body_in_space_is_refused_with_advice():
+    t, q, _ = ball(np.random.default_rng(1), coordinates=3)
+    track = ji.tracks.find_impacts(t, q, 1e-3, acceleration=[0, 0, -G])
+    with pytest.raises(ValueError, match=r"body in space.*body\.scenes"):
+        track.experiments(ji.Box([0.1, 0.1, 0.1]))
 
 
 def test_an_impact_in_the_first_frames_is_told():
@@ -275,3 +318,89 @@ def test_tables_of_trackers_loggers_and_capture_systems(tmp_path):
 def test_a_picture_of_a_track():
     t, y, _ = ball(np.random.default_rng(1))
     assert len(ji.tracks.find_impacts(t, y, acceleration=-G).plot().axes) == 2
+
+
+SEEN = """
+[scene]
+masses_kg = [0.1]
+wall = "left"
+[law]
+name = "Newton"
+restitution = 0.6
+[fit]
+starts = 1
+[track]
+file = "ball.txt"
+columns = "height"
+unit = "cm"
+rate = 120
+acceleration = -9.80665
+"""
+
+
+def written(folder, old="", new=""):
+    """A study of a ball that a camera saw."""
+    _, y, _ = ball(np.random.default_rng(11))
+    (folder / "ball.txt").write_text("height\n" + "\n".join(f"{100 * x:.3f}" for x in y))
+    path = folder / "study.toml"
+    path.write_text(SEEN.replace(old, new))
+    return path
+
+
+def test_a_study_of_a_track_finds_its_impacts(tmp_path):
+    study = ji.read_study(written(tmp_path))
+    (impact,) = study.track.impacts
+    assert abs(restitution(impact)[0] - 0.8) < 5 * restitution(impact)[1]
+    np.testing.assert_allclose(study.experiments.pre[0], impact.pre)
+    np.testing.assert_allclose(study.experiments.covariance[0], impact.covariance)
+    free = ji.read_study(written(tmp_path, "acceleration = -9.80665", 'acceleration = "unknown"'))
+    np.testing.assert_allclose(free.track.acceleration, -G, atol=0.1)
+    assert ji.read_study("ball_track.toml").experiments.pre.shape == (3, 1)
+
+
+@pytest.mark.slow
+def test_the_command_prints_impacts_and_then_the_fit(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert call(capsys, "new", "fit", "seen", "--like", "ball_track.toml")[0] == 0
+    code, said = call(capsys, "fit", "seen")
+    assert code == 0
+    assert said.out.index("impact 3 at") < said.out.index("std. error")
+    assert (tmp_path / "jimpact-fit-seen-track.png").exists()
+    code, said = call(capsys, "fit", "seen", "--json", "--starts", "1")
+    assert len(json.loads(said.out)["track"]["impacts"]) == 3
+
+
+def test_a_study_of_bounces(tmp_path):
+    scene = SEEN[: SEEN.index("[track]")]
+    path = tmp_path / "study.toml"
+    path.write_text(scene + "[bounces]\ntimes = [0.0, 0.5, 0.9, 1.22]\nsigma = 0.001\n")
+    shots = ji.read_study(path).experiments
+    np.testing.assert_allclose(-shots.post / shots.pre, 0.8)
+    assert shots.covariance.shape == (4, 4)
+    path.write_text(scene + "[bounces]\ntimes = [0.0, 0.5, 0.4]\nsigma = 0.001\n")
+    with pytest.raises(ValueError, match=r"\[bounces\].*`times` must rise"):
+        ji.read_study(path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('unit = "cm"\n', "", "the key `unit`"),
+        ('unit = "cm"', 'unit = "px"', "`unit` must be one of"),
+        ("rate = 120", "", "`rate`"),
+        ("rate = 120", 'rate = "fast"', "`rate` in .* must be a number"),
+        ("rate = 120", "framerate = 120", "Did you mean rate"),
+        ('columns = "height"', 'columns = "hight"', "`hight` is missing"),
+        ('columns = "height"', "columns = 3", "`columns` in .* must be a text or a list"),
+        ("acceleration = -9.80665", "acceleration = true", "`acceleration` in"),
+        ("acceleration = -9.80665", "sigma = -1.0", "`sigma` must"),
+        ("acceleration = -9.80665", "contact = -0.1", "`contact` must"),
+        ("acceleration = -9.80665", "shortest = 2", "`shortest` must"),
+        ("acceleration = -9.80665", "near_m = 0.001", "`near_m` in .* for bodies"),
+        ("masses_kg = [0.1]", "masses_kg = [0.1, 0.1]", "`columns` in .* 2 coordinates"),
+        ("rate = 120", 'rate = 120\n[data]\nfile = "x.csv"', r"one table of shots"),
+    ],
+)
+def test_studies_of_tracks_name_the_key_that_is_wrong(tmp_path, old, new, words):
+    with pytest.raises(ValueError, match=words):
+        ji.read_study(written(tmp_path, old, new))

@@ -1,0 +1,86 @@
+"""Shots of a study from what was seen or heard: its tables [track] and [bounces]."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jimpact as ji
+from jimpact.bodies.base import Body
+from jimpact.cli.study_file import check_keys, check_kind
+from jimpact.core.scene import Scene
+from jimpact.fits.data import Experiments
+
+if TYPE_CHECKING:
+    from jimpact.tracks.track import Track
+
+# Keys of [track]: the arguments of `ji.tracks.read` and of `find_impacts`, by their names, and that
+# of `Track.experiments`; of [bounces]: the arguments of `ji.tracks.bounce_times`.
+READ = ("columns", "time", "rate", "unit", "decimal")
+FOUND = ("sigma", "acceleration", "contact", "shortest", "window")
+TRACK = ("file", *READ, *FOUND, "near_m")
+BOUNCES = ("times", "sigma", "gravity")
+UNKNOWN = "unknown"  # what a study writes where an acceleration is None
+_NUMBER, _NUMBERS = (int | float, "a number"), (int | float | list, "a number or a list of numbers")
+_KINDS = {
+    **dict.fromkeys(("file", "time", "decimal"), (str, "a text")),
+    **dict.fromkeys(("columns", "unit"), (str | list, "a text or a list of texts")),
+    **dict.fromkeys(("rate", "contact", "window", "near_m", "gravity"), _NUMBER),
+    **dict.fromkeys(("sigma", "acceleration"), _NUMBERS),
+    **{"shortest": (int, "a whole number"), "times": (list, "a list of numbers")},
+}
+
+
+def track_of(table: Mapping[str, Any], study: Path) -> "Track":
+    """The track that the table [track] describes, with its impacts."""
+    check_keys("[track]", table, TRACK, ("file", "columns", "unit"))
+    choice = dict(table)
+    if choice.get("acceleration") == UNKNOWN:
+        choice["acceleration"] = None
+    _check_kinds("[track]", {key: x for key, x in choice.items() if x is not None})
+    try:
+        t, q = ji.tracks.read(study.parent / choice["file"], **_only(choice, READ))
+        unit = choice["unit"]
+        stated = [unit] * q.shape[1] if isinstance(unit, str) else unit
+        units = ["rad" if each in ("rad", "deg") else "m" for each in stated]
+        return ji.tracks.find_impacts(t, q, units=units, **_only(choice, FOUND))
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"[track]: {error}") from None
+
+
+def shots_of_track(track: "Track", table: Mapping[str, Any], place: Scene | Body) -> Experiments:
+    """The shots of a track, in the scene of the study or in those of the poses of its body."""
+    if isinstance(place, Scene):
+        if "near_m" in table:
+            raise ValueError("`near_m` in [track] is for bodies, which have poses.")
+        if track.q.shape[1] != place.size:
+            raise ValueError(
+                f"`columns` in [track] must be those of {place.size} coordinates, one of "
+                f"each body of the scene, but are {track.q.shape[1]}."
+            )
+    near = {"near": table["near_m"]} if "near_m" in table else {}
+    try:
+        return track.experiments(place, **near)
+    except ValueError as error:
+        raise ValueError(f"[track]: {error}") from None
+
+
+def shots_of_bounces(table: Mapping[str, Any]) -> Experiments:
+    """The shots of bounces that were heard, of the table [bounces]."""
+    check_keys("[bounces]", table, BOUNCES, ("times", "sigma"))
+    _check_kinds("[bounces]", table)
+    try:
+        return ji.tracks.bounce_times(**table)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"[bounces]: {error}") from None
+
+
+def _check_kinds(where: str, table: Mapping[str, Any]) -> None:
+    """Raise a ValueError for a value that is no text, number or list, where its key asks for it."""
+    for key, value in table.items():
+        kind, words = _KINDS[key]
+        check_kind(where, key, None if isinstance(value, bool) else value, kind, words)
+
+
+def _only(table: Mapping[str, Any], keys: tuple[str, ...]) -> dict[str, Any]:
+    """The values of these keys, as far as they are there."""
+    return {key: table[key] for key in keys if key in table}
