@@ -280,7 +280,8 @@ class LawsCommand(Command):
     def run(self) -> int:
         """Print them."""
         from jimpact.cli.starting import laws_as_text
-        from jimpact.cli.study_file import REGISTRY, import_laws
+        from jimpact.cli.study_file import import_laws
+        from jimpact.laws import REGISTRY
 
         if self.module is not None:
             import_laws(self.module, Path())

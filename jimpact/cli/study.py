@@ -26,9 +26,10 @@ from jimpact.core.distributions import Distribution, RandomLaw
 from jimpact.core.law import Law, free_parameters_of
 from jimpact.core.scene import Scene, chain
 from jimpact.fits.data import Experiments, read_experiments
-from jimpact.fits.fitting import Fit, fit
+from jimpact.fits.fitting import fit
 from jimpact.fits.parameters import OF_SPEED, default_free
 from jimpact.fits.problem import FitProblem, of_shots
+from jimpact.fits.report import Fit
 from jimpact.fits.search import Search
 
 if TYPE_CHECKING:

@@ -17,9 +17,9 @@ from jimpact.cli.study_file import (
     without_none,
 )
 from jimpact.core.law import Law
-from jimpact.fits.fitting import Fit
 from jimpact.fits.fitting_motion import MOTION_SEARCH, fit_motion
 from jimpact.fits.parameters import default_free
+from jimpact.fits.report import Fit
 from jimpact.fits.shots_file import UNEVEN_STEPS, Positions, read_positions
 from jimpact.motion.methods import METHODS, Method, as_method
 from jimpact.motion.record import Motion

@@ -9,12 +9,13 @@ from typing import Any
 import jax
 import numpy as np
 
+from jimpact.core.law import AnyLaw
 from jimpact.core.scene import Scene
 from jimpact.fits.checks import Judged, fit_findings, unusable
 from jimpact.fits.data import Experiments
 from jimpact.fits.findings import Finding
 from jimpact.fits.observables import COARSE_RTOL
-from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw
+from jimpact.fits.parameters import DEFAULT_FREE
 from jimpact.fits.problem import FitProblem, of_shots
 from jimpact.fits.profiles import LEVEL, PROFILE_STARTS, needs_profiles, profiles_of
 from jimpact.fits.report import Fit, check_squares
@@ -129,7 +130,8 @@ def fit(
         as_whole(name, count, least)
     check_choice("loss", search.loss, ("squares", *LOSSES))
     if isinstance(law, FitProblem):
-        if not (scene is experiments is bounds is priors is ties is None and free is DEFAULT_FREE):
+        others: tuple[Any, ...] = (scene, experiments, bounds, priors, ties)
+        if free is not DEFAULT_FREE or any(each is not None for each in others):
             raise ValueError(
                 "Arguments `scene`, `experiments`, `free`, `bounds`, `priors` and `ties` must be "
                 "left out where a FitProblem is given, which holds its own."

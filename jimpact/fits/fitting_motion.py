@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact.core.law import Law
-from jimpact.fits.fitting import Fit, fit
+from jimpact.fits.fitting import fit
 from jimpact.fits.observables import Prediction
 from jimpact.fits.parameters import as_names, entry_of
 from jimpact.fits.parts_of_motion import LawInMotion, with_parts_of_motion
 from jimpact.fits.problem import FitProblem
+from jimpact.fits.report import Fit
 from jimpact.fits.search import Search
 from jimpact.motion.methods import as_method
 from jimpact.motion.record import Motion

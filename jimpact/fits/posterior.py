@@ -10,10 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact.core.distributions import Normal, Uniform
-from jimpact.fits.fitting import Fit
 from jimpact.fits.parameters import mean_and_std
 from jimpact.fits.problem import FitProblem
-from jimpact.fits.report import check_squares
+from jimpact.fits.report import Fit, check_squares
 from jimpact.tools.checks import as_whole, check_choice, needed
 from jimpact.tools.compiling import known_options
 

@@ -118,11 +118,11 @@ def _with_error(fit: "Fit", i: int) -> str:
     if np.isnan(error):
         return f"{name} = {value:.5g}, its error unknown"
     text = f"{name} = {value:g}" if fit.at_bound[i] else f"{name} = {with_error(value, error)}"
-    words = fit.profiles[i].words if fit.profiles else ""
     if fit.from_prior[i]:
         return f"{text}, which is its prior"
-    if words.startswith("at ") or " or " in words:
-        return f"{text}, {words} ({100 * fit.profiles[i].level:g} %)"
+    profile = fit.profiles[i] if fit.profiles else None
+    if profile and profile.determines and (any(profile.open_ends) or len(profile.intervals) > 1):
+        return f"{text}, {profile.words} ({100 * profile.level:g} %)"
     return f"{text}{', the end of what is allowed' if fit.at_bound[i] else ''}"
 
 

@@ -12,12 +12,12 @@ from jimpact.core.law import Law, free_parameters_of, with_parameter
 from jimpact.core.registry import REGISTRY, registered_laws, simplest_first
 from jimpact.core.scene import Scene
 from jimpact.fits.data import Experiments
-from jimpact.fits.fitting import Fit, fit, leave_one_out, rms
+from jimpact.fits.fitting import fit, leave_one_out, rms
 from jimpact.fits.matrices import admissible_start
 from jimpact.fits.parameters import OF_SPEED, default_free
 from jimpact.fits.problem import FEW
 from jimpact.fits.profiles import needs_profiles, profile
-from jimpact.fits.report import check_squares, named_values
+from jimpact.fits.report import Fit, check_squares, named_values
 from jimpact.fits.search import Search
 from jimpact.laws.velocity_dependent import VelocityDependent
 from jimpact.tools.checks import check_choice, check_kind

@@ -10,11 +10,11 @@ import numpy as np
 from scipy.linalg import qr
 from scipy.special import ndtri, stdtrit
 
-from jimpact.core.law import parameters_of
+from jimpact.core.law import AnyLaw, parameters_of
 from jimpact.core.scene import Scene
 from jimpact.fits.data import Experiments
 from jimpact.fits.findings import Finding
-from jimpact.fits.parameters import AnyLaw, LawInScene, tied_names, tied_value
+from jimpact.fits.parameters import LawInScene, tied_names, tied_value
 from jimpact.fits.problem import FitProblem
 from jimpact.fits.search import FitMinimum, Solution, solution
 from jimpact.fits.solve import RANK_TOLERANCE, outcome_at
@@ -176,6 +176,16 @@ class Profile:
         """
         return pieces_in_words(self.intervals, self.domain)
 
+    @property
+    def open_ends(self) -> tuple[bool, bool]:
+        """Whether the data leave the parameter unbounded below, and above."""
+        return self.intervals[0][0] <= self.domain[0], self.intervals[-1][1] >= self.domain[1]
+
+    @property
+    def determines(self) -> bool:
+        """Whether the data exclude any value of the domain."""
+        return len(self.intervals) > 1 or not all(self.open_ends)
+
     def __str__(self) -> str:
         return f"{self.name}: {self.words} ({100 * self.level:g} %)"
 
@@ -275,7 +285,7 @@ class FitResult(Solution, Uncertainty, Tabular, Generic[AnyLaw]):
         """(P,) which parameters the data say anything about; the values of others are starts."""
         seen = ~np.isinf(self.standard_error)
         for i, each in enumerate(self.profiles):
-            seen[i] &= each.words != "anything"
+            seen[i] &= each.determines
         return seen
 
     @property
