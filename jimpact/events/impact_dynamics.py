@@ -31,7 +31,7 @@ from jimpact.events.plastic_limit import final_impulses, inspect
 from jimpact.events.run import run
 from jimpact.events.slip import SlipFlow
 from jimpact.numerics.dense import unit
-from jimpact.numerics.derive import Arrays, in_lanes, without_derivatives
+from jimpact.numerics.derive import Arrays, Kind, in_lanes, without_derivatives
 from jimpact.numerics.sparse import Neighbours
 from jimpact.numerics.step_impulses import descent_lengths
 from jimpact.numerics.tangential import TangentialBlock
@@ -246,6 +246,12 @@ class ImpulseProgram:
     def takes_duals(self) -> bool:
         """Whether its arguments may have tangents (see `tangents.py`)."""
         return self.finely
+
+    def results(self, *kinds: Kind) -> tuple[Kind, ...]:
+        """Of the results from leaves of these kinds."""
+        normal = jax.tree.unflatten(self.tree, kinds).gamma
+        one, whole = normal._replace(shape=(1,)), Kind((1,), jnp.dtype(jnp.int32))
+        return normal, normal._replace(shape=(self.sides,)), one, whole, whole
 
     def __call__(self, *leaves: Any) -> tuple[Any, ...]:
         """The results from the leaves of a problem; see the class."""

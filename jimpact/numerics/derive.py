@@ -1,8 +1,10 @@
-"""Lanes and derivatives of programs with loops, by JAX's public API alone.
+"""Lanes and derivatives of programs with loops.
 
 LANES   A function of arrays (.., B) has its batch in the last axis: entries of one impact would
 otherwise be neighbours in memory, and loops over two or three of them do not fill a vector unit.
-`vmap` only makes B longer. One impact is a batch of one: there is no second code path.
+`vmap` only makes B longer. One impact is a batch of one: there is no second code path. The function
+is an operation of JAX: levels of `vmap` (impacts, shots, starts) see its shapes only, and its loop
+is traced once, at the batch that is compiled. Its results are as the function states them.
 
 DERIVATIVES   A loop of unknown length has no reverse mode. So a derivative is the contraction of
 the Jacobian with tangents, which JAX transposes, and the Jacobian is a function of the same form:
@@ -16,13 +18,14 @@ import functools
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.custom_batching import custom_vmap
 from jax.custom_derivatives import SymbolicZero
+from jax.extend.core import Primitive
+from jax.interpreters import batching, mlir
 
 from jimpact.numerics.tangents import TANGENT_AXIS, Dual, dual_like, is_dual, is_smooth, value_of
 from jimpact.tools.compiling import full_precision
@@ -42,6 +45,19 @@ REVERSE_ONLY = (
     "Argument `adjoint` must be 'jacobian' or 'forward' for derivatives in forward mode (jvp, "
     "jacfwd, hessian), but has value 'checkpoints', which has the reverse mode only (grad, vjp)."
 )
+
+
+class Kind(NamedTuple):
+    """Shape of an array but for the batch in its last axis, and type."""
+
+    shape: tuple[int, ...]
+    dtype: Any
+
+    @property
+    def smooth(self) -> bool:
+        """Whether it has derivatives."""
+        return jnp.issubdtype(self.dtype, jnp.inexact)
+
 
 Arrays = tuple[jax.Array, ...]
 Function = Callable[..., Arrays]
@@ -148,6 +164,12 @@ class _WithTangents:
         """Whether its function works through a batch of any size by itself."""
         return _queues(self.function, arrays[: len(self.marked)])
 
+    def results(self, *kinds: Kind) -> Iterator[Kind]:
+        """Those of the function, then those of rates."""
+        at, directions = kinds[: len(self.marked)], kinds[len(self.marked) :]
+        many = directions[0].shape[:1] if self.many else ()
+        return _with_rates(results_of(self.function, *at), many)
+
     def __call__(self, *arrays: jax.Array) -> Arrays:
         """Results and rates."""
         at, directions = arrays[: len(self.marked)], arrays[len(self.marked) :]
@@ -171,6 +193,11 @@ class _WithJacobian:
     def queues(self, *arrays: jax.Array) -> bool:
         """Whether its function works through a batch of any size by itself."""
         return _queues(self.function, arrays)
+
+    def results(self, *kinds: Kind) -> Iterator[Kind]:
+        """Those of the function, then those of rates."""
+        count = sum(math.prod(kind.shape) for kind, mark in zip(kinds, self.marked) if mark)
+        return _with_rates(results_of(self.function, *kinds), (count,))
 
     def __call__(self, *arrays: jax.Array) -> Arrays:
         """Results and rates; those of many directions by one run after the other."""
@@ -199,6 +226,12 @@ class _WithJacobian:
         outs, rates = jax.lax.map(along, unit.reshape(count, size, -1))
         joined = (jnp.concatenate(x)[: sum(sizes)] for x in rates)
         return *(x[0] for x in outs), *joined
+
+
+def _with_rates(results: tuple[Kind, ...], many: tuple[int, ...]) -> Iterator[Kind]:
+    """Kinds of results, then of the rates of the smooth ones, in `many` directions."""
+    yield from results
+    yield from (kind._replace(shape=(*many, *kind.shape)) for kind in results if kind.smooth)
 
 
 def _count_of_values(outs: Arrays) -> int:
@@ -357,40 +390,90 @@ def _queues(function: Any, arrays: Arrays) -> bool:
 @functools.cache
 def _lanes(function: Function) -> Function:
     """`function` compiled; `vmap` makes the last axis of its arrays longer."""
-    compiled = jax.jit(functools.partial(_in_chunks, function))
 
-    @custom_vmap
     def call(*arrays: jax.Array) -> Arrays:
         """Its results."""
-        return tuple(compiled(*arrays))
-
-    @call.def_vmap
-    def wider(size: int, batched: list[bool], *arrays: jax.Array) -> tuple[Arrays, Any]:
-        """The batch of `vmap` becomes part of the last axis, or that of the directions."""
-        count = len(getattr(function, "marked", ()))
-        if isinstance(function, _WithTangents) and not function.many and not any(batched[:count]):
-            # many directions at one point: its steps are computed once
-            along = [
-                x if is_batched else jnp.broadcast_to(x, (size, *x.shape))
-                for x, is_batched in zip(arrays[count:], batched[count:])
-            ]
-            outs = _lanes(dataclasses.replace(function, many=True))(*arrays[:count], *along)
-            values = _count_of_values(outs)
-            return outs, tuple(i >= values for i in range(len(outs)))
-
-        def wide(x: jax.Array, is_batched: bool) -> jax.Array:
-            """An array with both batches in its last axis."""
-            if is_batched:
-                x = jnp.moveaxis(x, 0, -2)
-            else:
-                x = jnp.broadcast_to(x[..., None, :], (*x.shape[:-1], size, x.shape[-1]))
-            return x.reshape(*x.shape[:-2], size * x.shape[-1])
-
-        outs = call(*map(wide, arrays, batched))
-        split = [x.reshape(*x.shape[:-1], size, x.shape[-1] // size) for x in outs]
-        return tuple(jnp.moveaxis(x, -2, 0) for x in split), (True,) * len(split)
+        arrays = tuple(varying_like(arrays, arrays))
+        kinds = results_of(function, *(Kind(x.shape[:-1], x.dtype) for x in arrays))
+        return tuple(_lanes_p.bind(*arrays, function=function, results=kinds))
 
     return call
+
+
+@functools.cache
+def results_of(function: Function, *kinds: Kind) -> tuple[Kind, ...]:
+    """Of the results at arguments of these `kinds`: as the function states them, or by a trace."""
+    if hasattr(function, "results"):
+        return tuple(function.results(*kinds))
+    one = [jax.ShapeDtypeStruct((*kind.shape, 1), kind.dtype) for kind in kinds]
+    return tuple(Kind(x.shape[:-1], x.dtype) for x in jax.eval_shape(_compiled(function), *one))
+
+
+@functools.cache
+def _compiled(function: Function) -> Function:
+    """`function` in chunks, compiled."""
+    return jax.jit(functools.partial(_in_chunks, function))
+
+
+# A function in lanes as one operation: see above.
+_lanes_p = Primitive("lanes")
+_lanes_p.multiple_results = True
+
+
+def _run_lanes(*arrays: jax.Array, function: Function, results: Any) -> Arrays:
+    """The operation as it is compiled, and run."""
+    return tuple(_compiled(function)(*arrays))
+
+
+_lanes_p.def_impl(_run_lanes)
+mlir.register_lowering(_lanes_p, mlir.lower_fun(_run_lanes, multiple_results=True))
+
+
+def _kinds_of_results(*arguments: Any, function: Function, results: Any) -> list[Any]:
+    """What the operation returns: its results with the batch of the arguments."""
+    first = arguments[0]
+    batch = first.shape[-1]
+    return [
+        first.update(shape=(*kind.shape, batch), dtype=kind.dtype, weak_type=False, sharding=None)
+        for kind in results
+    ]
+
+
+_lanes_p.def_abstract_eval(_kinds_of_results)
+
+
+def _longer(
+    arrays: Any, axes: Any, *, function: Function, results: Any
+) -> tuple[Arrays, tuple[Any, ...]]:
+    """The batch of `vmap` becomes part of the last axis, or that of the directions."""
+    batched = [axis is not None for axis in axes]
+    size = next(x.shape[axis] for x, axis in zip(arrays, axes) if axis is not None)
+    arrays = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(arrays, axes)]
+    count = len(getattr(function, "marked", ()))
+    if isinstance(function, _WithTangents) and not function.many and not any(batched[:count]):
+        # many directions at one point: its steps are computed once
+        along = [
+            x if is_batched else jnp.broadcast_to(x, (size, *x.shape))
+            for x, is_batched in zip(arrays[count:], batched[count:])
+        ]
+        outs = _lanes(dataclasses.replace(function, many=True))(*arrays[:count], *along)
+        values = _count_of_values(outs)
+        return outs, tuple(None if i < values else 0 for i in range(len(outs)))
+
+    def wide(x: jax.Array, is_batched: bool) -> jax.Array:
+        """An array with both batches in its last axis."""
+        if is_batched:
+            x = jnp.moveaxis(x, 0, -2)
+        else:
+            x = jnp.broadcast_to(x[..., None, :], (*x.shape[:-1], size, x.shape[-1]))
+        return x.reshape(*x.shape[:-2], size * x.shape[-1])
+
+    outs = _lanes(function)(*map(wide, arrays, batched))
+    split = [x.reshape(*x.shape[:-1], size, x.shape[-1] // size) for x in outs]
+    return tuple(jnp.moveaxis(x, -2, 0) for x in split), (0,) * len(split)
+
+
+batching.primitive_batchers[_lanes_p] = _longer
 
 
 @full_precision
