@@ -4,6 +4,19 @@ LAYOUT   Flows keep the batch in the last axis: matrices (n, n, B), vectors (n, 
 `solve_definite`, `solve_mass_matrix`, `solve_by_pivots`, `singular_values`, `eigenvectors`,
 `null_projector`, `solve_symmetric` and `determinants` have no batch.
 
+WHICH ONE
+
+    solve, inverse          regular by themselves or by a ridge: batches, without pivots
+    solve_definite          symmetric positive definite, one matrix
+    solve_mass_matrix       M, a diagonal or a matrix
+    block_inverse, _solve   blocks of 2 or 3 rows of many contacts
+    solve_by_pivots         any one matrix, with its determinant
+    regularized, _once      singular symmetric ones of redundant contacts
+    pseudoinverse           the same, with the least forces
+    singular_values,        one matrix whose rank is asked for
+    eigenvectors
+    elsewhere               `sparse.conjugate_gradients` for packings, `tridiagonal.py` for chains
+
 LAPACK   Its kernels go through a batch one by one. So they factor single matrices; in batches,
 loops of our own do, up to `_BY_LOOP` rows.
 

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact.numerics.dense import block_inverse, block_solve, load_shares, singular_values, times
+from jimpact.numerics.discs import in_disc, length_of, over
 from jimpact.numerics.interior_points import ATTEMPTS, Best, better, cones_of, within_cones
 from jimpact.numerics.lcp import gathered_rounding
 from jimpact.numerics.many_contacts import solve_many
@@ -217,23 +218,6 @@ def _times(matrix: jax.Array, x: jax.Array) -> jax.Array:
     return jnp.sum(matrix * x[None, None], axis=(2, 3))
 
 
-def _length(vectors: jax.Array) -> jax.Array:
-    """(m, N) of vectors (m, rows, N); its derivative is 0 at 0."""
-    squares = jnp.sum(vectors**2, axis=1)
-    return jnp.where(squares > 0, jnp.sqrt(jnp.where(squares > 0, squares, 1.0)), 0.0)
-
-
-def _over(vectors: jax.Array, length: jax.Array) -> jax.Array:
-    """Vectors (m, rows, N) over (m, N), 0 over 0."""
-    return jnp.where(length > 0, 1 / jnp.where(length > 0, length, 1.0), 0.0)[:, None] * vectors
-
-
-def in_disc(side: jax.Array, radius: jax.Array) -> jax.Array:
-    """The points of discs (m, N) next to `side` (m, rows, N)."""
-    length = _length(side)
-    return jnp.where((length > radius)[:, None], _over(side, length) * radius[:, None], side)
-
-
 def _bound(problem: _FrictionProblem, x: jax.Array) -> jax.Array:
     """mu (p + load) (m, N)."""
     p = jnp.maximum(x[:, 0], 0.0)
@@ -301,10 +285,10 @@ def _turned(problem: _FrictionProblem, modes: _Modes, x: jax.Array) -> _Modes:
         return modes
     slip = _rates(problem, x)[:, 1:]
     pull = slip - x[:, 1:]  # along d where a contact slides, and where it only reaches its cone
-    length, bound = _length(pull), _bound(problem, x)
-    slides = (_length(modes.direction) > 0) & (length > 0)
-    direction = jnp.where(slides[:, None], _over(pull, length), modes.direction)
-    whole = bound + _length(slip)
+    length, bound = length_of(pull), _bound(problem, x)
+    slides = (length_of(modes.direction) > 0) & (length > 0)
+    direction = jnp.where(slides[:, None], over(pull, length), modes.direction)
+    whole = bound + length_of(slip)
     turning = jnp.where(slides & (whole > 0), bound / jnp.where(whole > 0, whole, 1.0), 0.0)
     return modes._replace(direction=direction, turning=turning)
 
@@ -357,8 +341,8 @@ def _enumerate(
     begin = jnp.ones((m, 1, 1), dtype)
     if rows == 2:  # the slip without impulses, if there is some
         begin = problem.rate[:, 1:, None] + 0.0
-        begin = jnp.where(_length(begin)[:, None] > 0, begin, 1.0)
-        begin = _over(begin, _length(begin))
+        begin = jnp.where(length_of(begin)[:, None] > 0, begin, 1.0)
+        begin = over(begin, length_of(begin))
     modes = _Modes(
         jnp.asarray(taking | (not problem.complementary)),
         jnp.asarray(kinds == 0),
@@ -411,10 +395,10 @@ def _at_rest(problem: _FrictionProblem, x: jax.Array, margin: jax.Array) -> _Mod
     pushes = taking & (x[:, :1] >= -margin)
     if problem.load is not None:
         pushes = pushes | (problem.load[:, None] > 0)
-    speed = _length(rate[:, 1:])
+    speed = length_of(rate[:, 1:])
     slides = pushes & (speed > margin)
     sticks = pushes & ~slides & _rubs(problem)
-    direction = jnp.where(slides[:, None], _over(rate[:, 1:], speed), 0.0)
+    direction = jnp.where(slides[:, None], over(rate[:, 1:], speed), 0.0)
     modes = _Modes(taking, sticks, direction, jnp.zeros(speed.shape, x.dtype))
     return _turned(problem, modes, x[..., None])
 
@@ -519,10 +503,10 @@ def _modes_at(problem: _FrictionProblem, x: jax.Array) -> _Modes:
     rate, p = _rates(problem, x), x[:, 0]
     taking = p > rate[:, 0] if problem.complementary else jnp.ones(p.shape, bool)
     pull, bound = rate[:, 1:] - x[:, 1:], _bound(problem, x)
-    length = _length(pull)
+    length = length_of(pull)
     sticks = (length <= bound) & _rubs(problem)
     slides = ~sticks & (bound > 0)
-    direction = jnp.where(slides[:, None], _over(pull, length), 0.0)
+    direction = jnp.where(slides[:, None], over(pull, length), 0.0)
     return _turned(problem, _Modes(taking, sticks, direction, jnp.zeros_like(p)), x)
 
 

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jimpact.numerics.discs import in_disc
 from jimpact.tools.compiling import full_precision
 from jimpact.tools.loops import while_loop
 
@@ -132,10 +133,8 @@ def _scale(diagonal: jax.Array) -> jax.Array:
 def _projected(x: jax.Array, slope: jax.Array, load: jax.Array | None) -> jax.Array:
     """The nearest normal impulses >= 0, and tangential ones (m, b - 1) in their discs."""
     p = jnp.maximum(x[:, :1], 0.0)
-    side, bound = x[:, 1:], slope[:, None] * (p if load is None else p + load[:, None])
-    length = jnp.sqrt(jnp.sum(side**2, axis=1, keepdims=True))
-    shrink = jnp.where(length <= bound, 1.0, bound / jnp.where(length > 0, length, 1.0))
-    return jnp.concatenate([p, side * shrink], axis=1)
+    radius = slope[:, None] * (p if load is None else p + load[:, None])
+    return jnp.concatenate([p, in_disc(x[:, 1:, None], radius)[..., 0]], axis=1)
 
 
 def _with_momentum(at: _At, x: jax.Array, ax: jax.Array, most: Any) -> _At:

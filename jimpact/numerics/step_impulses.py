@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact.numerics.dense import regularized
-from jimpact.numerics.friction import in_disc
+from jimpact.numerics.discs import in_disc
 from jimpact.tools.compiling import full_precision
 from jimpact.tools.precision import precision
 
