@@ -1,5 +1,6 @@
 """Measured shots: velocities before and after impacts, read from CSV files."""
 
+import os
 from collections.abc import Callable, Sequence
 from itertools import zip_longest
 from pathlib import Path
@@ -25,6 +26,7 @@ from jimpact.tools.checks import (
     check_kind,
     check_values,
     in_numbers,
+    short_repr,
 )
 
 # Share of velocities, momenta and readings up to which a difference is rounding, also in files of
@@ -537,6 +539,11 @@ def read_experiments(
     >>> [round(float(v), 4) for v in balls.post[0]]
     [-0.0605, 0.1049, 0.9978]
     """
+    if not isinstance(path, str | os.PathLike):
+        raise TypeError(
+            f"Argument `path` must be the path of a CSV file, but is {short_repr(path)}. Of arrays "
+            "or a table in memory make `Experiments(pre=table[[...]], post=table[[...]])`."
+        )
     values, units, shots = read_shots(path)
     named: dict[str, Any] = {name: values.get(name) for name in _VALUES}
     scenes = _scenes_of(path, values, scene, near)

@@ -263,7 +263,7 @@ def _minima(fit: "Fit") -> list[str]:
         ended = f"{total - lost} of {total} starts ended in this minimum."
         return [" ".join([ended, *unfinished])] if total > 1 else []
     where = f"{count} minima" if fit.rank == len(fit.names) else f"{count} points of one valley"
-    lines = [f"{total} starts ended in {where}:  sum of squares, number of starts, values"]
+    lines = [f"{total - lost} of {total} starts ended in {where}:  sum of squares, starts, values"]
     for minimum in fit.starts[:_MINIMA_SHOWN]:
         values, squares = named_values(fit, minimum.value), minimum.sum_of_squares
         squares = 0.0 if squares <= fit.problem.exact_squares else squares

@@ -154,7 +154,7 @@ class NestedTest(NamedTuple):
         kind, freedom = ("chi^2", self.more) if rest is None else ("F", f"{self.more} and {rest}")
         return (
             f"{', '.join(self.names)} {needed}: {kind} = {self.statistic:.3g} with {freedom} "
-            f"degrees of freedom, p-value {self.chance:.2g}."
+            f"degrees of freedom, p-value {self.chance:.2g} (needed: below {WORSE:g})."
         )
 
     def to_dict(self) -> dict[str, Any]:

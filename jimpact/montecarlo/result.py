@@ -130,17 +130,18 @@ class MonteCarlo(Tabular):
         columns = (
             Column("coordinate", head="[m/s]"),
             Column("mean", ".6f"),
-            Column("standard_error", ".1g", "± error"),
+            Column("standard_error", ".1g", "std. error"),
             Column("std", ".5f"),
             *(Column(f"quantile_{q:g}", ".5f", f"{100 * q:g} %") for q in REPORTED),
-            Column("least", ".5f"),
-            Column("largest", ".5f"),
+            Column("minimum", ".5f"),
+            Column("maximum", ".5f"),
         )
         names = [f"v{i + 1}+" for i in range(len(self.mean))]
         values = self.std, *self.quantile(REPORTED), self.minimum, self.maximum
         rows = [*zip(names, self.mean, self.standard_error, *values)]
         head = [f"{self.samples:,} samples of {self.description}", self._rate(), ""]
-        notes = [f"Quantiles are right to {self.quantile_resolution.max():.2g} m/s.", ""]
+        right = f"Quantiles are right to {self.quantile_resolution.max():.2g} m/s"
+        notes = [f"{right}; std. error: of the mean, std: of one impact.", ""]
         notes += [*self._gap_lines(), *self._status_lines()]
         return Table(columns, rows, head, notes)
 

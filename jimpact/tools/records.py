@@ -17,6 +17,7 @@ from jimpact.tools.checks import needed
 if TYPE_CHECKING:
     from matplotlib.figure import Figure  # which takes long to import
 
+_ROUNDING = 1e-12  # share of a scale that is printed as 0; ten times more hides small velocities
 _LEAST_WIDTH = 20  # characters of a column whose text is wrapped; narrower ones are not readable
 
 
@@ -87,6 +88,26 @@ def readable_unit(unit: str, largest: float) -> tuple[str, float]:
     """
     sizes = {unit: 1.0, f"m{unit}": 1e-3, f"µ{unit}": 1e-6, f"n{unit}": 1e-9}
     return next((row for row in sizes.items() if largest >= row[1]), (f"n{unit}", 1e-9))
+
+
+def counted(count: int, noun: str) -> str:
+    """So many of a thing, in words: the noun in the singular, or with an s at the end.
+
+    >>> from jimpact.tools.records import counted
+    >>> counted(1, "shot"), counted(0, "degree"), counted(12, "start")
+    ('1 shot', '0 degrees', '12 starts')
+    """
+    return f"{count} {noun}{'s' * (count != 1)}"
+
+
+def plain(value: float, scale: float = 1.0) -> float:
+    """0 in the place of what is rounding beside `scale`, so that no report has a -0.
+
+    >>> from jimpact.tools.records import plain
+    >>> plain(-0.0), plain(-1e-17), plain(-0.5)
+    (0.0, 0.0, -0.5)
+    """
+    return 0.0 if abs(value) <= _ROUNDING * abs(scale) else value
 
 
 def with_error(value: float, error: float) -> str:
