@@ -14,6 +14,7 @@ from jimpact.core.scene import Scene, as_velocity, gap_velocity, kinetic_energy,
 from jimpact.numerics.tridiagonal import diagonal
 from jimpact.tools.checks import check_shape
 from jimpact.tools.compiling import full_precision
+from jimpact.tools.records import formatted
 from jimpact.tools.status import STATUS, sign_tolerance
 
 CONSISTENCIES = ("kinematic", "kinetic", "energetic", "momentum")
@@ -165,7 +166,8 @@ def summary(out: Impact, scene: Scene, velocity: Any, names: Sequence[str] = ())
         return "\n".join([f"{codes.size} impacts by status", *rows])
     row = STATUS[int(codes)]
     before = float(kinetic_energy(scene, velocity))
-    remaining = (before + float(out.energy_change)) / before if before else float("nan")
+    change = float(out.energy_change)
+    remaining = (before + change) / before if before else float("nan")
     broken = audit(scene, velocity, out).broken
     words = [f"{name} {'VIOLATED' if name in broken else 'ok'}" for name in CONSISTENCIES]
     reason = nothing_approaches(scene, velocity)
@@ -173,14 +175,15 @@ def summary(out: Impact, scene: Scene, velocity: Any, names: Sequence[str] = ())
     lines = [
         f"status         {row.name}: {row.message}",
         *([f"impact         none: {reason}"] if quiet else []),
-        f"energy         {before:.6g} J before, change {float(out.energy_change):.6g} J "
+        f"energy         {before:.6g} J before, change {formatted(change, '.6g')} J "
         f"({100 * remaining:.4g} % kept)",
         f"audit          {', '.join(words)}",
         f"coordinate          v-             v+   {_unit(scene, names)}",
     ]
     pairs = zip(np.asarray(velocity, float), np.asarray(out.velocity, float))
     for i, (a, b) in enumerate(pairs):
-        lines.append(f"{i + 1:10d} {a:14.6g} {b:14.6g}{f'   {names[i]}' if names else ''}")
+        numbers = f"{formatted(a, '14.6g')} {formatted(b, '14.6g')}"
+        lines.append(f"{i + 1:10d} {numbers}{f'   {names[i]}' if names else ''}")
     lines.append("contact          gamma-         gamma+   [m/s]     impulse [N s]")
     g0, g1 = (
         np.asarray(gap_velocity(scene, velocity)),
@@ -188,5 +191,6 @@ def summary(out: Impact, scene: Scene, velocity: Any, names: Sequence[str] = ())
     )
     for j, (a, b, p, closed) in enumerate(zip(g0, g1, np.asarray(out.impulse), scene.closed)):
         note = "" if closed else "   open: takes no part" if p == 0 else "   open before"
-        lines.append(f"{j + 1:7d} {a:15.6g} {b:14.6g} {p:21.6g}{note}")
+        numbers = f"{formatted(a, '15.6g')} {formatted(b, '14.6g')} {formatted(p, '21.6g')}"
+        lines.append(f"{j + 1:7d} {numbers}{note}")
     return "\n".join(lines)

@@ -28,10 +28,12 @@ from jimpact.tools.checks import (
     in_numbers,
     short_repr,
 )
+from jimpact.tools.records import counted
 
 # Share of velocities, momenta and readings up to which a difference is rounding, also in files of
 # ten digits. Ten times more would take measured shots for corrected ones no more often.
 ROUNDING = 1e-9
+_VELOCITY = ("velocity", "velocities")
 _PRINTED = 4  # shots that `print` shows
 _VALUES = ("pre", "post", "sigma", "sigma_pre", "resolution")
 
@@ -155,9 +157,10 @@ class Experiments(eqx.Module):
         count, n = self.pre.shape
         missing, sigma = int((~self.measured).sum()), self.sigma
         units = ", ".join(dict.fromkeys(self.units))
-        lines = [f"{count} shot{'s' * (count > 1)} of {n} velocities [{units}]"]
+        lines = [f"{counted(count, 'shot')} of {counted(n, *_VELOCITY)} [{units}]"]
         if missing:
-            lines.append(f"{missing} of {self.post.size} velocities after were not measured")
+            was = "was" if missing == 1 else "were"
+            lines.append(f"{missing} of {self.post.size} velocities after {was} not measured")
         known = (
             "not known" if sigma is None else f"{np.nanmin(sigma):.3g} to {np.nanmax(sigma):.3g}"
         )

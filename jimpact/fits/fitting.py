@@ -101,7 +101,8 @@ def fit(
         search: method, loss, limits and progress, see `Search`.
 
     Returns:
-        `Fit`; `print` gives its report, `ji.plot.fit` a picture.
+        `Fit` (`help("jimpact.fits.report.Fit")`); `print` gives its report, `ji.plot.fit` a
+        picture.
 
     Shots whose impact fails at the best parameters, or whose derivatives are not finite or
     absurdly large, are left out, and `Fit.warnings` names them. `Fit.warnings` also says whether
