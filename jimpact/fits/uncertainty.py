@@ -236,8 +236,8 @@ class Predicted(NamedTuple):
         )
         rows = [
             [
-                *(k + 1, i + 1, plain(self.velocity[k, i]), self.standard_error[k, i]),
-                *(plain(self.low[k, i]), plain(self.high[k, i]), self.units[i]),
+                *(k + 1, i + 1, plain(float(self.velocity[k, i])), self.standard_error[k, i]),
+                *(self.low[k, i], self.high[k, i], self.units[i]),
                 STATUS[int(self.status[k])].name if self.status[k] else None,
             ]
             for k, i in np.ndindex(*self.velocity[:_PRINTED_SHOTS].shape)

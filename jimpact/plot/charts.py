@@ -377,9 +377,9 @@ def advice(result: Advice, title: str = "", names: Sequence[str] = ()) -> Figure
     bottom.vlines(x, np.where(np.isnan(median), lowest / 2, median), worst, color=GREY, lw=1)
     bottom.plot(x, worst, "s", color="black", label="worst")
     bottom.plot(x, median, "_", color="black", ms=14, label="median")
-    for i in np.flatnonzero(~beyond[0]):
-        what = "reference" if laws[i] == result.reference else "rounding"
-        write(bottom, (i, lowest), what)
+    for j in np.flatnonzero(~beyond[0]):
+        what = "reference" if laws[j] == result.reference else "rounding"
+        write(bottom, (j, lowest), what)
     bottom.axhline(result.tolerance, color=COLOURS[1], lw=1, label="tolerance")
     bottom.set(yscale="log", ylim=(lowest / 2, 10))
     logarithmic(bottom, "y")
