@@ -122,7 +122,7 @@ class ShotCommand(DrawingCommand):
     study: StudyFile = Path("three_balls.toml")
     """Study file, or the name of a bundled one; its [data] may be missing."""
     velocity: Annotated[tuple[float, ...], _option("V ...")] = ()
-    """Velocities before the impact [m/s], one a body; default: those of a measured shot."""
+    """Velocities before the impact [m/s, rad/s], one a coordinate; default: of a measured shot."""
     shot: int = 1
     """Which measured shot, counted from 1."""
 

@@ -15,6 +15,7 @@ from jimpact.tools.records import readable_unit
 
 _BARS = 30  # of a histogram: each is several pixels wide
 _MEAN_AT, _TOP = 1.12, 1.25  # height of the mean, and of the axis, over that of the highest bar
+_TICKS = 3  # at most, on the axis of a velocity: those of a narrow range have many digits
 _BODIES = 6  # histograms; of more bodies only the most scattered are drawn
 _DOT = 4.0  # area of a sample in the map [points^2]
 _TITLE = 80  # letters of a line of the title
@@ -50,13 +51,13 @@ def monte_carlo(result: MonteCarlo, title: str = "") -> Figure:
     bodies = sorted(scattered[:_BODIES].tolist())
     mapped = result.first["gaps"].shape[1] > 0
     mosaic: Any = [[str(body), "map"] if mapped else [str(body)] for body in bodies]
-    figure = Figure(figsize=(WIDTH, max(4.8, 1.8 * len(bodies))))
+    figure = Figure(figsize=(WIDTH, max(4.8, 2.0 * len(bodies))))
     figure.suptitle(title or textwrap.fill(result.description, _TITLE), x=0.01, ha="left")
     panels = figure.subplot_mosaic(mosaic)
     for body in bodies:
         axes = panels[str(body)]
         _histogram(axes, result, body)
-    axes.set_xlabel(f"velocity after the impact [{result.unit}]\n(dot: mean, bar: 5 % to 95 %)")
+    axes.set_xlabel(f"{axes.get_xlabel()}\n(dot: mean, bar: 5 % to 95 %)")
     if mapped:
         _map(panels["map"], result, int(scattered[0]))
     return figure
@@ -81,7 +82,9 @@ def _histogram(axes: Axes, result: MonteCarlo, body: int) -> None:
     axes.set_ylim(0, _TOP * top)
     label = f"body {body + 1}: mean {mean:.4g}, std {result.std[body]:.2g} {result.unit}"
     axes.set_title(label, fontsize=SMALL, color=colour)
-    axes.set_ylabel("samples [%]")
+    axes.set(xlabel=f"velocity after the impact [{result.unit}]", ylabel="samples [%]")
+    axes.ticklabel_format(axis="x", useOffset=False)
+    axes.locator_params(axis="x", nbins=_TICKS)
     axes.grid(False, axis="x")
 
 

@@ -341,6 +341,10 @@ def test_phase_portrait_of_what_moves():
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("angle [rad]", "angle' [rad/s]")
     jump = axes.lines[1]
     np.testing.assert_array_equal(jump.get_ydata().ravel(), [-2.0, 3.0])
+    (legend,) = axes.figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == ["jump at an event"]
+    unnamed = ji.plot.phase_portrait(found).axes[0].get_xlabel()
+    assert unnamed == "q3  (`system=` or `names=` name it)"
     with pytest.raises(ValueError, match=r"`coordinate` must lie in \[0, 2\], but is 3"):
         ji.plot.phase_portrait(found, 3)
 
