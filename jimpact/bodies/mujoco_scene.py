@@ -9,8 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.core.scene import Scene
+from jimpact.core.scene import Scene, gap_velocity
 from jimpact.tools.checks import as_float_array, check_values, needed
+from jimpact.tools.records import Column, Table, counted, plain
 
 HOW = "pip install 'jimpact[mujoco]'"
 
@@ -73,6 +74,26 @@ class MujocoScene(NamedTuple):
     velocity: jax.Array
     friction: jax.Array | None
     names: tuple[str, ...]
+
+    def __str__(self) -> str:
+        """A row for each contact: its gap, how fast it opens, its friction."""
+        scene, gamma = self.scene, gap_velocity(self.scene, self.velocity)
+        zeros = np.zeros(scene.contacts)
+        gaps = zeros if scene.gaps is None else np.asarray(scene.gaps)
+        friction = [None] * len(zeros) if self.friction is None else self.friction.tolist()
+        columns = (
+            *(Column("contact"), Column("geoms"), Column("gap_m", ".3g", "gap", "m")),
+            Column("gap_velocity_m_per_s", ".4g", "gap velocity", "m/s"),
+            Column("friction", ".3g"),
+        )
+        rows = [
+            [j + 1, name, gap, plain(speed), mu]
+            for j, (name, gap, speed, mu) in enumerate(
+                zip(self.names, gaps.tolist(), np.asarray(gamma).tolist(), friction)
+            )
+        ]
+        size = f"{counted(scene.size, 'coordinate')} (as data.qvel)"
+        return str(Table(columns, rows, head=[f"{size}, {counted(len(rows), 'contact')}"], keys=2))
 
 
 def from_mujoco(model: Any, data: Any, margin: float = 0.0) -> MujocoScene:

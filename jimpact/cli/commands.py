@@ -96,7 +96,9 @@ def _show(command: options.DrawingCommand, result: CommandResult, steps: Steps) 
 
 def _write_picture(path: Path, picture: "Figure | Callable[[Path], Any]") -> None:
     """Save a figure, whole or not at all; or call the function that writes the file."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    if not path.parent.exists():
+        path.parent.mkdir(parents=True)
+        print(f"jimpact: folder {path.parent} was made.", file=sys.stderr)
     if callable(picture):
         picture(path)
         return

@@ -146,20 +146,21 @@ def parse(arguments: list[str]) -> Any:
     import operator
     from typing import Annotated
 
-    import tyro
+    from jimpact.tools.checks import check_word, needed
 
+    tyro = needed("tyro", "pip install tyro")
     from jimpact.cli.options import COMMANDS
-    from jimpact.tools.checks import check_word
 
-    names = [x.name() for x in COMMANDS]
-    word = arguments[0]
-    if not word.startswith("-"):
-        check_word("the command", word, names)
-    commands: list[Any] = [Annotated[x, tyro.conf.subcommand(x.name())] for x in COMMANDS]
+    named = {x.name(): x for x in COMMANDS}
+    word, config = arguments[0], (tyro.conf.FlagCreatePairsOff,)
+    if not word.startswith("-"):  # by itself, so that messages name its own help
+        check_word("the command", word, named)
+        return tyro.cli(named[word], prog=f"jimpact {word}", config=config, args=arguments[1:])
+    commands: list[Any] = [Annotated[x, tyro.conf.subcommand(name)] for name, x in named.items()]
     return tyro.cli(
         functools.reduce(operator.or_, commands),
         prog="jimpact",
-        config=(tyro.conf.FlagCreatePairsOff,),
+        config=config,
         description="Impact laws for several simultaneous contacts. --version: the version.",
         args=arguments,
     )
@@ -175,8 +176,9 @@ def keep_programs(no_cache: bool) -> None:
         os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"
     if no_cache or root == "":
         return
-    import platformdirs
+    from jimpact.tools.checks import needed
 
+    platformdirs = needed("platformdirs", "pip install platformdirs")
     # One for each kind of processor: a home may be shared by machines that differ.
     root = root or platformdirs.user_cache_dir("jimpact")
     folder = os.path.join(root, f"programs-{_processor()}")

@@ -122,7 +122,7 @@ class ShotCommand(DrawingCommand):
     study: StudyFile = Path("three_balls.toml")
     """Study file, or the name of a bundled one; its [data] may be missing."""
     velocity: Annotated[tuple[float, ...], _option("V ...")] = ()
-    """Velocities before the impact [m/s], one a body; default: those of a measured shot."""
+    """Velocities before the impact [m/s, rad/s], one a coordinate; default: of a measured shot."""
     shot: int = 1
     """Which measured shot, counted from 1."""
 
@@ -222,9 +222,9 @@ class AdviseCommand(ShotCommand):
     """The simplest law and method that a scene needs, with the evidence."""
 
     tolerance: float = 1e-2
-    """Model error that is allowed, over the largest velocity before."""
+    """Model error that is allowed: energy norm of the error of v+ over that of v-."""
     stiffness_range: Annotated[tuple[float, float] | None, _option("LOW HIGH")] = None
-    """Factors by which each stiffness may be off; default 0.1 10."""
+    """Factors by which each stiffness may be off; default: 0.1 10, or 1 1 if the study has it."""
     samples: int = 128
     """Draws of the unknown stiffnesses."""
     seed: int = 0
@@ -285,7 +285,7 @@ class LawsCommand(Command):
 
         if self.module is not None:
             import_laws(self.module, Path())
-        keys = ("parameters", "summary", "right_when", "fails_when", "source")
+        keys = ("parameters", "in_python", "summary", "right_when", "fails_when", "source")
         rows = {name: {key: getattr(row, key) for key in keys} for name, row in REGISTRY.items()}
         if self.json:
             text = json.dumps(rows, indent=2)

@@ -70,6 +70,7 @@ def laws_as_text(rows: Mapping[str, Mapping[str, Any]]) -> str:
         friction = "friction" in row["parameters"]
         entries = {
             "parameters": ", ".join(row["parameters"]),
+            "in Python": row["in_python"],
             "friction": "yes, planar and in space" if friction else "no",
             "right when": row["right_when"],
             "fails when": row["fails_when"],

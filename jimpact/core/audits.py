@@ -1,5 +1,6 @@
 """Consistency of an outcome: kinematic, kinetic and energetic, and the momentum balance."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -11,7 +12,9 @@ from jimpact.core.contact import contact_of
 from jimpact.core.impacts import Impact, judged_beyond
 from jimpact.core.scene import Scene, as_velocity, gap_velocity, kinetic_energy, momentum
 from jimpact.numerics.tridiagonal import diagonal
+from jimpact.tools.checks import check_shape
 from jimpact.tools.compiling import full_precision
+from jimpact.tools.records import formatted
 from jimpact.tools.status import STATUS, sign_tolerance
 
 CONSISTENCIES = ("kinematic", "kinetic", "energetic", "momentum")
@@ -128,19 +131,28 @@ def nothing_approaches(scene: Scene, velocity: Any) -> str | None:
 
 
 @full_precision
-def summary(out: Impact, scene: Scene, velocity: Any) -> str:
+def _unit(scene: Scene, names: Sequence[str]) -> str:
+    """Of the velocities in a `summary`: those of a chain are in m/s, others may turn."""
+    if names:
+        check_shape("names", np.empty(len(names)), (scene.size,), "one per velocity")
+        return "velocity"
+    return "[m/s]" if scene.walls is not None else "[m/s, or rad/s of an angle]"
+
+
+def summary(out: Impact, scene: Scene, velocity: Any, names: Sequence[str] = ()) -> str:
     """A printable report of one impact (or, for a batch, of its status codes).
 
     Args:
         out: what `impact` returned, one or a batch.
         scene: of the impact.
-        velocity: v- (n,) [m/s].
+        velocity: v- (n,) [m/s, rad/s].
+        names: of the velocities with their units (n,), as `body.velocity_names`.
 
     Returns:
         Text of several lines: status, energy, audit, velocities and impulses of all contacts.
 
     Raises:
-        ValueError: not one velocity per coordinate.
+        ValueError: not one velocity, or name, per coordinate.
 
     >>> import jimpact as ji
     >>> scene, v = ji.chain([1.0, 1.0]), [1.0, 0.0]
@@ -154,7 +166,8 @@ def summary(out: Impact, scene: Scene, velocity: Any) -> str:
         return "\n".join([f"{codes.size} impacts by status", *rows])
     row = STATUS[int(codes)]
     before = float(kinetic_energy(scene, velocity))
-    remaining = (before + float(out.energy_change)) / before if before else float("nan")
+    change = float(out.energy_change)
+    remaining = (before + change) / before if before else float("nan")
     broken = audit(scene, velocity, out).broken
     words = [f"{name} {'VIOLATED' if name in broken else 'ok'}" for name in CONSISTENCIES]
     reason = nothing_approaches(scene, velocity)
@@ -162,13 +175,15 @@ def summary(out: Impact, scene: Scene, velocity: Any) -> str:
     lines = [
         f"status         {row.name}: {row.message}",
         *([f"impact         none: {reason}"] if quiet else []),
-        f"energy         {before:.6g} J before, change {float(out.energy_change):.6g} J "
+        f"energy         {before:.6g} J before, change {formatted(change, '.6g')} J "
         f"({100 * remaining:.4g} % kept)",
         f"audit          {', '.join(words)}",
-        "coordinate          v-             v+   [m/s]",
+        f"coordinate          v-             v+   {_unit(scene, names)}",
     ]
     pairs = zip(np.asarray(velocity, float), np.asarray(out.velocity, float))
-    lines += [f"{i + 1:10d} {a:14.6g} {b:14.6g}" for i, (a, b) in enumerate(pairs)]
+    for i, (a, b) in enumerate(pairs):
+        numbers = f"{formatted(a, '14.6g')} {formatted(b, '14.6g')}"
+        lines.append(f"{i + 1:10d} {numbers}{f'   {names[i]}' if names else ''}")
     lines.append("contact          gamma-         gamma+   [m/s]     impulse [N s]")
     g0, g1 = (
         np.asarray(gap_velocity(scene, velocity)),
@@ -176,5 +191,6 @@ def summary(out: Impact, scene: Scene, velocity: Any) -> str:
     )
     for j, (a, b, p, closed) in enumerate(zip(g0, g1, np.asarray(out.impulse), scene.closed)):
         note = "" if closed else "   open: takes no part" if p == 0 else "   open before"
-        lines.append(f"{j + 1:7d} {a:15.6g} {b:14.6g} {p:21.6g}{note}")
+        numbers = f"{formatted(a, '15.6g')} {formatted(b, '14.6g')} {formatted(p, '21.6g')}"
+        lines.append(f"{j + 1:7d} {numbers}{note}")
     return "\n".join(lines)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact.core.law import Domain, Law, free_parameters_of
-from jimpact.tools.checks import as_float_array, as_numbers, check_shape
+from jimpact.tools.checks import as_float_array, as_numbers, check_kind, check_shape
 
 OVERLAP = (
     "a negative gap is an overlap, that is a precompressed contact: give LZB the energy stored in "
@@ -141,8 +141,8 @@ class RandomLaw(eqx.Module):
             law a scalar to have one value for all contacts).
 
     Raises:
-        ValueError: no such field, or a distribution that leaves its domain (as a Normal does
-            where the domain is bounded; a function `key -> Law` may do anything).
+        TypeError: no law. ValueError: no such field, or a distribution that leaves its domain (as a
+            Normal does where the domain is bounded; a function `key -> Law` may do anything).
 
     >>> import jax
     >>> import jimpact as ji
@@ -156,6 +156,12 @@ class RandomLaw(eqx.Module):
 
     def __init__(self, law: Law, **parameters: Distribution):
         """Check that the law has such parameters, and that they stay in their domains."""
+        if isinstance(law, type):
+            raise TypeError(
+                "Argument `law` must be a law with its values, as in `RandomLaw(LZB(0.9), "
+                f"restitution=Uniform(0.8, 0.9))`, but is the class {law.__name__}."
+            )
+        check_kind("law", law, Law)
         known = free_parameters_of(law)
         if not parameters:
             raise ValueError(

@@ -69,7 +69,7 @@ class Impact(eqx.Module):
 
     def __str__(self) -> str:
         """Velocities, impulses, energy and status, in numbers."""
-        lines = [f"velocity        {in_numbers(self.velocity)} m/s"]
+        lines = [f"velocity        {in_numbers(self.velocity)} (m/s, of angles rad/s)"]
         lines.append(f"impulse         {in_numbers(self.impulse)} N s")
         if self.tangential_impulse.size:
             lines.append(f"tangential      {in_numbers(self.tangential_impulse)} N s")

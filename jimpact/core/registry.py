@@ -45,6 +45,12 @@ class Row(NamedTuple):
         return tuple(name for name in self.arguments if name not in self.options)
 
     @property
+    def in_python(self) -> str:
+        """How the class is called, without options: a study may give other, plain parameters."""
+        names = [x for x in inspect.signature(self.law).parameters if x not in self.options]
+        return f"ji.{self.law.__name__}({', '.join(names)})"
+
+    @property
     def required(self) -> tuple[str, ...]:
         """Parameters without a default."""
         empty = inspect.Parameter.empty

@@ -35,6 +35,7 @@ from jimpact.tools.checks import (
 )
 from jimpact.tools.compiling import full_precision
 from jimpact.tools.precision import precision
+from jimpact.tools.records import counted
 
 # Asymmetry of M, relative to its largest entry, that rounding causes in float32. Ten times more
 # would accept a mass matrix with a wrong fourth digit.
@@ -165,7 +166,8 @@ class Scene(eqx.Module):
         if self.walls is not None:
             walls = next(name for name, sides in WALLS.items() if sides == self.walls)
             kind = "chain" + (f" (wall: {walls})" if any(self.walls) else "")
-        lines = [f"{kind} of {self.size} velocities and {self.contacts} contacts"]
+        size = counted(self.size, "velocity", "velocities")
+        lines = [f"{kind} of {size} and {counted(self.contacts, 'contact')}"]
         mass = self.mass if self.mass.ndim == 1 else jnp.diagonal(self.mass, axis1=-2, axis2=-1)
         lines.append(f"mass     {in_numbers(mass)}{'' if self.mass.ndim == 1 else ' (diagonal)'}")
         if self.walls is None and self.pairs is None:

@@ -22,7 +22,7 @@ from jimpact.fits.search import MEDIAN, Solution
 from jimpact.fits.solve import RANK_TOLERANCE
 from jimpact.fits.uncertainty import uncertainty
 from jimpact.laws.kinematic import RestitutionMatrix
-from jimpact.tools.records import listed
+from jimpact.tools.records import counted, degrees, listed
 from jimpact.tools.status import STATUS
 
 # ------------------------------------------------------------------ thresholds of the fit
@@ -282,7 +282,7 @@ def _beyond_sigma(judged: Judged) -> Iterator[Finding]:
         yield Finding(
             "lack_of_fit",
             f"Lack of fit: the residuals are {judged.stretch:.2g} times what sigma allows (chi^2 = "
-            f"{judged.squares:.4g} with {judged.freedom} degrees of freedom): the law or "
+            f"{judged.squares:.4g} with {degrees(judged.freedom)}): the law or "
             f"the stated errors are wrong, or the parameters scatter; the standard errors {how}.",
             numbers={"ratio": judged.stretch, "chi_squared": judged.squares},
         )
@@ -303,7 +303,7 @@ def _beyond_noise(judged: Judged) -> Iterator[Finding]:
         yield Finding(
             "lack_of_fit",
             f"Lack of fit: the residuals are {np.sqrt(ratio):.2g} times the noise that momentum "
-            f"and repeated shots show ({rest} and {count} degrees of freedom): the law does not "
+            f"and repeated shots show ({rest} and {degrees(count)}): the law does not "
             "fit, and the standard errors mean little.",
             numbers={"ratio": float(np.sqrt(ratio))},
         )
@@ -337,7 +337,7 @@ def _pattern(judged: Judged) -> Iterator[Finding]:
         yield Finding(
             "lack_of_fit",
             f"Lack of fit: the residuals follow the velocities before the impact (F = {ratio:.3g} "
-            f"with {count} and {rest} degrees of freedom): the law does not fit.",
+            f"with {count} and {degrees(rest)}): the law does not fit.",
             numbers={"F": ratio},
         )
 
@@ -447,8 +447,8 @@ def _choices(judged: Judged) -> Iterator[Finding]:
     if rank < count:
         yield Finding(
             "undetermined",
-            f"The data determine {rank} of {count} parameters (rank {rank} of {count}); the values "
-            "given are one choice of many.",
+            f"The data determine {rank} of {counted(count, 'parameter')} (rank {rank} of {count}); "
+            "the values given are one choice of many.",
             numbers={"rank": rank, "parameters": count},
         )
     elif several > 1:

@@ -1,5 +1,6 @@
 """Measured shots: velocities before and after impacts, read from CSV files."""
 
+import os
 from collections.abc import Callable, Sequence
 from itertools import zip_longest
 from pathlib import Path
@@ -25,11 +26,14 @@ from jimpact.tools.checks import (
     check_kind,
     check_values,
     in_numbers,
+    short_repr,
 )
+from jimpact.tools.records import counted
 
 # Share of velocities, momenta and readings up to which a difference is rounding, also in files of
 # ten digits. Ten times more would take measured shots for corrected ones no more often.
 ROUNDING = 1e-9
+_VELOCITY = ("velocity", "velocities")
 _PRINTED = 4  # shots that `print` shows
 _VALUES = ("pre", "post", "sigma", "sigma_pre", "resolution")
 
@@ -153,9 +157,10 @@ class Experiments(eqx.Module):
         count, n = self.pre.shape
         missing, sigma = int((~self.measured).sum()), self.sigma
         units = ", ".join(dict.fromkeys(self.units))
-        lines = [f"{count} shot{'s' * (count > 1)} of {n} velocities [{units}]"]
+        lines = [f"{counted(count, 'shot')} of {counted(n, *_VELOCITY)} [{units}]"]
         if missing:
-            lines.append(f"{missing} of {self.post.size} velocities after were not measured")
+            was = "was" if missing == 1 else "were"
+            lines.append(f"{missing} of {self.post.size} velocities after {was} not measured")
         known = (
             "not known" if sigma is None else f"{np.nanmin(sigma):.3g} to {np.nanmax(sigma):.3g}"
         )
@@ -537,6 +542,11 @@ def read_experiments(
     >>> [round(float(v), 4) for v in balls.post[0]]
     [-0.0605, 0.1049, 0.9978]
     """
+    if not isinstance(path, str | os.PathLike):
+        raise TypeError(
+            f"Argument `path` must be the path of a CSV file, but is {short_repr(path)}. Of arrays "
+            "or a table in memory make `Experiments(pre=table[[...]], post=table[[...]])`."
+        )
     values, units, shots = read_shots(path)
     named: dict[str, Any] = {name: values.get(name) for name in _VALUES}
     scenes = _scenes_of(path, values, scene, near)

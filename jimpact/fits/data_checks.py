@@ -171,6 +171,11 @@ def _error(gradient: np.ndarray, covariance: np.ndarray) -> float:
     return float(np.sqrt(max(gradient @ covariance @ gradient, 0.0)))
 
 
+def wrong_unit(experiments: Experiments, scene: Scene | None) -> str:
+    """What speaks for a wrong unit, '' if nothing does: by the data alone, before any search."""
+    return next((found.line for found in _units(DataBalances(experiments, scene, 0.0, True))), "")
+
+
 def _units(data: DataBalances) -> Iterator[Finding]:
     """Whether velocities after are those before but for a factor that a wrong unit leaves.
 
@@ -185,9 +190,10 @@ def _units(data: DataBalances) -> Iterator[Finding]:
     for factor, unit in UNIT_FACTORS.items():
         near = (factor, 1 / factor) if what == "momentum" else (factor,)
         if any(abs(ratio / value - 1) < UNIT_NEAR for value in near):
+            plainly = f"{ratio:.0f}" if ratio >= 100 else f"{ratio:.3g}"
             yield Finding(
                 "units",
-                f"Units? The {what} after is {ratio:.3g} times that before: {unit} in one of the "
+                f"Units? The {what} after is {plainly} times that before: {unit} in one of the "
                 "columns?",
                 "the units are suspect",
                 numbers={"ratio": ratio, "factor": factor},

@@ -2,6 +2,7 @@
 
 import functools
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -13,6 +14,7 @@ from jimpact.core.law import AnyLaw
 from jimpact.core.scene import Scene
 from jimpact.fits.checks import Judged, fit_findings, unusable
 from jimpact.fits.data import Experiments
+from jimpact.fits.data_checks import wrong_unit
 from jimpact.fits.findings import Finding
 from jimpact.fits.observables import COARSE_RTOL
 from jimpact.fits.parameters import DEFAULT_FREE
@@ -21,7 +23,6 @@ from jimpact.fits.profiles import LEVEL, PROFILE_STARTS, needs_profiles, profile
 from jimpact.fits.report import Fit, check_squares
 from jimpact.fits.search import (
     DEFAULT_SEARCH,
-    LOSSES,
     FitMinimum,
     Search,
     Solution,
@@ -41,7 +42,7 @@ from jimpact.fits.solve import (
     step_limit,
 )
 from jimpact.fits.uncertainty import Profile, check_level, uncertainty
-from jimpact.tools.checks import as_whole, check_choice, check_kind, check_values
+from jimpact.tools.checks import as_whole, check_kind
 from jimpact.tools.progress import progress_bar
 from jimpact.tools.records import listed
 from jimpact.tools.threads import as_workers
@@ -101,7 +102,8 @@ def fit(
         search: method, loss, limits and progress, see `Search`.
 
     Returns:
-        `Fit`; `print` gives its report, `ji.plot.fit` a picture.
+        `Fit` (`help("jimpact.fits.report.Fit")`); `print` gives its report, `ji.plot.fit` a
+        picture.
 
     Shots whose impact fails at the best parameters, or whose derivatives are not finite or
     absurdly large, are left out, and `Fit.warnings` names them. `Fit.warnings` also says whether
@@ -121,14 +123,10 @@ def fit(
     0.4
     """
     check_kind("search", search, Search)
-    check_values("limit", search.limit, low=0.0)
     method, seed = search.method, search.seed
     steps = step_limit(method, search.max_steps)
     if starts is not None:
         as_whole("starts", starts, 1)
-    for name, count, least in (("max_steps", steps, 1), ("seed", seed, 0)):
-        as_whole(name, count, least)
-    check_choice("loss", search.loss, ("squares", *LOSSES))
     if isinstance(law, FitProblem):
         others: tuple[Any, ...] = (scene, experiments, bounds, priors, ties)
         if free is not DEFAULT_FREE or any(each is not None for each in others):
@@ -139,6 +137,8 @@ def fit(
         problem = law
     else:
         problem = of_shots(law, scene, experiments, free, bounds, priors, ties)  # type: ignore[arg-type]
+    if problem.experiments is not None and (said := wrong_unit(problem.experiments, problem.scene)):
+        warnings.warn(said, stacklevel=2)  # before a search that may take long and find nothing
     deadline = np.inf if search.limit is None else time.monotonic() + float(search.limit)
     with progress_bar(search.progress) as show:
         solver = Solver(method, steps, show, deadline)

@@ -17,6 +17,7 @@ from jimpact.tools.checks import as_whole, check_choice, needed
 from jimpact.tools.compiling import known_options
 
 HOW = 'pip install "jimpact[bayes]"'
+TOO_NEW = 1  # arviz: its `InferenceData` is gone, and `from_dict` takes other arguments
 # Chains begin inside: at the end of a domain the sampler's own coordinate is infinite.
 _INSIDE = 1e-3  # of the domain's width, or of the value where it has no end
 _AFAR = 1e3  # farther than any admissible matrix
@@ -58,7 +59,7 @@ def posterior(
         `draws.posterior["restitution"]` (chains, samples).
 
     Raises:
-        ImportError: numpyro or arviz is missing; the extra is named.
+        ImportError: numpyro or arviz is missing, or arviz is too new; the extra is named.
         ValueError: unknown names, priors outside the domain, a robust loss.
 
     Warns of chains that disagree, and of divergences: the draws are then not to be trusted.
@@ -72,7 +73,7 @@ def posterior(
     >>> print(f"{float(e.mean()):.2f} +- {float(e.std()):.3f}")  # doctest: +SKIP
     0.40 +- 0.013
     """
-    numpyro, arviz = needed("numpyro", HOW), needed("arviz", HOW)
+    numpyro, arviz = needed("numpyro", HOW), _arviz()
     if not isinstance(fit, FitProblem):
         check_squares("fit", fit)
     problem = fit.problem if isinstance(fit, Fit) else fit
@@ -123,6 +124,16 @@ def posterior(
         del draws.posterior[_FREE]
     _warn(draws, arviz)
     return draws
+
+
+def _arviz() -> Any:
+    """ArviZ; one whose results are built in another way is refused before anything is sampled."""
+    arviz = needed("arviz", HOW)
+    if int(arviz.__version__.split(".")[0]) >= TOO_NEW:
+        raise ImportError(
+            f"arviz must be older than {TOO_NEW} for this, but is {arviz.__version__}: {HOW}."
+        )
+    return arviz
 
 
 def _drawn(sampler: Any, seed: int, shown: bool) -> tuple[Any, Any]:

@@ -1,6 +1,7 @@
 """A fit as text (verdict, parameters, quality, minima, warnings, shots), as data, and in a file."""
 
 import dataclasses
+import itertools
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,12 +15,15 @@ from jimpact.fits.encoding import decoded, encoded, instance_of, versions
 from jimpact.fits.findings import of_sentences
 from jimpact.fits.uncertainty import FitResult, pieces_in_words
 from jimpact.tools.checks import check_kind
-from jimpact.tools.records import as_data, with_error
+from jimpact.tools.records import as_data, counted, degrees, formatted, with_error
 from jimpact.tools.status import STATUS
 
 _ZERO = 1e-12  # parameters in whatever unit that are printed as 0: rounding, as minima end in it
 _ROUNDING = 1e-7  # share of the largest velocity that is printed as 0: impacts are good to 1e-8
 _VELOCITIES_SHOWN = 24  # in the table of shots
+# Correlations of two parameters from this size on are printed, as lmfit does; ten times more: none.
+_CORRELATED = 0.1
+_CORRELATIONS_SHOWN = 6  # the largest ones; 10 parameters have 45
 _MINIMA_SHOWN = 5  # in the list of minima, the lowest first
 _PARAMETERS_NAMED = 6  # in one sentence; of more, the least certain
 OF_A_CONTACT = ("restitution", "friction", "tangential_restitution")  # each may have its own
@@ -134,11 +138,10 @@ def _headline(fit: "Fit") -> str:
         return f"Fit of {law} to {values} measured values, {fit.method}"
     shots, size = fit.predicted.shape
     count = f"{values}" if measured.all() else f"{values} of {measured.size}"
-    what = "bodies" if len(set(fit.experiments.units)) == 1 else "coordinates"
-    return (
-        f"Fit of {law} to {shots} shot{'s' * (shots > 1)} of {size} {what} "
-        f"({count} velocities measured), {fit.method}"
-    )
+    one_unit = len(set(fit.experiments.units)) == 1
+    what = counted(size, *(("body", "bodies") if one_unit else ("coordinate",)))
+    seen = f"{count} {'velocity' if measured.size == 1 else 'velocities'} measured"
+    return f"Fit of {law} to {counted(shots, 'shot')} of {what} ({seen}), {fit.method}"
 
 
 def _prior(fit: "Fit", i: int) -> str:
@@ -152,7 +155,8 @@ def _prior(fit: "Fit", i: int) -> str:
 
 def marked(value: float, seen: bool, digits: str) -> str:
     """A value of a table, in brackets where the data do not determine it."""
-    return f"{value:{digits}}" if seen else f"({value:{digits}})"
+    text = formatted(value, digits)
+    return text if seen else f"({text})"
 
 
 def named_values(fit: "Fit", values: np.ndarray) -> str:
@@ -193,6 +197,23 @@ def _parameters(fit: "Fit") -> list[str]:
     return lines
 
 
+def _correlations(fit: "Fit") -> list[str]:
+    """Pairs of parameters that the data determine and that errors move together, the worst first.
+
+    A pair of size 1 would be one combination that the data do not see.
+    """
+    pairs = itertools.combinations(np.flatnonzero(fit.determined).tolist(), 2)
+    sizes = {pair: float(fit.correlation[pair]) for pair in pairs}
+    worst = sorted((x for x in sizes if abs(sizes[x]) >= _CORRELATED), key=lambda x: -abs(sizes[x]))
+    lines = [
+        f"{fit.names[i]} and {fit.names[j]}: {sizes[i, j]:.3f}"
+        for i, j in worst[:_CORRELATIONS_SHOWN]
+    ]
+    if len(worst) > len(lines):
+        lines.append(f"... and {len(worst) - len(lines)} more, see `fit.correlation`")
+    return _section(f"Correlations (below {_CORRELATED:g} in size: not listed)", tuple(lines))
+
+
 def _quality(fit: "Fit") -> list[str]:
     """Residuals, noise, how many parameters the data determine, the solver."""
     unit, one = (" m/s", "velocity") if fit.experiments is not None else ("", "value")
@@ -219,22 +240,12 @@ def _quality(fit: "Fit") -> list[str]:
     total, bounded = len(fit.names), int(fit.determined.sum())
     fewer = f"; the errors leave {total - bounded} unbounded" if bounded < fit.rank == total else ""
     state = "converged" if fit.converged else "NOT converged"
-    rank = f"{fit.rank} of {total} parameter{'s' * (total > 1)}"
+    rank = f"{fit.rank} of {counted(total, 'parameter')}"
     lines.append(f"determined     {rank} (rank of the derivatives{fewer})")
     return [
         *lines,
-        f"solver         {state}, at most {fit.steps} step{'s' * (fit.steps > 1)} a start",
+        f"solver         {state}, at most {counted(fit.steps, 'step')} a start",
     ]
-
-
-def degrees(count: int) -> str:
-    """So many degrees of freedom, in words.
-
-    >>> from jimpact.fits.report import degrees
-    >>> degrees(1), degrees(2)
-    ('1 degree of freedom', '2 degrees of freedom')
-    """
-    return f"{count} degree{'s' * (count != 1)} of freedom"
 
 
 def _sigma_sources(fit: "Fit") -> list[str]:
@@ -258,12 +269,13 @@ def _section(title: str, lines: tuple[str, ...]) -> list[str]:
 def _minima(fit: "Fit") -> list[str]:
     """Where the starts ended."""
     total, lost, count = fit.start_count, fit.lost_starts, len(fit.starts)
-    unfinished = [f"{lost} of {total} starts were given up."] if lost else []
+    given_up = f"{lost} of {counted(total, 'start')} {'was' if lost == 1 else 'were'} given up."
+    unfinished = [given_up] if lost else []
     if count == 1:
         ended = f"{total - lost} of {total} starts ended in this minimum."
         return [" ".join([ended, *unfinished])] if total > 1 else []
     where = f"{count} minima" if fit.rank == len(fit.names) else f"{count} points of one valley"
-    lines = [f"{total} starts ended in {where}:  sum of squares, number of starts, values"]
+    lines = [f"{total - lost} of {total} starts ended in {where}:  sum of squares, starts, values"]
     for minimum in fit.starts[:_MINIMA_SHOWN]:
         values, squares = named_values(fit, minimum.value), minimum.sum_of_squares
         squares = 0.0 if squares <= fit.problem.exact_squares else squares
@@ -290,12 +302,13 @@ def _shots(fit: "Fit") -> list[str]:
     for k, i in np.ndindex(*before[:shown].shape):
         label = data.shots[k] if i == 0 else ""
         status = STATUS[int(fit.status[k])].name if fit.status[k] and i == 0 else ""
-        value = "-" if np.isnan(measured[k, i]) else f"{measured[k, i]:.6g}"
-        row = f"{label:>8s} {i + 1:>5d} {before[k, i]:>12.6g} {value:>12s} {fitted[k, i]:>12.6g}"
+        value = "-" if np.isnan(measured[k, i]) else formatted(measured[k, i], ".6g")
+        own, law = (formatted(x[k, i], ">12.6g") for x in (before, fitted))
+        row = f"{label:>8s} {i + 1:>5d} {own} {value:>12s} {law}"
         unit = f" {data.units[i]}" if mixed else ""
         lines.append(f"{row}{unit}   {status}".rstrip())
     if shots > shown:
-        lines.append(f"     ... and {shots - shown} more shots")
+        lines.append(f"     ... and {counted(shots - shown, 'more shot')}")
     return lines
 
 
@@ -323,6 +336,7 @@ def report(fit: "Fit") -> str:
         [fit.verdict],
         [_headline(fit)],
         _parameters(fit),
+        _correlations(fit),
         _quality(fit),
         _section("What the data do not determine", fit.identifiability),
         _minima(fit),

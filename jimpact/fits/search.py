@@ -22,7 +22,9 @@ from jimpact.fits.solve import (
     minimize,
     outcome_at,
     stacked,
+    step_limit,
 )
+from jimpact.tools.checks import as_whole, check_choice, check_values
 from jimpact.tools.compiling import quick_jit
 
 if TYPE_CHECKING:
@@ -67,6 +69,21 @@ LEAST_SLOPE = 1e-7  # mean psi' of residuals that all are outliers, in the place
 MEDIAN = 1.4826  # sigma of a normal distribution over the median of its absolute values
 
 
+def _huber(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """psi(u) / u and psi'(u)."""
+    inside = np.abs(u) <= HUBER
+    return np.where(inside, 1.0, HUBER / np.where(inside, 1.0, np.abs(u))), inside.astype(float)
+
+
+def _student(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """psi(u) / u and psi'(u)."""
+    below = STUDENT + u**2
+    return (STUDENT + 1) / below, (STUDENT + 1) * (STUDENT - u**2) / below**2
+
+
+LOSSES = {"huber": _huber, "student": _student}
+
+
 @dataclass(frozen=True)
 class Search:
     """How `fit` searches for the parameters, if not as it does by default.
@@ -82,6 +99,9 @@ class Search:
         limit: seconds after which no further step of the search is begun; None: no limit.
         progress: bar on stderr; None: on a terminal, for fits longer than two seconds.
 
+    Raises:
+        ValueError: a method or a loss that is not known; a number out of its range.
+
     >>> import jimpact as ji
     >>> data = ji.Experiments(pre=[[1.0, 0.0], [2.0, 0.0]], post=[[0.3, 0.7], [0.6, 1.4]])
     >>> fit = ji.fit(ji.Newton(0.9), ji.chain([1.0, 1.0]), data, search=ji.Search(method="adam"))
@@ -95,6 +115,13 @@ class Search:
     max_steps: int | None = None
     limit: float | None = None
     progress: float | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse a word that is not known, and numbers out of range."""
+        as_whole("max_steps", step_limit(self.method, self.max_steps), 1)
+        as_whole("seed", self.seed, 0)
+        check_values("limit", self.limit, low=0.0)
+        check_choice("loss", self.loss, ("squares", *LOSSES))
 
 
 DEFAULT_SEARCH = Search()
@@ -404,21 +431,6 @@ def settled(
 
 
 # ---------------------------------------------------------------------------- robust losses
-
-
-def _huber(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """psi(u) / u and psi'(u)."""
-    inside = np.abs(u) <= HUBER
-    return np.where(inside, 1.0, HUBER / np.where(inside, 1.0, np.abs(u))), inside.astype(float)
-
-
-def _student(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """psi(u) / u and psi'(u)."""
-    below = STUDENT + u**2
-    return (STUDENT + 1) / below, (STUDENT + 1) * (STUDENT - u**2) / below**2
-
-
-LOSSES = {"huber": _huber, "student": _student}
 
 
 def robust_minimum(

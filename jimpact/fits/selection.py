@@ -22,7 +22,7 @@ from jimpact.fits.search import Search
 from jimpact.laws.velocity_dependent import VelocityDependent
 from jimpact.tools.checks import check_choice, check_kind
 from jimpact.tools.progress import progress_bar
-from jimpact.tools.records import Column, Table, Tabular, as_data
+from jimpact.tools.records import Column, Table, Tabular, as_data, degrees
 from jimpact.tools.status import STATUS
 
 RESTITUTION = 0.8  # start value by default
@@ -159,10 +159,12 @@ class NestedTest(NamedTuple):
 
     def __str__(self) -> str:
         needed, rest = "needed" if self.needed else "not needed", self.degrees_of_freedom
-        kind, freedom = ("chi^2", self.more) if rest is None else ("F", f"{self.more} and {rest}")
+        kind, freedom = "chi^2", degrees(self.more)
+        if rest is not None:
+            kind, freedom = "F", f"{self.more} and {degrees(rest)}"
         return (
-            f"{', '.join(self.names)} {needed}: {kind} = {self.statistic:.3g} with {freedom} "
-            f"degrees of freedom, p-value {self.chance:.2g}."
+            f"{', '.join(self.names)} {needed}: {kind} = {self.statistic:.3g} with {freedom}, "
+            f"p-value {self.chance:.2g} (needed: below {WORSE:g})."
         )
 
     def to_dict(self) -> dict[str, Any]:

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.tools.checks import suggestion
+from jimpact.tools.checks import needed, suggestion
 from jimpact.tools.compiling import quick_jit
 from jimpact.tools.progress import Show
 from jimpact.tools.threads import in_threads
@@ -25,6 +25,7 @@ from jimpact.tools.threads import in_threads
 if TYPE_CHECKING:
     import optax  # which takes long to import
 
+HOW = "pip install optax"
 Method: TypeAlias = "str | optax.GradientTransformation"
 
 # Steps of one start before the solver gives up: more only costs time.
@@ -151,8 +152,7 @@ def step_limit(method: Any, stated: int | None) -> int:
     """The stated limit of steps, or that of the method; raises a ValueError for an unknown one."""
     known = isinstance(method, str) and method in DEFAULT_STEPS
     if not known:
-        import optax
-
+        optax = needed("optax", HOW)
         if not isinstance(method, optax.GradientTransformation):
             raise ValueError(
                 f"Argument `method` must be one of {', '.join(map(repr, DEFAULT_STEPS))} or an "
@@ -267,7 +267,7 @@ def _cost(problem: LeastSquares, y: jax.Array) -> jax.Array:
 
 def _transformation(method: Method, max_steps: int) -> "optax.GradientTransformationExtraArgs":
     """The optax transformation of a method."""
-    import optax
+    optax = needed("optax", HOW)
 
     if method == "adam":
         method = optax.adam(optax.cosine_decay_schedule(_ADAM_RATE, max_steps))

@@ -19,7 +19,10 @@ from jimpact.fits.problem import FitProblem
 from jimpact.fits.search import FitMinimum, Solution, solution
 from jimpact.fits.solve import RANK_TOLERANCE, outcome_at
 from jimpact.tools.checks import check_choice, check_kind, check_shape, check_values
-from jimpact.tools.records import Column, Table, Tabular
+from jimpact.tools.records import Column, Table, Tabular, counted, plain
+from jimpact.tools.status import STATUS
+
+_PRINTED_SHOTS = 12  # of predictions; ten times more fill pages
 
 # A parameter takes part in an undetermined combination if its share of that direction exceeds this;
 # shares of parameters that take no part are errors of the derivatives, about 1e-6.
@@ -223,7 +226,7 @@ class Predicted(NamedTuple):
     """Velocities after each shot (K, n) [m/s], their standard errors (K, n), status codes (K,).
 
     `noise` (K, n) is the standard error of a measurement of them. `low` and `high` (K, n) are the
-    ends of the band in which such a measurement lies.
+    ends of the band in which such a measurement lies. `units` (n,): of the velocities.
     """
 
     velocity: np.ndarray
@@ -232,6 +235,26 @@ class Predicted(NamedTuple):
     noise: np.ndarray
     low: np.ndarray
     high: np.ndarray
+    units: tuple[str, ...]
+
+    def __str__(self) -> str:
+        """A row for each velocity; a status where it is not ok."""
+        columns = (
+            *(Column("shot"), Column("coordinate"), Column("velocity", ".5g")),
+            *(Column("standard_error", ".2g", "std. error"), Column("low", ".5g")),
+            *(Column("high", ".5g"), Column("unit"), Column("status")),
+        )
+        rows = [
+            [
+                *(k + 1, i + 1, plain(float(self.velocity[k, i])), self.standard_error[k, i]),
+                *(self.low[k, i], self.high[k, i], self.units[i]),
+                STATUS[int(self.status[k])].name if self.status[k] else None,
+            ]
+            for k, i in np.ndindex(*self.velocity[:_PRINTED_SHOTS].shape)
+        ]
+        more = len(self.velocity) - _PRINTED_SHOTS
+        notes = [f"... and {counted(more, 'more shot')}"] if more > 0 else []
+        return str(Table(columns, rows, notes=[*notes, "low to high: of a measurement."], keys=2))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -375,7 +398,8 @@ class FitResult(Solution, Uncertainty, Tabular, Generic[AnyLaw]):
         error = self.errors_of(problem.derivatives(there.starts[0]))
         value, noise = there.predicted, np.broadcast_to(self._noise_of(sigma), data.pre.shape)
         half = quantile * np.hypot(error, noise)
-        return Predicted(value, error, np.asarray(there.status), noise, value - half, value + half)
+        band, status = (value - half, value + half), np.asarray(there.status)
+        return Predicted(value, error, status, noise, *band, tuple(units))
 
     def _check_scene(self, scene: Any, size: int) -> None:
         """Raise unless this is a scene for the law that was fitted and velocities of this size."""

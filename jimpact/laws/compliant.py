@@ -162,6 +162,7 @@ def make_compliant(
     restitution: Any = 1.0,
     rheology: str = "bistiffness",
     damping: Any = None,
+    friction: Any = None,
 ) -> Compliant:
     """`Compliant` from plain parameters, as in a study file."""
     viscous: dict[str, Callable[..., Force]] = {
@@ -176,5 +177,7 @@ def make_compliant(
             f"`rheology` is {rheology!r} and `damping` has value {damping!r}."
         )
     if rheology == "bistiffness":
-        return Compliant(Bistiffness(stiffness, exponent, restitution))
-    return Compliant(viscous[rheology](stiffness, damping))
+        force: Force = Bistiffness(stiffness, exponent, restitution)
+    else:
+        force = viscous[rheology](stiffness, damping)
+    return Compliant(force, friction=friction)

@@ -16,7 +16,11 @@ from jimpact.tools.status import CODE, STATUS
 _WIDTH = 80  # characters of the printed lines
 _NAMED = 4  # unknown stiffnesses named one by one; the others are "..."
 _PERCENT_FROM = 1e-4  # smaller errors are printed as 2e-05, not as 0.002 %
-_ROUNDING = 1e-12  # errors up to this are printed as "rounding"
+ROUNDING = 1e-12  # errors up to this are printed as "rounding"
+_KNOWN = (  # where nothing was varied
+    "The stiffnesses are taken as known. A range on their ratios tests whether that matters: "
+    "`stiffness_range=(0.5, 2)`, `jimpact advise --stiffness-range 0.5 2`."
+)
 _POSITIONAL = ("restitution", "stiffness", "exponent")  # parameters of a law as it is printed
 _KEYWORDS = ("friction", "order", "rtol")  # the same, by name, where they are not the default
 
@@ -170,7 +174,10 @@ class Advice(Tabular):
             f"Error of v+ against {self.reference}: sqrt(dv^T M dv) over sqrt(v-^T M v-), dv the "
             f"difference of v+; stiffnesses tried: {self.rows}."
         )
-        notes = ["", *textwrap.wrap(footnote, _WIDTH), *left_out_notes(self.left_out)]
+        notes = ["", *textwrap.wrap(footnote, _WIDTH)]
+        if not self.unknown and any(b.approaches and len(b.contacts) > 1 for b in self.blocks):
+            notes += textwrap.wrap(_KNOWN, _WIDTH)
+        notes += left_out_notes(self.left_out)
         return Table(columns, rows, [*head, ""], notes)
 
 
@@ -201,10 +208,10 @@ def share(x: float) -> str:
     """
     if math.isnan(x):
         return "nan"
-    if x <= _ROUNDING:
+    if x <= ROUNDING:
         return "rounding"
     unit = 10.0 ** (math.floor(math.log10(x)) - 1)
-    up = math.ceil(x / unit * (1 - _ROUNDING)) * unit
+    up = math.ceil(x / unit * (1 - ROUNDING)) * unit
     return f"{100 * up:.3g} %" if x >= _PERCENT_FROM else f"{up:.2g}"
 
 
@@ -277,6 +284,11 @@ def _cause(advice: Advice) -> str:
         return f"contacts open and close again, where lzb and compliant are up to {apart} apart"
     if advice.name == "newton" and not np.any(parameters_of(advice.law)["restitution"].value):
         return "plastic contacts (restitution 0) that stay together"
+    if advice.name == advice.reference and not advice.unknown:
+        return (
+            f"{stiffnesses}, taken as known: {advice.name} is the reference itself, and compliant, "
+            f"with springs in the place of its energies, is {share(advice.reclosing)} apart"
+        )
     return f"{stiffnesses}: {advice.name} is within {share(advice.candidates[advice.name].worst)}"
 
 

@@ -138,6 +138,7 @@ class WorkPrecision(Tabular):
             Column("status"),
         )
         rows = []
+        differentiated = any(x.gradient for points in self.points.values() for x in points)
         for name, points in self.points.items():
             compiled = sum(self.compile_time.get(name, {}).values()) or None  # said once
             for x in points:
@@ -153,7 +154,7 @@ class WorkPrecision(Tabular):
             f"Errors: relative, the largest of {self.sample} impacts with stiffness spread over a "
             f"factor {self.spread:g}; of a law its model error.",
             f"Times: medians of {self.repeats} in turns, per impact: alone, in a batch of "
-            f"{self.batch} (from, to: quartiles), with J: with the Jacobian.",
+            f"{self.batch} (from, to: quartiles){', with J: with the Jacobian' * differentiated}.",
         ]
         notes += left_out_notes(self.left_out)
         notes += left_out_notes(self.without_gradient, "has no gradient")

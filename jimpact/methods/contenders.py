@@ -14,9 +14,8 @@ True
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import diffrax
 import jax
 import numpy as np
 
@@ -28,7 +27,12 @@ from jimpact.laws.lzb import LZB
 from jimpact.methods import schemes
 from jimpact.methods.points import Outcomes, Solution as Solution
 from jimpact.methods.schemes import Solve
-from jimpact.tools.checks import check_choice, short_repr
+from jimpact.tools.checks import check_choice, needed, short_repr
+
+if TYPE_CHECKING:
+    import diffrax
+else:  # what impacts do without
+    diffrax = needed("diffrax", "pip install diffrax")
 
 SETTING_KINDS = ("rtol", "step", "impulse step")  # what `Contender.setting` may be
 

@@ -23,9 +23,8 @@ is touched for the first time has a closed form. It has no time, so the duration
 import dataclasses
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -41,9 +40,14 @@ from jimpact.numerics.sparse import Neighbours, Sparse
 from jimpact.numerics.stepper import STAGES
 from jimpact.numerics.tangential import per_tangent
 from jimpact.numerics.tridiagonal import Tridiagonal, as_matrix
-from jimpact.tools.checks import as_float_array, in_common_dtype
+from jimpact.tools.checks import as_float_array, in_common_dtype, needed
 from jimpact.tools.compiling import precise_jit
 from jimpact.tools.status import CODE
+
+if TYPE_CHECKING:
+    import diffrax
+else:  # what impacts do without
+    diffrax = needed("diffrax", "pip install diffrax")
 
 # Part of the largest energy below which that of a contact is rounding, and the contact unloaded.
 # Ten times more would unload contacts that still push.
@@ -384,7 +388,7 @@ def _emptying(
 # ------------------------------------------------------------------------------- libraries
 
 
-def by_diffrax(solver: diffrax.AbstractSolver, stages: int | None) -> Solve:
+def by_diffrax(solver: "diffrax.AbstractSolver", stages: int | None) -> Solve:
     """A solver of diffrax, ended by an event; `stages`: new ones a step (None: not known)."""
 
     def solve(law: LZB, scene: Scene, velocity: Any, setting: Any) -> Solution:

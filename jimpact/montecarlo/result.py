@@ -20,7 +20,7 @@ from jimpact.montecarlo.statistics import (
     part,
 )
 from jimpact.tools.checks import as_float_array, check_values
-from jimpact.tools.records import Column, Table, Tabular, as_data, fields_as_data
+from jimpact.tools.records import Column, Table, Tabular, as_data, counted, fields_as_data
 
 REPORTED = (0.05, 0.5, 0.95)  # quantiles in the report
 _OUTCOMES = {row.name: row for row in OUTCOMES}
@@ -109,6 +109,11 @@ class MonteCarlo(Tabular):
         ends = self.edges[:, [0, -1]]
         return binned_quantiles(q, ends, self.counts, self.minimum, self.maximum)
 
+    @property
+    def unit(self) -> str:
+        """Of the velocities: m/s of a chain; others may turn."""
+        return "m/s" if self.run.scene.walls is not None else "m/s, or rad/s of an angle"
+
     def replay(self, index: int) -> tuple[Law, Scene, jax.Array]:
         """Law, scene and velocity of sample `index`: `ji.impact(*result.replay(index))`."""
         if not 0 <= index < self.samples:
@@ -126,21 +131,22 @@ class MonteCarlo(Tabular):
 
     @property
     def table(self) -> Table:
-        """A row for each velocity after, with quantiles; numbers in m/s."""
+        """A row for each velocity after, with quantiles."""
         columns = (
-            Column("coordinate", head="[m/s]"),
+            Column("coordinate", head=f"[{self.unit}]"),
             Column("mean", ".6f"),
-            Column("standard_error", ".1g", "± error"),
+            Column("standard_error", ".1g", "std. error"),
             Column("std", ".5f"),
             *(Column(f"quantile_{q:g}", ".5f", f"{100 * q:g} %") for q in REPORTED),
-            Column("least", ".5f"),
-            Column("largest", ".5f"),
+            Column("minimum", ".5f"),
+            Column("maximum", ".5f"),
         )
         names = [f"v{i + 1}+" for i in range(len(self.mean))]
         values = self.std, *self.quantile(REPORTED), self.minimum, self.maximum
         rows = [*zip(names, self.mean, self.standard_error, *values)]
-        head = [f"{self.samples:,} samples of {self.description}", self._rate(), ""]
-        notes = [f"Quantiles are right to {self.quantile_resolution.max():.2g} m/s.", ""]
+        head = [f"{counted(self.samples, 'sample')} of {self.description}", self._rate(), ""]
+        right = f"Quantiles are right to {self.quantile_resolution.max():.2g} {self.unit}"
+        notes = [f"{right}; std. error: of the mean, std: of one impact.", ""]
         notes += [*self._gap_lines(), *self._status_lines()]
         return Table(columns, rows, head, notes)
 

@@ -27,6 +27,7 @@ from jimpact.montecarlo.statistics import BAD_GAP, BAD_LAW, BAD_VELOCITY, Chunk,
 from jimpact.montecarlo.store import fingerprint
 from jimpact.tools.checks import as_whole, check_kind, in_common_dtype
 from jimpact.tools.compiling import precise_jit
+from jimpact.tools.records import counted
 
 _WRITTEN = 6  # velocities that the report lists
 SAMPLES = 100_000  # default number of samples; ten times more: quantiles three times finer
@@ -198,7 +199,8 @@ class Run:
         """The run in one line."""
         sources, scene = self.sources, self.scene
         law = type(sources.law).__name__ if isinstance(sources.law, Law) else _named(sources.law)
-        text = f"{law}, {scene.size} coordinates, {scene.contacts} contacts"
+        size = counted(scene.size, "coordinate"), counted(scene.contacts, "contact")
+        text = ", ".join([law, *size])
         for what in ("gaps", "velocity"):
             if sources.random[what]:
                 text += f"; {what}: {_named(getattr(sources, what))}"

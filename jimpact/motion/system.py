@@ -32,7 +32,8 @@ class System(eqx.Module):
             [m], written with jax.numpy.
         mass: M: (n,), (n, n), or a function q -> M(q); its Coriolis terms follow by
             differentiation of `T = v^T M(q) v / 2`.
-        force: (q, v, t) -> generalized forces (n,); None: none.
+        force: (q, v, t) -> generalized forces (n,); None: none. They do work on v: of a body in
+            space v has its angular velocity in the axes of the body, and so are its moments.
         potential: q -> V () [J], its forces are `-grad V`; None: 0.
         gravity: True: the body has a weight; or its acceleration g >= 0 [m/s^2], downwards. For
             functions, see `gravity`.

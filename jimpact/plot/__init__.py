@@ -8,4 +8,7 @@
 
 import lazy_loader
 
+from jimpact.tools.checks import needed
+
+needed("matplotlib", "pip install matplotlib")  # the first of what all pictures import
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from jimpact.methods.advice_report import Advice, as_code, share
+from jimpact.methods.advice_report import ROUNDING, Advice, as_code, share
 from jimpact.methods.chart import Point, Timing, WorkPrecision
 from jimpact.methods.stability import CLASSES, Slice, StabilityMap
 from jimpact.methods.validity import ValidityMap
@@ -30,6 +30,7 @@ from jimpact.plot.style import (
     panels_of_laws,
     side_by_side,
     styled,
+    write,
 )
 from jimpact.tools.status import CODE, STATUS
 
@@ -369,11 +370,16 @@ def advice(result: Advice, title: str = "", names: Sequence[str] = ()) -> Figure
     for axes in figure.axes:
         label = "advised" if axes is bottom else None
         axes.axvspan(chosen - 0.5, chosen + 0.5, color=HIGHLIGHT, lw=0, label=label)
-    lowest = result.tolerance / 1000
-    worst, median = np.maximum(np.array([(c.worst, c.median) for c in rows]).T, lowest)
-    bottom.vlines(x, median, worst, color=GREY, lw=1)
+    errors = np.array([(c.worst, c.median) for c in rows]).T
+    beyond = errors > ROUNDING  # what is smaller has no place on a logarithmic axis: words
+    lowest = min(result.tolerance / 1000, errors[beyond].min(initial=1.0))
+    worst, median = np.where(beyond, errors, np.nan)
+    bottom.vlines(x, np.where(np.isnan(median), lowest / 2, median), worst, color=GREY, lw=1)
     bottom.plot(x, worst, "s", color="black", label="worst")
     bottom.plot(x, median, "_", color="black", ms=14, label="median")
+    for j in np.flatnonzero(~beyond[0]):
+        what = "reference" if laws[j] == result.reference else "rounding"
+        write(bottom, (j, lowest), what)
     bottom.axhline(result.tolerance, color=COLOURS[1], lw=1, label="tolerance")
     bottom.set(yscale="log", ylim=(lowest / 2, 10))
     logarithmic(bottom, "y")

@@ -15,6 +15,7 @@ from jimpact.tools.records import readable_unit
 
 _BARS = 30  # of a histogram: each is several pixels wide
 _MEAN_AT, _TOP = 1.12, 1.25  # height of the mean, and of the axis, over that of the highest bar
+_TICKS = 3  # at most, on the axis of a velocity: those of a narrow range have many digits
 _BODIES = 6  # histograms; of more bodies only the most scattered are drawn
 _DOT = 4.0  # area of a sample in the map [points^2]
 _TITLE = 80  # letters of a line of the title
@@ -25,9 +26,9 @@ def monte_carlo(result: MonteCarlo, title: str = "") -> Figure:
     """Histograms of every body, and the first samples over two gaps, coloured by the outcome.
 
     Gaps are over the indentation of the contact (delta_c of `ji.theory.gap_scale`), where it is
-    known. The velocities of a chain share an axis; others may be in m/s or in rad/s. The map shows
-    the two gaps that vary most and the most scattered velocity; with one random gap, that velocity
-    against it; without, no map.
+    known. Each velocity has an axis of its own. The map shows the most scattered velocity over the
+    two gaps with which it is most correlated; with one random gap, that velocity against it;
+    without, no map.
 
     Args:
         result: what `ji.monte_carlo` returned.
@@ -50,25 +51,16 @@ def monte_carlo(result: MonteCarlo, title: str = "") -> Figure:
     bodies = sorted(scattered[:_BODIES].tolist())
     mapped = result.first["gaps"].shape[1] > 0
     mosaic: Any = [[str(body), "map"] if mapped else [str(body)] for body in bodies]
-    figure = Figure(figsize=(WIDTH, max(4.8, 1.5 * len(bodies))))
+    figure = Figure(figsize=(WIDTH, max(4.8, 2.0 * len(bodies))))
     figure.suptitle(title or textwrap.fill(result.description, _TITLE), x=0.01, ha="left")
     panels = figure.subplot_mosaic(mosaic)
-    unit = _unit(result)
     for body in bodies:
         axes = panels[str(body)]
-        if unit == "m/s":
-            axes.sharex(panels[str(bodies[0])])
-            axes.tick_params(labelbottom=body == bodies[-1])
         _histogram(axes, result, body)
-    axes.set_xlabel(f"velocity after the impact [{unit}]\n(dot: mean, bar: 5 % to 95 %)")
+    axes.set_xlabel(f"{axes.get_xlabel()}\n(dot: mean, bar: 5 % to 95 %)")
     if mapped:
         _map(panels["map"], result, int(scattered[0]))
     return figure
-
-
-def _unit(result: MonteCarlo) -> str:
-    """Of velocities: m/s of a chain; others may turn."""
-    return "m/s" if result.run.scene.walls is not None else "m/s or rad/s"
 
 
 def _histogram(axes: Axes, result: MonteCarlo, body: int) -> None:
@@ -88,24 +80,33 @@ def _histogram(axes: Axes, result: MonteCarlo, body: int) -> None:
     axes.plot([low, high], [height, height], "|-", color="black", ms=7, lw=1)
     axes.plot(mean, height, "o", color="black", ms=4)  # it may lie outside that range
     axes.set_ylim(0, _TOP * top)
-    label = f"body {body + 1}: mean {mean:.3f}, std {result.std[body]:.3f} {_unit(result)}"
+    label = f"body {body + 1}: mean {mean:.4g}, std {result.std[body]:.2g} {result.unit}"
     axes.set_title(label, fontsize=SMALL, color=colour)
-    axes.set_ylabel("samples [%]")
+    axes.set(xlabel=f"velocity after the impact [{result.unit}]", ylabel="samples [%]")
+    axes.ticklabel_format(axis="x", useOffset=False)
+    axes.locator_params(axis="x", nbins=_TICKS)
     axes.grid(False, axis="x")
 
 
+def _that_matter(result: MonteCarlo, body: int) -> list[int]:
+    """At most two gaps: those with which the velocity of a body is most correlated."""
+    std = np.sqrt(np.diag(result.gap_covariance))
+    varies = std > 0
+    share = np.abs(result.cross_covariance[body]) / np.where(varies, std, 1.0)
+    return sorted(np.lexsort((-std, -np.where(varies, share, -1.0)))[:2].tolist())
+
+
 def _map(axes: Axes, result: MonteCarlo, body: int) -> None:
-    """The first samples over the two gaps that vary most, coloured by the velocity of a body."""
+    """The first samples over the two gaps that matter most, coloured by the velocity of a body."""
     first = result.first
     fine = np.isfinite(first["velocity"]).all(axis=1) & ~FAILURE[first["status"]]
     velocity = first["velocity"][fine, body]
-    vary = np.argsort(-np.diag(result.gap_covariance), kind="stable")[:2]
-    gaps = sorted(vary.tolist())
+    gaps = _that_matter(result, body)
     x = [_in_units(result, first["gaps"][fine, gap], gap) for gap in gaps]
     axes.set_xlabel(x[0][1])
     axes.set_title(f"{fine.sum():,} samples", fontsize=SMALL)
     axes.grid(False)
-    label = f"velocity of body {body + 1} [{_unit(result)}]"
+    label = f"velocity of body {body + 1} [{result.unit}]"
     if len(gaps) == 1:
         axes.plot(x[0][0], velocity, ".", ms=3, color=colour_of(body))
         axes.set_ylabel(label)

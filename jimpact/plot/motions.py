@@ -10,18 +10,20 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from jimpact.bodies.base import Body, rate_of, split_name
 from jimpact.motion.dynamics import kinetic, potential
 from jimpact.motion.record import Motion
 from jimpact.motion.system import System
-from jimpact.plot.style import COLOURS, GREY, colour_of, new_figure, styled
+from jimpact.plot.style import COLOURS, GREY, colour_of, legend_below, new_figure, styled
 from jimpact.tools.checks import check_kind
 
 POINT = 0.02  # radius in which a point mass is drawn, of the range of its coordinates
 _MARKED = ("accumulation", "detachment", "friction")  # events with a line style of their kind
 _MANY = 20  # up to this number of impacts each is marked by a line; more are a grey block
 _BASEPOINTS = 1000  # at which a base is drawn
+_LONG = 10  # letters of a word in a legend above a panel of which three take its width
 _FEW = 6  # curves that one panel shows by default, each with its entry in the legend
 # Share of the scale of its unit below which what a panel shows is rounding. Ten times more would
 # flatten motions that a thousandth of a hair's width is a lot for.
@@ -80,7 +82,7 @@ def motion(
     course = course_of(motion)
     columns = [_by_unit(labels, bodies), _by_unit(rates, bodies)]
     rows = max(map(len, columns)) + 1
-    figure, panels = new_figure(2.5 * rows, title, rows, 2, sharex=True, squeeze=False)
+    figure, panels = new_figure(2.7 * rows + 0.4, title, rows, 2, sharex=True, squeeze=False)
     scales = _scales(labels, motion)
     for j, (units, values) in enumerate(zip(columns, (course.q, course.v), strict=True)):
         for axes, (unit, which) in zip(panels[:, j], units.items(), strict=False):
@@ -105,6 +107,7 @@ def motion(
             _event_lines(axes, motion)
     for axes in panels[-1]:
         axes.set_xlabel("time [s]")
+    legend_below(figure, 4, [Line2D([], [], label=x, **y) for x, y in _event_styles(motion)])
     return figure
 
 
@@ -115,8 +118,11 @@ def _finish(axes: Axes, scale: float, note: str = "") -> None:
     if high - low < _FLAT * scale:
         middle = (low + high) / 2
         axes.set_ylim(middle - scale / 2, middle + scale / 2)
-    if len(axes.get_legend_handles_labels()[0]) > 1:
-        axes.legend(ncols=2, title=note or None)
+    words = axes.get_legend_handles_labels()[1]
+    if len(words) > 1:
+        above: Any = {"loc": "lower left", "bbox_to_anchor": (0, 1), "borderaxespad": 0.2}
+        columns = 2 if max(map(len, words)) > _LONG else 3
+        axes.legend(ncols=columns, title=note or None, frameon=False, **above)
 
 
 def _scales(labels: list[str], motion: Motion) -> dict[str, float]:
@@ -265,15 +271,21 @@ def _gaps(axes: Axes, motion: Motion, shown: list[int] | None) -> str:
     return note
 
 
+def _event_styles(motion: Motion) -> list[tuple[str, dict[str, Any]]]:
+    """Kinds of events that a motion has and that are marked, and how their lines are drawn."""
+    styles: dict[str, dict[str, Any]] = {}
+    if len(motion.event_times("impact")) <= _MANY:
+        styles["impact"] = {"color": GREY, "lw": 0.4}
+    for kind, style in zip(_MARKED, ("--", ":", "-."), strict=True):
+        styles[kind] = {"color": "black", "lw": 0.8, "ls": style}
+    return [(kind, style) for kind, style in styles.items() if len(motion.event_times(kind))]
+
+
 def _event_lines(axes: Axes, motion: Motion) -> None:
     """A line at each impact, and at events of the marked kinds."""
-    impacts = motion.event_times("impact")
-    if len(impacts) <= _MANY:
-        for t in impacts:
-            axes.axvline(t, color=GREY, lw=0.4, zorder=0)
-    for kind, style in zip(_MARKED, ("--", ":", "-."), strict=True):
+    for kind, style in _event_styles(motion):
         for t in motion.event_times(kind)[:_MANY]:
-            axes.axvline(t, color="black", lw=0.8, ls=style, zorder=0)
+            axes.axvline(t, zorder=0, **style)
 
 
 def _ledger(axes: Axes, motion: Motion, course: _Course, system: System | None) -> None:
@@ -358,8 +370,12 @@ def phase_portrait(
     cut = np.flatnonzero(course.after)
     axes.plot(np.insert(position, cut, np.nan), np.insert(speed, cut, np.nan), color=COLOURS[0])
     jumps = np.stack([cut - 1, cut])
-    axes.plot(position[jumps], speed[jumps], "--", color=COLOURS[1], lw=0.8, zorder=0)
-    axes.set(xlabel=labels[coordinate], ylabel=rates[rate])
+    lines = axes.plot(position[jumps], speed[jumps], "--", color=COLOURS[1], lw=0.8, zorder=0)
+    hint = "" if names or system is not None else "  (`system=` or `names=` name it)"
+    axes.set(xlabel=labels[coordinate] + hint, ylabel=rates[rate])
+    if lines:
+        lines[0].set_label("jump at an event")
+        legend_below(figure, 1)
     return figure
 
 

@@ -2,6 +2,7 @@
 
 import functools
 import inspect
+import re
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
@@ -11,6 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from jimpact.bodies.base import split_name
@@ -31,6 +33,7 @@ COLUMNS = 2  # panels side by side
 
 _UPRIGHT = 8  # names of laws that stand side by side, at most
 _DECADES = 100.0  # an axis that spans less is labelled within its decades, too
+_MINUS = re.compile(r"(?<![\w)\]}])-(?=\.?\d)")  # a hyphen in the place of a minus sign
 _PLAIN = (1e-3, 1e5)  # numbers within are written without a power of ten
 
 P = ParamSpec("P")
@@ -49,7 +52,10 @@ def styled(kind: type = object) -> Callable[[Callable[P, R]], Callable[P, R]]:
             """The picture."""
             check_kind(first, args[0] if args else keywords.get(first), kind)
             with matplotlib.style.context(SHEET):
-                return picture(*args, **keywords)
+                result = picture(*args, **keywords)
+            for text in result.findobj(Text) if isinstance(result, Figure) else ():
+                text.set_text(_MINUS.sub("\N{MINUS SIGN}", text.get_text()))
+            return result
 
         return drawn
 
@@ -126,6 +132,7 @@ def panels_of_laws(
     for axes in panels:
         axes.grid(False, axis="x")
     many = len(laws) > _UPRIGHT
+    laws = [law.replace("lzb", "LZB") for law in laws]
     words = laws if many else [law.replace(", ", ",\n").replace("_", "\n") for law in laws]
     at = range(len(laws))
     panels[-1].set_xticks(at, words, fontsize=SMALL, rotation=90 if many else 0)
@@ -181,14 +188,23 @@ def logarithmic(axes: Axes, which: str) -> None:
     else:
         few = high / low < _DECADES
         axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,), numticks=7))
-    axis.set_major_formatter(FuncFormatter(lambda x, _: in_words(x)))
+    axis.set_major_formatter(FuncFormatter(lambda x, _: _tick(x, *axis.get_view_interval())))
     axis.set_minor_formatter(NullFormatter())
+
+
+def _tick(x: float, first: float, last: float) -> str:
+    """A number on a logarithmic axis, all of them in the notation that its ends need."""
+    plain = all(_PLAIN[0] <= end < _PLAIN[1] for end in (first, last))
+    return in_words(x) if plain else as_power(x)
 
 
 def in_words(x: float) -> str:
     """A number for an axis; powers of ten as such."""
-    if x == 0 or _PLAIN[0] <= abs(x) < _PLAIN[1]:
-        return f"{x:g}"
+    return f"{x:g}" if x == 0 or _PLAIN[0] <= abs(x) < _PLAIN[1] else as_power(x)
+
+
+def as_power(x: float) -> str:
+    """A number as a factor, unless it is 1, and a power of ten."""
     power = int(np.floor(np.log10(abs(x)) + 1e-9))
     factor = x / 10.0**power
     head = "" if abs(factor - 1) < 1e-6 else f"{factor:.3g}\\cdot"

@@ -36,9 +36,30 @@ def is_traced(value: Any) -> bool:
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(value))
 
 
-def _not_numeric(name: str, value: Any) -> TypeError:
-    """The error for what is no array of numbers."""
+def _not_numeric(name: str, value: Any, kind: str = "") -> TypeError:
+    """The error for what is no array of numbers; `kind`: of its dtype."""
+    what = {
+        "c": "must be real, but is complex",
+        "M": "must be numbers, but holds dates: give seconds, (t - t[0]) / np.timedelta64(1, 's')",
+        "m": "must be numbers, but holds durations: give seconds, t / np.timedelta64(1, 's')",
+    }
+    if kind in what:
+        return TypeError(f"Argument `{name}` {what[kind]}.")
     return TypeError(f"Argument `{name}` must be numeric, but has value {short_repr(value)}.")
+
+
+def _on_host(name: str, value: Any) -> np.ndarray:
+    """`value` as an array of real numbers on the host."""
+    try:
+        host = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        raise ValueError(
+            f"Argument `{name}` must be an array, whose rows are equally long, but has value "
+            f"{short_repr(value)}."
+        ) from None
+    if host.dtype.kind not in "fiubV":  # V: the short floats of JAX
+        raise _not_numeric(name, value, host.dtype.kind)
+    return host
 
 
 def as_float_array(name: str, value: Any) -> "jax.Array":
@@ -51,12 +72,11 @@ def as_float_array(name: str, value: Any) -> "jax.Array":
     elif is_traced(value):  # a list of numbers, some of them traced
         array = jnp.asarray(value)
     else:
-        host = np.asarray(value)
-        if host.dtype.kind not in "fiu":
+        if _on_host(name, value).dtype.kind not in "fiu":
             raise _not_numeric(name, value)
         array = jnp.asarray(value)
     if jnp.issubdtype(array.dtype, jnp.complexfloating):
-        raise TypeError(f"Argument `{name}` must be real, but has dtype {array.dtype}.")
+        raise _not_numeric(name, value, "c")
     if not jnp.issubdtype(array.dtype, jnp.floating):
         array = array.astype(float)
     return array
@@ -105,10 +125,7 @@ def check_values(
     """Raise a ValueError unless all entries lie between `low` and `high`; TypeError: no numbers."""
     if value is None or is_traced(value):
         return
-    try:
-        entries = np.asarray(value, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise _not_numeric(name, value) from error
+    entries = _on_host(name, value).astype(float)
     finite = np.isfinite(entries) | (np.isnan(entries) & nan_allowed)
     inside = (entries > low if open_low else entries >= low) & (entries <= high)
     bad = ~(finite & (inside | np.isnan(entries)))
@@ -199,10 +216,16 @@ def in_numbers(values: Any) -> str:
 
 def check_kind(name: str, value: Any, kind: type) -> None:
     """Raise a TypeError unless `value` is an instance of `kind`."""
-    if not isinstance(value, kind):
-        raise TypeError(
-            f"Argument `{name}` must be of type {kind.__name__}, but is {short_repr(value)}."
-        )
+    if isinstance(value, kind):
+        return
+    hint = ""
+    if kind is Mapping:
+        hint = " Give each a name, as in {'a': ...}."
+    elif kind.__name__ == "Scene" and callable(getattr(value, "scene", None)):
+        hint = " A body has a scene at each configuration: `.scene(q)`."
+    raise TypeError(
+        f"Argument `{name}` must be of type {kind.__name__}, but is {short_repr(value)}.{hint}"
+    )
 
 
 def check_function(name: str, value: Any) -> None:

@@ -39,8 +39,17 @@ def progress_bar(progress: float | None) -> Iterator[Show]:
         return
     check_values("progress", progress, low=0.0)
     after = LONG if progress is None else 0.0 if progress is True else progress
-    with (_bar if terminal else _lines)(after) as show:
+    with (_bar if terminal and _has_bars() else _lines)(after) as show:
         yield show
+
+
+def _has_bars() -> bool:
+    """Whether rich is there; a long run does not fail without it."""
+    try:
+        import rich.progress  # noqa: F401
+    except ImportError:
+        return False
+    return True
 
 
 @contextlib.contextmanager

@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import io
+import re
 import shutil
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -17,6 +18,7 @@ from jimpact.tools.checks import needed
 if TYPE_CHECKING:
     from matplotlib.figure import Figure  # which takes long to import
 
+_ROUNDING = 1e-12  # share of a scale that is printed as 0; ten times more hides small velocities
 _LEAST_WIDTH = 20  # characters of a column whose text is wrapped; narrower ones are not readable
 
 
@@ -89,6 +91,49 @@ def readable_unit(unit: str, largest: float) -> tuple[str, float]:
     return next((row for row in sizes.items() if largest >= row[1]), (f"n{unit}", 1e-9))
 
 
+def counted(count: int, noun: str, plural: str = "") -> str:
+    """So many of a thing, in words; `plural`: of a noun whose plural is not its s.
+
+    >>> from jimpact.tools.records import counted
+    >>> counted(1, "shot"), counted(2000, "sample"), counted(2, "body", "bodies")
+    ('1 shot', '2,000 samples', '2 bodies')
+    """
+    return f"{count:,} {noun if count == 1 else plural or f'{noun}s'}"
+
+
+def degrees(count: int) -> str:
+    """So many degrees of freedom, in words.
+
+    >>> from jimpact.tools.records import degrees
+    >>> degrees(1), degrees(2)
+    ('1 degree of freedom', '2 degrees of freedom')
+    """
+    return counted(count, "degree of freedom", "degrees of freedom")
+
+
+def formatted(value: Any, form: str) -> str:
+    """A number as of `format`; one that rounds to 0 has no minus sign.
+
+    >>> from jimpact.tools.records import formatted
+    >>> formatted(-0.0, "6g"), formatted(-4e-9, ".5f"), formatted(-0.01, ".1e")
+    ('     0', '0.00000', '-1.0e-02')
+    """
+    text = format(value, form)
+    if "-" in text and value <= 0 and not re.search("[1-9]|inf", text.partition("e")[0]):
+        text = text.replace("-", "", 1).rjust(len(text) if text[0] == " " else 0)
+    return text
+
+
+def plain(value: float, scale: float = 1.0) -> float:
+    """0 in the place of what is rounding beside `scale`, so that no report has a -0.
+
+    >>> from jimpact.tools.records import plain
+    >>> plain(-0.0), plain(-1e-17), plain(-0.5)
+    (0.0, 0.0, -0.5)
+    """
+    return 0.0 if abs(value) <= _ROUNDING * abs(scale) else value
+
+
 def with_error(value: float, error: float) -> str:
     """A value and its standard error, to the digits that count.
 
@@ -155,7 +200,7 @@ class Column(NamedTuple):
         """A value as it is printed; '' for None and NaN, unless `form` is a function."""
         if callable(self.form):
             return self.form(value)
-        return "" if value is None or value != value else format(value, self.form)
+        return "" if value is None or value != value else formatted(value, self.form)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -76,6 +76,7 @@ def test_fit_of_a_study(tmp_path, capsys):
     for words in ("study", "as measured", "corrected ", "Rank: ", "Warnings", "Picture: "):
         assert words in said.out
     assert picture.read_text().startswith("<?xml")
+    assert f"folder {picture.parent} was made." in said.err
     options = ["--law", "newton", "--method", "adam", "--starts", "1", "--json"]
     code, said = call(capsys, "fit", "study.toml", "--out", tmp_path, *options)
     result = json.loads(said.out)["fits"]["as measured"]
@@ -425,6 +426,13 @@ def test_the_notebook_of_a_new_study_runs(tmp_path, capsys, kind):
     nbclient.NotebookClient(
         notebook, timeout=None, kernel_name="python3", resources=place
     ).execute()
+
+
+def test_messages_name_the_help_of_their_command(capsys):
+    for arguments in (["--starts", "x"], ["--nonsense"]):
+        with pytest.raises(SystemExit):
+            call(capsys, "fit", *arguments)
+        assert "jimpact fit --help" in " ".join(capsys.readouterr().err.split())
 
 
 def test_laws(capsys, tmp_path, monkeypatch):

@@ -596,3 +596,10 @@ def test_offsets_of_gaps_are_in_units_of_the_larger_indentation():
     gaps = larger * (2.0 + 0.5 * offset[:, None] * jnp.array([[1.0, -1.0]]))
     direct = jax.vmap(lambda g: ji.impact(law, ji.chain(jnp.array(masses), gaps=g), v))(gaps)
     np.testing.assert_allclose(outcome.velocity, direct.velocity, rtol=0, atol=1e-9)
+
+
+def test_a_study_gives_contacts_with_forces_their_friction():
+    """As other laws: `compare` would else show it without, in silence."""
+    row = ji.REGISTRY["compliant"]
+    assert float(row.build(stiffness=1e6, friction=0.3).friction) == 0.3
+    assert row.in_python.startswith("ji.Compliant(force, ")

@@ -579,6 +579,11 @@ def test_further_shots_are_predicted_with_errors():
         np.testing.assert_allclose(out.velocity, at_0 + e * (at_1 - at_0), rtol=1e-9)
         np.testing.assert_allclose(out.standard_error, error * np.abs(at_1 - at_0), rtol=1e-6)
         assert (out.status == 0).all()
+    head, first, *_, last = str(out).splitlines()
+    assert head.split()[:5] == ["shot", "coordinate", "velocity", "std.", "error"]
+    assert first.split()[:3] == ["1", "1", f"{out.velocity[0, 0]:.5g}"]
+    assert first.split()[-1] == "m/s"
+    assert last == "low to high: of a measurement."
     q = stats.norm.ppf(0.9)
     half = q * np.sqrt((error * (at_1 - at_0)) ** 2 + 0.02**2)
     band = found.predict(further, level=0.8)
@@ -1162,15 +1167,20 @@ PER_CONTACT = ji.LZB([0.9, 0.9], [1.0, 1.0])
         (ji.Newton(0.9), BALLS, TWO, {}, r"one velocity per body of the scene: it has 2 a shot, but the scene has 3"),
         (ji.Newton(0.9), None, TWO, {}, r"`scene` must be a Scene"),
         (ji.Newton([0.9, 0.9]), PAIR, TWO, {}, r"`restitution` must have shape \(1,\)"),
-        (ji.Newton(0.9), PAIR, TWO, {"search": ji.Search("newton")}, r"`method` must be one of 'levenberg-marquardt', .*'newton'"),
-        (ji.Newton(0.9), PAIR, TWO, {"search": ji.Search("newton", max_steps=5)}, r"`method` must be one of 'levenberg-marquardt', .*'newton'"),
         (ji.Newton(0.9), PAIR, TWO, {"starts": 0}, r"`starts` must be an int >= 1"),
-        (ji.Newton(0.9), PAIR, TWO, {"search": ji.Search(max_steps=0)}, r"`max_steps` must be an int >= 1"),
     ],
 )  # fmt: skip
 def test_bad_arguments(law, scene, data, options, message):
     with pytest.raises(ValueError, match=message):
         ji.fit(law, scene, data, **options)
+
+
+def test_a_wrong_unit_is_said_before_the_search():
+    """mm/s after: a warning, whatever the search then finds."""
+    post = 1000.0 * simulated(ji.Newton(0.6), PAIR, SHOTS)
+    with pytest.warns(UserWarning, match=r"momentum after is 1000 times .* mm/s in one of"):
+        found = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post), starts=1)
+    assert "the units are suspect" in found.reservations
 
 
 def test_bad_level():

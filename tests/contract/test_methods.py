@@ -431,6 +431,9 @@ def test_known_ratio(ratio, tolerance, name):
     for other in simple[: simple.index(name)] if name in simple else simple:
         assert np.abs(result.candidates[other].velocity - exact).max() > tolerance
     assert f"k2/k1 = {ratio:.3g}" in result.reason
+    itself = "taken as known: lzb is the reference itself, and compliant, with springs"
+    assert (itself in result.reason) == (name == "lzb")
+    assert "`jimpact advise --stiffness-range" in " ".join(str(result).split())
 
 
 @pytest.mark.slow

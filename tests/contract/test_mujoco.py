@@ -79,6 +79,17 @@ def test_rows_are_those_of_mujoco(pile):
     np.testing.assert_allclose(np.diag(ji.delassus_matrix(world.scene)), w, rtol=1e-12)
 
 
+def test_the_scene_prints_a_row_for_each_contact(pile):
+    _, _, world = pile
+    head, columns, *rows = str(world).splitlines()
+    contacts = world.scene.contacts
+    assert head == f"{world.scene.size} coordinates (as data.qvel), {contacts} contacts"
+    for word in ("geoms", "gap [m]", "gap velocity [m/s]", "friction"):
+        assert word in columns
+    assert [row.split()[0] for row in rows] == [str(j + 1) for j in range(contacts)]
+    assert world.names[0] in rows[0]
+
+
 def test_gap_velocities_are_rates_of_distances(pile):
     model, data, world = pile
     gamma = np.asarray(ji.gap_velocity(world.scene, world.velocity))

@@ -163,3 +163,46 @@ def test_a_room_imports_while_those_beside_and_above_it_are_blocked(room):
     script = ALONE.format(blocked=blocked, modules=own)
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT)
     assert done.returncode == 0, done.stderr[-600:]
+
+
+BARE = """
+import sys
+
+WITHOUT = {without}
+
+class Blocked:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in WITHOUT:
+            raise ImportError(f"{{name}} is blocked")
+
+sys.meta_path.insert(0, Blocked())
+import jimpact as ji
+from jimpact.cli.main import main
+
+pair = ji.chain([1.0, 3.0])
+out = ji.impact(ji.Newton(0.5), pair, [1.0, 0.0])
+print([round(float(v), 6) for v in out.velocity])
+for ask in (
+    lambda: ji.plot.system,
+    lambda: ji.stability_map,
+    lambda: ji.Search("adagrad"),
+    lambda: main(["compare"]),
+):
+    try:
+        ask()
+    except ImportError as error:
+        print(error)
+"""
+
+
+def test_impacts_need_no_package_but_jax_and_what_it_brings():
+    """Pictures, the chart, gradient descent and the command line name what they need."""
+    without = ["matplotlib", "diffrax", "optax", "tyro", "rich", "platformdirs"]
+    script = BARE.format(without=without)
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr[-600:]
+    velocity, *said = done.stdout.splitlines()
+    assert velocity == "[-0.125, 0.375]"  # (m1 - e m2) / (m1 + m2), m1 (1 + e) / (m1 + m2)
+    said.append(done.stderr.strip())
+    for module, line in zip(without[:4], said, strict=True):
+        assert f"{module} must be installed for this, but is not: pip install {module}." in line

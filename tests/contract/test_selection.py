@@ -1,6 +1,8 @@
 """Which law, restitution by speed, scatter between shots, the posterior."""
 
 import json
+import sys
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -280,3 +282,11 @@ def test_exponents_are_sought_where_they_mean_something():
     data = ji.Experiments([1.0, 0.0, 0.0], [-0.06, 0.1, 0.96])
     problem = ji.FitProblem.from_shots(law, balls, data, "exponent")
     assert problem.domains.tolist() == [[1.0, 5.0], [1.0, 7.0]]
+
+
+def test_a_posterior_by_an_arviz_that_is_too_new_is_refused_before_it_is_drawn(monkeypatch):
+    """Version 1 has no `InferenceData`: the message says so at once."""
+    monkeypatch.setitem(sys.modules, "numpyro", SimpleNamespace())
+    monkeypatch.setitem(sys.modules, "arviz", SimpleNamespace(__version__="1.3.0"))
+    with pytest.raises(ImportError, match=r"arviz must be older than 1 .* is 1\.3\.0: pip install"):
+        ji.posterior(None)

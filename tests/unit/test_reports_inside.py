@@ -4,6 +4,7 @@ import json
 import re
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +17,7 @@ from programs import CODE
 
 import jimpact as ji
 from jimpact.fits.findings import Finding
+from jimpact.fits.report import _correlations
 from jimpact.fits.selection import LawFit, LawFits
 from jimpact.fits.uncertainty import Profile
 from jimpact.motion.record import KIND_CODE, Motion, no_events
@@ -61,6 +63,18 @@ def test_report_of_a_fit():
     assert "The data gain energy." in text
     assert "NOT converged" in str(canned(4, converged=False))
     assert max(map(len, text.splitlines())) < 200
+
+
+def test_correlations_of_a_fit():
+    """Of determined parameters, from a tenth on, the largest first."""
+    names = tuple("abcd")
+    matrix = np.array(
+        [[1, 0.05, -0.9, 0.5], [0.05, 1, 0.3, 0.5], [-0.9, 0.3, 1, 0.5], [0.5, 0.5, 0.5, 1]]
+    )
+    seen = np.array([True, True, True, False])
+    lines = _correlations(SimpleNamespace(names=names, correlation=matrix, determined=seen))
+    assert lines[1:] == ["  - a and c: -0.900", "  - b and c: 0.300"]
+    assert not _correlations(SimpleNamespace(names=names, correlation=np.eye(4), determined=seen))
 
 
 def test_a_fit_in_one_sentence():
@@ -327,6 +341,10 @@ def test_phase_portrait_of_what_moves():
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("angle [rad]", "angle' [rad/s]")
     jump = axes.lines[1]
     np.testing.assert_array_equal(jump.get_ydata().ravel(), [-2.0, 3.0])
+    (legend,) = axes.figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == ["jump at an event"]
+    unnamed = ji.plot.phase_portrait(found).axes[0].get_xlabel()
+    assert unnamed == "q3  (`system=` or `names=` name it)"
     with pytest.raises(ValueError, match=r"`coordinate` must lie in \[0, 2\], but is 3"):
         ji.plot.phase_portrait(found, 3)
 
