@@ -37,7 +37,7 @@ HERTZ = ji.Compliant(ji.Hertz(1e9))
 
 DIMENSIONLESS = (  # quantities that have no unit
     "ratio", "restitution", "exponent", "setting", "error", "evaluations", "dispersion",
-    "share", "method", "balls N", "deviance", "stiffness",
+    "share", "method", "balls N", "deviance", "stiffness", "residual / sigma",
 )  # fmt: skip
 
 
@@ -48,8 +48,18 @@ def correlated():
     """Of two parameters, and one that the data do not determine."""
     covariance = np.array([[4e-4, 3e-4, 0.0], [3e-4, 9e-4, 0.0], [0.0, 0.0, np.inf]])
     names = ("restitution[1]", "restitution[2]", "stiffness[2]")
-    known = {"names": names, "value": np.array([0.8, 0.7, 1.0]), "covariance": covariance}
-    return dataclasses.replace(canned(4), standard_error=np.sqrt(np.diag(covariance)), **known)
+    known = {"names": names, "covariance": covariance}
+    error = np.sqrt(np.diag(covariance))
+    return canned(4, (0.8, 0.7, 1.0), standard_error=error, **known)
+
+
+def track():
+    """A ball that bounces once."""
+    t = np.arange(40) / 60
+    since = t - 0.3
+    y = np.where(since < 0, -3.0, 2.4) * since - 4.905 * since**2
+    y += 0.001 * np.random.default_rng(0).normal(size=40)
+    return ji.plot.track(ji.tracks.find_impacts(t, y, acceleration=-9.81), "a ball")
 
 
 def correlated_draws():
@@ -238,6 +248,7 @@ PICTURES = {
     "system, a chain": lambda: ji.plot.system(ji.chain([1.0, 4.0, 0.1], "right", [0, 1, 0]), STRIKE),
     "system, a block": lambda: ji.plot.system(BLOCK, BLOCK.touching(0.2), "a block"),
     "force_chains": lambda: force_chains(),
+    "track": track,
 }  # fmt: skip
 
 
