@@ -29,9 +29,27 @@ def noise(q: np.ndarray) -> np.ndarray:
     They vanish for a constant acceleration; the median of their sizes, times 1.4826 (normal
     errors), does not see the few at impacts. The variance of a third difference is 20 sigma^2.
     """
-    sizes = np.nanmedian(np.abs(np.diff(q, 3, axis=0)), axis=0)
-    extent = np.nanmax(q, axis=0) - np.nanmin(q, axis=0)
-    return np.maximum(1.4826 * sizes / np.sqrt(20), LEAST_NOISE * max(extent.max(), 1e-300))
+    sizes = np.array([_median(np.abs(_differences(x, 3))) for x in q.T])
+    extent = (np.nanmax(q, axis=0) - np.nanmin(q, axis=0)).max()
+    least = LEAST_NOISE * (extent if extent > 0 else 1.0)  # where nothing moves any is little
+    return np.maximum(1.4826 * sizes / np.sqrt(20), least)
+
+
+def _differences(x: np.ndarray, order: int, step: int = 1) -> np.ndarray:
+    """Differences of seen positions (T,); of those alone where frames are lost by turns."""
+
+    def all_of(x: np.ndarray) -> np.ndarray:
+        for _ in range(order):
+            x = x[step:] - x[:-step]
+        return x[np.isfinite(x)]
+
+    found = all_of(x)
+    return found if found.size else all_of(x[np.isfinite(x)])
+
+
+def _median(x: np.ndarray) -> float:
+    """The median; 0 of nothing."""
+    return float(np.median(x)) if x.size else 0.0
 
 
 def price(frames: int, n: int) -> float:
@@ -157,8 +175,13 @@ def curvature(t: np.ndarray, q: np.ndarray, shortest: int) -> np.ndarray:
     """A first value (n,) of the acceleration: the median of second differences."""
     step = max(shortest, 2)  # over so many frames, of which most lie in one flight
     step = step if len(q) > 2 * step else 1
-    second = q[2 * step :] - 2 * q[step:-step] + q[: -2 * step]
-    return np.nanmedian(second, axis=0) / (step * np.median(np.diff(t))) ** 2
+    found = np.zeros(q.shape[1])
+    for c, x in enumerate(q.T):
+        whole = np.isfinite(x[2 * step :] + x[step:-step] + x[: -2 * step]).any()
+        times = t if whole else t[np.isfinite(x)]
+        if len(times) > 2 * step:
+            found[c] = _median(_differences(x, 2, step)) / (step * np.median(np.diff(times))) ** 2
+    return found
 
 
 def common_acceleration(t: np.ndarray, q: np.ndarray, flights: list[np.ndarray]) -> np.ndarray:
