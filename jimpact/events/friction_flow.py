@@ -222,7 +222,6 @@ class FrictionFlow(ContactFlow):
         resting = loaded & rests & ((slip != 0) | closed)
         check = any_of(stopped | (closed & resting))
         to_check = check & loaded & (stopped | resting | (slip == 0))
-        u = jnp.where(to_check, 0.0, u)
         still, state = jax.lax.stop_gradient((self, y))
         f = still.soon(modes, state)
         most = still.friction * f
@@ -231,7 +230,31 @@ class FrictionFlow(ContactFlow):
         stick, towards = distribute(still.tangent, b, most, to_check)
         towards = jnp.where(stick, 0, jnp.sign(towards).astype(slip.dtype))
         slip = jnp.where(to_check, towards, slip)
-        return jnp.concatenate([modes[: 2 * m], slip]), jnp.concatenate([y[: 3 * m], u, y[4 * m :]])
+        y = self._at_rest(modes, y, to_check, jnp.where(stick, most, 0.0))
+        return jnp.concatenate([modes[: 2 * m], slip]), y
+
+    def _at_rest(
+        self, modes: jax.Array, y: jax.Array, rests: jax.Array, most: jax.Array
+    ) -> jax.Array:
+        """The state with slips of 0 at contacts (m, B) that rest, those that stick by friction.
+
+        Slips are nothing there, but their tangents are not: those of a contact that sticks are
+        taken by a tangential impulse, of one that begins to slide they remain.
+        """
+        m, (x, g, p), u = self.contacts, self.rows(y), self.slip(y)
+        weight, holds = load_shares(most), most > 0
+        soft = jnp.where(holds, ridge(u.dtype), 1.0)
+        right = jnp.where(holds, -u, 0.0)
+        side = weight * regularized_once(self.tangent * weight[None], soft, right)
+        g = g + self.as_rows(modes, times(self.normal_tangent, side))
+        u = u + times(self.tangent, side)
+        u = jnp.where(rests, u - jax.lax.stop_gradient(u), u)
+        return jnp.concatenate([x, g, p, u, y[4 * m : 5 * m] + side, y[5 * m :]])
+
+    def as_rows(self, modes: jax.Array, gamma: jax.Array) -> jax.Array:
+        """Changes of gap velocities (m, B) as those of the rows g; 0 where e = 0 scales them."""
+        scale = self.scales(modes)
+        return jnp.where(scale > 0, gamma / jnp.where(scale > 0, scale, 1.0), 0.0)
 
     def soon(self, modes: jax.Array, y: jax.Array) -> jax.Array:
         """Forces (m, B) a moment later, in parts of the largest."""

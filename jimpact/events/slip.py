@@ -484,7 +484,29 @@ class SlipFlow(FrictionFlow):
         inside, towards = distribute(still.tangent, b, most, to_check)
         towards = angle_of(pairs(towards))
         begins = jnp.stack([jnp.zeros_like(towards), jnp.where(inside, 0.0, towards)], 1)
+        lost = jnp.where((closed & resting & inside)[:, None], q, 0.0)
         q = jnp.where(to_check[:, None], begins, q)
         checked = jnp.where(inside, Slip.STICKS, Slip.CREEPS)
         slip = jnp.where(to_check, checked, slip).astype(modes.dtype)
-        return jnp.concatenate([modes[: 2 * m], slip]), self.with_slip(y, q)
+        modes, held = jnp.concatenate([modes[: 2 * m], slip]), to_check & inside & (most > 0)
+        return modes, self._stopped(modes, self.with_slip(y, q), flat(lost), held)
+
+    def _stopped(
+        self, modes: jax.Array, y: jax.Array, lost: jax.Array, held: jax.Array
+    ) -> jax.Array:
+        """The state after slips (2 m, B) of nothing have been taken from contacts `held` (m, B).
+
+        As in the plane: the tangents of these slips are taken by a tangential impulse.
+        """
+        m, (x, g, p), q = self.contacts, self.rows(y), self.slip(y)
+        side = times(pseudoinverse(self.tangent, twice(held)), -lost)
+        side = side - jax.lax.stop_gradient(side)
+        g = g + self.as_rows(modes, times(self.normal_tangent, side))
+        du, (_, slips, creeps) = pairs(times(self.tangent, side)), self.sliding(modes)
+        along, across = polar(jnp.where(slips | creeps, q[:, 1], 0.0))
+        r = jnp.where(slips, self.speed(modes, q), 1.0)
+        turn = jnp.where(slips, dot(across, du), 0.0)
+        polars = jnp.stack([dot(along, du), turn], 1) / r[:, None]
+        free = ~self.loaded(modes)
+        q = q + jnp.where((slips | creeps)[:, None], polars, jnp.where(free[:, None], du, 0.0))
+        return jnp.concatenate([x, g, p, flat(q), y[5 * m : 7 * m] + side, y[7 * m :]])

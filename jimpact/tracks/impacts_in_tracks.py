@@ -8,7 +8,7 @@ import numpy as np
 from jimpact.fits.shots_file import ANGULAR, LINEAR
 from jimpact.tools.checks import as_float_array, check_concrete, check_values
 from jimpact.tracks.arcs import Arcs, fit_arcs
-from jimpact.tracks.judging import findings, findings_of_input, findings_of_signs
+from jimpact.tracks.judging import findings, findings_of_input, findings_of_noise, findings_of_signs
 from jimpact.tracks.segments import (
     SMALLEST_JUMP,
     common_acceleration,
@@ -91,8 +91,9 @@ def find_impacts(
     free = known is None
     arcs, flights = _of_true_impacts(x, q, given, flights, a, free, contact)
     if sigma is None:  # what the residuals show; jumps are judged anew by it
-        given = _of_residuals(given, arcs, free)
+        rough, given = given, _of_residuals(given, arcs, free)
         arcs, flights = _of_true_impacts(x, q, given, flights, a, free, contact)
+        notes += findings_of_noise(rough, given)
     if window is not None and len(arcs.instants) > 2:
         arcs = _windowed(x, q, given, arcs, free, contact, window)
     return _as_track(t, q, given, arcs, names, notes)

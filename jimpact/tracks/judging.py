@@ -22,6 +22,9 @@ DOUBLED = 0.05
 # Error of an angle [rad], 6 degrees, from which on degrees are suspected: trackers have a tenth of
 # it and less. Ten times more is half a turn; ten times less would warn of many good tracks.
 COARSE_ANGLE = 0.1
+# Residuals in units of the noise from frame to frame from which on flights do not explain them.
+# White noise stays below 1.3; ten times more would pass impacts that were not found.
+UNEXPLAINED = 3.0
 # chi^2 by which an impact must explain frames better than one parabola without it; by chance one
 # impact in a thousand gains less. Ten times more would doubt soft impacts; ten times less, and
 # drag or a wrong acceleration would pass as impacts.
@@ -77,6 +80,15 @@ def findings_of_signs(
                 f"{acceleration[c]:.4g}: does it point down, as y of pixels? Then take -q of it."
             )
     return found
+
+
+def findings_of_noise(differences: np.ndarray, residuals: np.ndarray) -> list[str]:
+    """Coordinates whose residuals are far above the noise from frame to frame."""
+    return [
+        f"Coordinate {c + 1} has residuals of {residuals[c]:.2g}, but noise of {differences[c]:.2g}"
+        " from frame to frame: is an impact missing, or do the flights bend?"
+        for c in np.flatnonzero(residuals > UNEXPLAINED * differences)
+    ]
 
 
 def findings(t: np.ndarray, q: np.ndarray, sigma: np.ndarray, arcs: Arcs) -> list[str]:

@@ -5,6 +5,8 @@ chi^2 and a price for beginning one; dynamic programming finds the partition of 
 et al., IEEE Signal Processing Letters 12, 2005).
 """
 
+from itertools import pairwise
+
 import numpy as np
 from scipy.stats import chi2
 
@@ -29,9 +31,27 @@ def noise(q: np.ndarray) -> np.ndarray:
     They vanish for a constant acceleration; the median of their sizes, times 1.4826 (normal
     errors), does not see the few at impacts. The variance of a third difference is 20 sigma^2.
     """
-    sizes = np.nanmedian(np.abs(np.diff(q, 3, axis=0)), axis=0)
-    extent = np.nanmax(q, axis=0) - np.nanmin(q, axis=0)
-    return np.maximum(1.4826 * sizes / np.sqrt(20), LEAST_NOISE * max(extent.max(), 1e-300))
+    sizes = np.array([_median(np.abs(_differences(x, 3))) for x in q.T])
+    extent = (np.nanmax(q, axis=0) - np.nanmin(q, axis=0)).max()
+    least = LEAST_NOISE * (extent if extent > 0 else 1.0)  # where nothing moves any is little
+    return np.maximum(1.4826 * sizes / np.sqrt(20), least)
+
+
+def _differences(x: np.ndarray, order: int, step: int = 1) -> np.ndarray:
+    """Differences of seen positions (T,); of those alone where frames are lost by turns."""
+
+    def all_of(x: np.ndarray) -> np.ndarray:
+        for _ in range(order):
+            x = x[step:] - x[:-step]
+        return x[np.isfinite(x)]
+
+    found = all_of(x)
+    return found if found.size else all_of(x[np.isfinite(x)])
+
+
+def _median(x: np.ndarray) -> float:
+    """The median; 0 of nothing."""
+    return float(np.median(x)) if x.size else 0.0
 
 
 def price(frames: int, n: int) -> float:
@@ -149,16 +169,66 @@ def flights_and_acceleration(
     for _ in range(ROUNDS):
         flights = flights_of(t, q, sigma, acceleration, shortest)
         if flights:
+            flights = _joined_at_any(t, q, sigma, acceleration, flights)
             acceleration = common_acceleration(t, q, flights)
     return flights, acceleration
+
+
+def _joined_at_any(
+    t: np.ndarray,
+    q: np.ndarray,
+    sigma: np.ndarray,
+    acceleration: np.ndarray,
+    flights: list[np.ndarray],
+) -> list[np.ndarray]:
+    """The flights, neighbours joined where all cost less so, each time at their best acceleration.
+
+    At a slightly wrong one long flights are parted, and the parts show theirs less well.
+    """
+    start, flights = price(*q.shape), list(flights)
+
+    def moments(frames: np.ndarray) -> np.ndarray:
+        """Sums (n, 3) over a flight without its line: of rest^2, rest curve and curve^2."""
+        x, sums = t[frames] - t[frames].mean(), np.zeros((q.shape[1], 3))
+        for c in range(q.shape[1]):
+            ok = np.isfinite(q[frames, c])
+            line = np.linalg.qr(np.vander(x[ok], 2))[0]
+            both = np.stack([q[frames[ok], c] - acceleration[c] * x[ok] ** 2 / 2, x[ok] ** 2 / 2])
+            rest, curve = (both - both @ line @ line.T) / sigma[c]
+            sums[c] = rest @ rest, rest @ curve, curve @ curve
+        return sums
+
+    def least(sums: np.ndarray) -> np.ndarray:
+        """chi^2 of all (.., n, 3) at their best acceleration."""
+        return (sums[..., 0] - sums[..., 1] ** 2 / np.maximum(sums[..., 2], 1e-300)).sum(axis=-1)
+
+    alone = [moments(f) for f in flights]
+    pairs = [moments(np.concatenate(two)) for two in pairwise(flights)]
+    while pairs:
+        whole = np.sum(alone, axis=0)
+        after = np.array([least(whole - a - b + p) for (a, b), p in zip(pairwise(alone), pairs)])
+        k = int(np.argmin(after))
+        if after[k] >= least(whole) + start:
+            break
+        flights[k : k + 2] = [np.concatenate(flights[k : k + 2])]
+        alone[k : k + 2] = [pairs.pop(k)]
+        for i in (k - 1, k):
+            if 0 <= i < len(pairs):
+                pairs[i] = moments(np.concatenate(flights[i : i + 2]))
+    return flights
 
 
 def curvature(t: np.ndarray, q: np.ndarray, shortest: int) -> np.ndarray:
     """A first value (n,) of the acceleration: the median of second differences."""
     step = max(shortest, 2)  # over so many frames, of which most lie in one flight
     step = step if len(q) > 2 * step else 1
-    second = q[2 * step :] - 2 * q[step:-step] + q[: -2 * step]
-    return np.nanmedian(second, axis=0) / (step * np.median(np.diff(t))) ** 2
+    found = np.zeros(q.shape[1])
+    for c, x in enumerate(q.T):
+        whole = np.isfinite(x[2 * step :] + x[step:-step] + x[: -2 * step]).any()
+        times = t if whole else t[np.isfinite(x)]
+        if len(times) > 2 * step:
+            found[c] = _median(_differences(x, 2, step)) / (step * np.median(np.diff(times))) ** 2
+    return found
 
 
 def common_acceleration(t: np.ndarray, q: np.ndarray, flights: list[np.ndarray]) -> np.ndarray:

@@ -774,3 +774,42 @@ def test_history_of_contacts_with_friction():
     close(h.tangential_impulse[-1], out.tangential_impulse, atol=1e-7)
     assert (np.abs(h.tangential_force) <= 0.3 * h.force * (1 + 1e-9)).all()
     assert (h.tangential_force * h.slip <= 1e-9).all()
+
+
+def straight(kind):
+    """Body, and slips (t, n) of its contact: a disc of 0.3 m, a sphere of 0.2 m."""
+    if kind == "disc":
+        return ji.Disc(0.3, 2.0), np.array([0.0, -1.2, 0.0])
+    return ji.Sphere(0.2, 2.0), np.array([0.0, 0.0, -1.2, 0.0, 0.0, 0.5])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["disc", "sphere"])
+def test_slope_of_a_contact_that_falls_straight(kind):
+    """Without slip it sticks at once: `dv+/dv-` takes the slip away, `1 - M^-1 H K^-1 H^T`."""
+    body, v = straight(kind)
+    scene = body.scene(body.touching())
+    h, mass = np.asarray(scene.tangents), np.asarray(scene.mass)
+    normal = np.asarray(scene.normals)[:, 0]
+    moves = np.linalg.solve(np.diag(mass), h) if mass.ndim == 1 else np.linalg.solve(mass, h)
+    right = np.eye(len(v)) - moves @ np.linalg.solve(h.T @ moves, h.T)
+    right[np.ix_(normal != 0, normal != 0)] = -0.6
+    law = ji.LZB(0.6, friction=0.2)
+    for jacobian in (jax.jacfwd, jax.jacrev):
+        close(jacobian(lambda v: ji.impact(law, scene, v).velocity)(v), right, atol=1e-7)
+
+
+@pytest.mark.slow
+def test_slope_of_a_block_that_falls_flat():
+    """Both corners stick at once: differences meet the slope as they shrink, like h^0.4."""
+    block = ji.Block(0.5, 0.3)
+    scene, law, v = block.scene(block.touching()), ji.LZB(0.4, friction=0.5), np.array([0, -1.0, 0])
+
+    @jax.jit
+    def after(v):
+        return ji.impact(law, scene, v).velocity
+
+    slope, way = jax.jacfwd(after)(v) @ np.eye(3)[0], np.eye(3)[0]
+    steps = np.array([1e-4, 1e-6])
+    off = [np.abs((after(v + s * way) - after(v - s * way)) / (2 * s) - slope).max() for s in steps]
+    assert off[1] < 0.3 * off[0] < 0.3 * 0.3

@@ -254,6 +254,45 @@ def test_a_track_without_an_impact_says_so():
         track.experiments()
 
 
+def test_a_track_that_does_not_move_has_no_impact():
+    """Neither at a place, nor at 0, where there is no scale of lengths."""
+    for place in (0.0, 0.4):
+        track = ji.tracks.find_impacts(np.arange(30) / 100, np.full(30, place))
+        assert not track.impacts
+        assert "No impact" in track.warnings[0]
+
+
+@pytest.mark.filterwarnings("error")
+def test_frames_lost_by_turns():
+    """Each second frame of a coordinate: no three in a row, the instant and velocities are found."""
+    t = np.arange(80) / 200
+    q = np.where(t < 0.203, 0.3 - 1.5 * t, -0.0045 + 0.9 * (t - 0.203))
+    q = np.where(np.arange(80) % 2, q + 1e-4 * np.random.default_rng(2).normal(size=80), np.nan)
+    for sigma in (None, 1e-4):
+        (impact,) = ji.tracks.find_impacts(t, q, sigma).impacts
+        np.testing.assert_allclose([*impact.pre, *impact.post], [-1.5, 0.9], atol=0.01)
+        assert abs(impact.time - 0.203) < 4 * impact.time_error < 1e-3
+
+
+def test_impacts_of_unknown_gravity_are_all_found():
+    """Four bounces at 500 frames a second, one frame in fifteen lost."""
+    t, speed, e = np.arange(618) / 500, 9.80665 * 0.38853, 0.558
+    at = 0.38853 + 2 * 0.38853 * np.concatenate([[0.0], np.cumsum(e ** np.arange(1, 4))])
+    flight = np.searchsorted(at, t)
+    since = np.where(flight > 0, t - at[flight - 1], t)
+    y = np.where(flight > 0, speed * e**flight * since, 0.7402) - 9.80665 / 2 * since**2
+    slides = np.array([0.7, 0.4, 0.9, 0.5, 0.8])
+    ends = np.concatenate([[0.0], np.cumsum(slides[:4] * np.diff([0.0, *at]))])
+    x = ends[flight] + slides[flight] * since
+    for seed in range(24, 40):
+        rng = np.random.default_rng(seed)
+        q = np.stack([x, y], 1) + 5e-4 * rng.normal(size=(618, 2))
+        q[rng.choice(618, 41, replace=False)] = np.nan
+        track = ji.tracks.find_impacts(t, q, acceleration=None)
+        assert len(track.impacts) == 4
+        assert not track.warnings
+
+
 def test_a_body_in_space_is_refused_with_advice():
     t, q, _ = ball(np.random.default_rng(1), coordinates=3)
     track = ji.tracks.find_impacts(t, q, 1e-3, acceleration=[0, 0, -G])
