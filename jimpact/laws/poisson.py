@@ -41,7 +41,8 @@ class Poisson(Law):
     Without friction it loses at least `(1 - e_max^2) p_c^T W p_c / 2`, whatever the e_j up to 1:
     of all s >= 0 the law takes that of least energy, and `s = (e_max - e_j) p_c` is one of them.
 
-    Derivatives are one-sided where a contact is about to take part in either stage.
+    Derivatives are one-sided where a contact is about to take part in either stage; where several
+    are (a block that falls flat at e = 0, given per contact), those of one of the sides.
 
     Source: Pfeiffer and Glocker (1996); Brogliato, Nonsmooth Mechanics (2016), (6.76)-(6.79) with
     the errata of `docs/equations.md`; e_t as in the kinematic laws, (6.54).

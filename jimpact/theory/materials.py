@@ -93,8 +93,8 @@ def pair_restitution(
         stiffness2: k2 > 0; `inf` for a rigid body, which stores no energy, of either.
 
     Returns:
-        e, of the common shape. Derivatives: of the geometric mean infinite at e = 0, of minimum and
-        maximum one-sided at equal values.
+        e, of the common shape. Derivatives: of the geometric mean infinite at e = 0; one-sided of
+        minimum and maximum at equal values, and of rule 'energy' at e1 = e2 = 0.
 
     Raises:
         ValueError: another rule, e outside [0, 1], stiffnesses not positive, missing, or given for
@@ -126,5 +126,9 @@ def pair_restitution(
     for name, k in (("stiffness", k1), ("stiffness2", k2)):  # infinite: rigid
         check_values(name, jnp.minimum(k, jnp.finfo(k.dtype).max), low=0.0, open_low=True)
     check_values("stiffness", jnp.minimum(k1, k2))  # one of them is finite
-    share = 1 / (1 + k1 / k2)  # of the energy, that of the first body
-    return jnp.sqrt(share * e1**2 + (1 - share) * e2**2)
+    share = (1 / k1) / (1 / k1 + 1 / k2)  # of the energy, that of the first body
+    square = share * e1**2 + (1 - share) * e2**2
+    own, other = jax.lax.stop_gradient((jnp.sqrt(share), jnp.sqrt(1 - share)))
+    # at e1 = e2 = 0 the root has a slope to each side only
+    root = jnp.sqrt(jnp.where(square > 0, square, 1.0))
+    return jnp.where(square > 0, root, own * e1 + other * e2)

@@ -450,6 +450,9 @@ def test_restitution_of_two_materials_in_series():
     assert float(rule(e1, e2, "energy", k1, np.inf)) == pytest.approx(e1)
     assert float(rule(e1, e2, "energy", np.inf, k2)) == pytest.approx(e2)
     assert float(rule(0.7, 0.7, "energy", k1, k2)) == pytest.approx(0.7)
+    assert float(jax.grad(rule)(0.0, 0.3, "energy", k1, np.inf)) == pytest.approx(1.0)
+    rigid_first = jax.grad(lambda k2: rule(e1, e2, "energy", np.inf, k2))
+    assert float(rigid_first(k2)) == pytest.approx(0.0)
     others = {"product": 0.36, "mean": 0.65, "geometric_mean": 0.6, "minimum": 0.4, "maximum": 0.9}
     for name, value in others.items():
         assert float(rule(e1, e2, name)) == pytest.approx(value)
