@@ -142,6 +142,7 @@ def test_sequence():
     assert ji.Binary(e).sequence(scene, np.arange(5.0)) == []
 
 
+@pytest.mark.slow
 def test_ball_and_ground_in_both_orders():
     """(6.3) and (6.4); ball 1 on top, +x up in the formulas: -v for `chain`."""
     scene, v = ji.chain([2.0, 5.0], wall=True), [1.0, 0.5]

@@ -43,6 +43,7 @@ def wanted():
     return run("serial")
 
 
+@pytest.mark.slow
 def test_anything_with_a_map(wanted):
     with ThreadPoolExecutor(2) as pool:
         assert same(run(pool), wanted)

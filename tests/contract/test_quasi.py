@@ -53,6 +53,7 @@ def compatible(scene, seed=0):
     return v - h @ np.linalg.solve(h.T @ h, h.T @ v)
 
 
+@pytest.mark.slow
 def test_four_balls():
     scene, v = ji.chain([2.0] * 4), jnp.array([0.3, -0.2, 0.5, 0.7])
     qn, qt = to_quasi(scene, v)
@@ -82,6 +83,7 @@ def test_flat_block():
     np.testing.assert_allclose((normal.T @ (metric * normal))[0, 1], (a**2 - 2) / (a**2 + 4))
 
 
+@pytest.mark.slow
 def test_friction_block():
     """Sliding block with given normal and tangential impulses: v+ in quasi-velocities."""
     scene = block()
@@ -128,6 +130,7 @@ def test_identities_of_random_scenes(constraints):
     np.testing.assert_allclose(to_quasi(scene, jump)[1], 0, atol=1e-13)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("constraints", [0, 1])
 def test_power_of_contact_forces(constraints):
     scene = random_scene(constraints)
