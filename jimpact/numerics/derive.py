@@ -433,10 +433,15 @@ def _kinds_of_results(*arguments: Any, function: Function, results: Any) -> list
     """What the operation returns: its results with the batch of the arguments."""
     first = arguments[0]
     batch = first.shape[-1]
-    return [
-        first.update(shape=(*kind.shape, batch), dtype=kind.dtype, weak_type=False, sharding=None)
-        for kind in results
-    ]
+
+    def like_first(kind: Kind) -> Any:
+        """An array of this kind that varies over the same axes of a mesh as the arguments."""
+        shape = (*kind.shape, batch)
+        whole = jax.sharding.PartitionSpec(*[None] * len(shape))
+        sharding = jax.sharding.NamedSharding(first.sharding.mesh, whole)
+        return first.update(shape=shape, dtype=kind.dtype, weak_type=False, sharding=sharding)
+
+    return [like_first(kind) for kind in results]
 
 
 _lanes_p.def_abstract_eval(_kinds_of_results)
