@@ -157,6 +157,11 @@ def fit(command: options.FitCommand, steps: Steps) -> CommandResult:
         fits[RAW] = study.fit(**chosen, limit=command.limit)
         steps(_fit_in_words(RAW, fits[RAW]))
         return _fits_result(study.title, fits)
+
+    def result() -> CommandResult:
+        """Of the fits that are done."""
+        return _with_track(_fits_result(study.title, fits), study, command)
+
     end = np.inf if command.limit is None else time.monotonic() + command.limit
     chosen |= {"method": command.method}
     for name, each in _fits_of(study, command.all_free, fits):
@@ -168,11 +173,9 @@ def fit(command: options.FitCommand, steps: Steps) -> CommandResult:
         limit = None if command.limit is None else left
         fits[name] = each.run(**chosen, profiles=profiles, limit=limit)
         steps(_fit_in_words(name, fits[name]))
-        steps.show_finished = lambda: _show(
-            command, _with_track(_fits_result(study.title, fits), study, command), steps
-        )
+        steps.show_finished = lambda: _show(command, result(), steps)
     steps.show_finished = None
-    return _with_track(_fits_result(study.title, fits), study, command)
+    return result()
 
 
 def _fits_of(

@@ -49,5 +49,6 @@ from .scene import (
     rounded_gaps as rounded_gaps,
     solve_mass as solve_mass,
     stackable as stackable,
+    velocity_unit as velocity_unit,
     with_gaps as with_gaps,
 )

@@ -10,7 +10,14 @@ import numpy as np
 
 from jimpact.core.contact import contact_of
 from jimpact.core.impacts import Impact, judged_beyond
-from jimpact.core.scene import Scene, as_velocity, gap_velocity, kinetic_energy, momentum
+from jimpact.core.scene import (
+    Scene,
+    as_velocity,
+    gap_velocity,
+    kinetic_energy,
+    momentum,
+    velocity_unit,
+)
 from jimpact.numerics.tridiagonal import diagonal
 from jimpact.tools.checks import check_shape
 from jimpact.tools.compiling import full_precision
@@ -131,14 +138,6 @@ def nothing_approaches(scene: Scene, velocity: Any) -> str | None:
 
 
 @full_precision
-def _unit(scene: Scene, names: Sequence[str]) -> str:
-    """Of the velocities in a `summary`: those of a chain are in m/s, others may turn."""
-    if names:
-        check_shape("names", np.empty(len(names)), (scene.size,), "one per velocity")
-        return "velocity"
-    return "[m/s]" if scene.walls is not None else "[m/s, or rad/s of an angle]"
-
-
 def summary(out: Impact, scene: Scene, velocity: Any, names: Sequence[str] = ()) -> str:
     """A printable report of one impact (or, for a batch, of its status codes).
 
@@ -164,6 +163,8 @@ def summary(out: Impact, scene: Scene, velocity: Any, names: Sequence[str] = ())
         counts = zip(*np.unique(codes, return_counts=True))
         rows = [f"{STATUS[c].name:24s}{k:10d}" for c, k in counts]
         return "\n".join([f"{codes.size} impacts by status", *rows])
+    if names:
+        check_shape("names", np.empty(len(names)), (scene.size,), "one per velocity")
     row = STATUS[int(codes)]
     before = float(kinetic_energy(scene, velocity))
     change = float(out.energy_change)
@@ -178,7 +179,8 @@ def summary(out: Impact, scene: Scene, velocity: Any, names: Sequence[str] = ())
         f"energy         {before:.6g} J before, change {formatted(change, '.6g')} J "
         f"({100 * remaining:.4g} % kept)",
         f"audit          {', '.join(words)}",
-        f"coordinate          v-             v+   {_unit(scene, names)}",
+        f"coordinate          v-             v+   "
+        f"{'velocity' if names else f'[{velocity_unit(scene)}]'}",
     ]
     pairs = zip(np.asarray(velocity, float), np.asarray(out.velocity, float))
     for i, (a, b) in enumerate(pairs):

@@ -160,6 +160,12 @@ class Scene(eqx.Module):
         self.walls = None
         _check_scene(self)
 
+    @staticmethod
+    def _instead_of(value: Any) -> str:
+        """Advice for a value that is no scene, ending the message of `check_kind`."""
+        body = callable(getattr(value, "scene", None))
+        return " A body has a scene at each configuration: `.scene(q)`." if body else ""
+
     def __str__(self) -> str:
         """Sizes, masses and gaps, in numbers."""
         kind = "scene"
@@ -389,6 +395,17 @@ def as_velocity(scene: Scene, velocity: Any, finite: bool = False) -> jax.Array:
     if finite:
         check_values("velocity", v)
     return v
+
+
+def velocity_unit(scene: Scene) -> str:
+    """Of the velocities: m/s of a chain; others may turn.
+
+    >>> import jimpact as ji
+    >>> from jimpact.core import velocity_unit
+    >>> velocity_unit(ji.chain([1.0, 1.0])), velocity_unit(ji.Block(0.2, 0.6).scene())
+    ('m/s', 'm/s, or rad/s of an angle')
+    """
+    return "m/s" if scene.walls is not None else "m/s, or rad/s of an angle"
 
 
 @full_precision

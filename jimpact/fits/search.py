@@ -18,7 +18,6 @@ from jimpact.fits.solve import (
     Ends,
     Method,
     Solver,
-    in_lanes,
     minimize,
     outcome_at,
     stacked,
@@ -26,6 +25,7 @@ from jimpact.fits.solve import (
 )
 from jimpact.tools.checks import as_whole, check_choice, check_values
 from jimpact.tools.compiling import quick_jit
+from jimpact.tools.threads import in_parts
 
 if TYPE_CHECKING:
     from jimpact.fits.problem import FitProblem
@@ -328,8 +328,7 @@ def _lowest(problem: "FitProblem", points: np.ndarray, count: int) -> np.ndarray
         steps = min(SCAN_STEPS * problem.observe.bodies, law.max_steps)
         law = replace(law, max_steps=steps)  # type: ignore[call-arg]
     squares, many = np.empty(len(points)), stacked([replace(problem, law=law)], len(points))
-    every = np.arange(len(points))
-    for rows, some in in_lanes(_squares, every, SCAN_LANES, many, points):
+    for rows, some in in_parts(_squares, (many, points), SCAN_LANES, np.arange(len(points))):
         squares[rows] = np.nan_to_num(some, nan=np.inf)
     width = np.ptp(points[:, :parameters], axis=0)
     apart = (points[:, None] - points)[..., :parameters] / np.where(width > 0, width, 1.0)

@@ -7,7 +7,7 @@ One pass evaluates residual and Jacobian together, so that an impact is compiled
 """
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias
@@ -20,7 +20,7 @@ import numpy as np
 from jimpact.tools.checks import needed, suggestion
 from jimpact.tools.compiling import quick_jit
 from jimpact.tools.progress import Show
-from jimpact.tools.threads import in_threads
+from jimpact.tools.threads import in_parts
 
 if TYPE_CHECKING:
     import optax  # which takes long to import
@@ -343,8 +343,8 @@ def minimize(
         if not moved.any():
             break
         inside = np.empty_like(y)
-        every = np.arange(len(y)), many.lanes(len(y)), matrix, states
-        for rows, nearest in in_lanes(best_inside, *every, workers=solver.workers):
+        lanes, workers = many.lanes(len(y)), solver.workers
+        for rows, nearest in in_parts(best_inside, (matrix, states), lanes, workers=workers):
             inside[rows] = nearest
         states, _ = _descended(many, inside, once, *rule)
         moved, y = np.abs(inside - y).max(axis=1) > SETTLED, inside
@@ -368,34 +368,6 @@ def outcome_at(problem: LeastSquares, x: Any) -> Ends:
     point = problem.point(np.asarray(x))[None]
     once, every = Solver(max_steps=1), np.ones(point.shape, bool)
     return minimize([problem], point, once, fixed=every)
-
-
-def in_lanes(
-    function: Callable[..., Any],
-    which: np.ndarray,
-    lanes: int,
-    *trees: Any,
-    compiles: bool = True,
-    workers: int | None = None,
-) -> Iterator[tuple[np.ndarray, Any]]:
-    """Which rows of the trees, so many side by side, and what a function makes of them.
-
-    In threads, as many as `workers`; the first lanes alone where they compile the function.
-    """
-
-    def chosen(first: int) -> np.ndarray:
-        """Rows (lanes,) from this one of `which` on; the last one again where there are fewer."""
-        return which[np.minimum(np.arange(first, first + lanes), len(which) - 1)]
-
-    def result(first: int) -> Any:
-        """What the function makes of them."""
-        rows = chosen(first)
-        pick = partial(jax.tree.map, lambda x: x[rows] if eqx.is_array(x) else x)
-        return jax.device_get(function(*map(pick, trees)))
-
-    starts = range(0, len(which), lanes)
-    results = in_threads(result, starts, workers, compiles)
-    yield from zip(map(chosen, starts), results)
 
 
 @quick_jit
@@ -431,8 +403,8 @@ def _descended(
     active, lanes = np.arange(count), problems.lanes(count)
     first = True
     while len(active):
-        before, every = states.cost.copy(), (active, lanes, problems, states)
-        for rows, some in in_lanes(advance, *every, compiles=first, workers=solver.workers):
+        before, every = states.cost.copy(), (problems, states)
+        for rows, some in in_parts(advance, every, lanes, active, solver.workers, first):
             for leaf, value in zip(jax.tree.leaves(states), jax.tree.leaves(some)):
                 leaf[rows] = value
         first = False

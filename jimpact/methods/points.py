@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -14,7 +13,7 @@ from jimpact.core.law import Law, with_entries
 from jimpact.core.scene import Scene, dense_mass, with_gaps
 from jimpact.tools.compiling import precise_jit
 from jimpact.tools.status import CODE, STATUS
-from jimpact.tools.threads import in_threads
+from jimpact.tools.threads import in_parts
 
 Result = TypeVar("Result")
 
@@ -136,25 +135,16 @@ def in_batches(
     rows: Any,
     size: int,
     advance: Callable[[int], Any] = lambda count: None,
-    workers: int | None = None,
 ) -> Any:
-    """`run` of rows, arrays (r, ...) in whatever tree, so many at a time: one compiled program.
+    """`run` of rows, arrays (r, ...) in whatever tree, so many at a time on all cores.
 
-    The last row is repeated where a batch is not full. `advance` is called with the rows of each.
-    Batches run in threads, as many as `workers`; None: one for each core.
+    `advance` is called with the number of rows of each batch.
     """
     count = len(jax.tree.leaves(rows)[0])
-
-    def batch(first: int) -> Any:
-        """The results of the rows from this one on."""
-        chosen = np.minimum(np.arange(first, first + size), count - 1)
-        part = jax.tree.map(partial(np.take, indices=chosen, axis=0), rows)
-        return jax.device_get(run(part))
-
-    starts, parts = range(0, count, size), []
-    for first, part in zip(starts, in_threads(batch, starts, workers, compiles=True)):
+    parts: list[Any] = []
+    for _, part in in_parts(run, [rows], size):
+        advance(min(size, count - size * len(parts)))
         parts.append(part)
-        advance(min(size, count - first))
     return jax.tree.map(lambda *x: np.concatenate(x)[:count], *parts)
 
 

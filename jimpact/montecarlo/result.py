@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from jimpact.core.law import Law
-from jimpact.core.scene import Scene
+from jimpact.core.scene import Scene, velocity_unit
 from jimpact.laws.gap_scale import DELTA_C
 from jimpact.montecarlo.samples import Run
 from jimpact.montecarlo.statistics import (
@@ -111,8 +111,8 @@ class MonteCarlo(Tabular):
 
     @property
     def unit(self) -> str:
-        """Of the velocities: m/s of a chain; others may turn."""
-        return "m/s" if self.run.scene.walls is not None else "m/s, or rad/s of an angle"
+        """Of the velocities."""
+        return velocity_unit(self.run.scene)
 
     def replay(self, index: int) -> tuple[Law, Scene, jax.Array]:
         """Law, scene and velocity of sample `index`: `ji.impact(*result.replay(index))`."""

@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jimpact.plot.style import COLOURS, GREY, new_figure, styled
+from jimpact.tools.records import counted
 
 _HEIGHT = 2.8  # of a row [in]
 _BEYOND = 5.0  # sigmas that the panel of residuals shows, unless flights leave more
@@ -48,7 +49,7 @@ def track(track: Track, title: str = "") -> Figure:
     """
     n = track.q.shape[1]
     count = len(track.impacts)
-    heading = title or f"{count} impact{'s' * (count != 1)}"
+    heading = title or counted(count, "impact")
     figure, panels = new_figure(_HEIGHT * n, heading, n, 2, squeeze=False)
     for c, (places, rest) in enumerate(panels):
         colour, unit = COLOURS[c % len(COLOURS)], track.units[c].split("/")[0]

@@ -221,8 +221,8 @@ def check_kind(name: str, value: Any, kind: type) -> None:
     hint = ""
     if kind is Mapping:
         hint = " Give each a name, as in {'a': ...}."
-    elif kind.__name__ == "Scene" and callable(getattr(value, "scene", None)):
-        hint = " A body has a scene at each configuration: `.scene(q)`."
+    elif hasattr(kind, "_instead_of"):
+        hint = kind._instead_of(value)
     raise TypeError(
         f"Argument `{name}` must be of type {kind.__name__}, but is {short_repr(value)}.{hint}"
     )

@@ -2,13 +2,16 @@
 
 import os
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from itertools import chain, islice
 from typing import Any, TypeVar
 
+import equinox as eqx
 import jax
+import numpy as np
 
 from jimpact.tools.checks import as_whole
 
@@ -87,6 +90,49 @@ def in_threads(
         finally:
             for each in waiting:
                 each.cancel()
+
+
+def in_parts(
+    function: Callable[..., Any],
+    trees: Sequence[Any],
+    size: int,
+    which: np.ndarray | None = None,
+    workers: int | None = None,
+    compiles: bool = True,
+) -> Iterator[tuple[np.ndarray, Any]]:
+    """`function` of rows of arrays, so many at a time: one program for all parts.
+
+    Args:
+        function: of trees like these, with `size` rows each.
+        trees: whose arrays have rows in their first axis.
+        size: rows of a part; the last row is repeated where one is not full.
+        which: rows that are asked for; None: all.
+        workers: as of `in_threads`, as the next one.
+        compiles: whether the function is compiled by the first part.
+
+    Yields:
+        The rows (size,) of a part, and what the function makes of them, on the host.
+
+    >>> import numpy as np
+    >>> from jimpact.tools.threads import in_parts
+    >>> [(rows.tolist(), y.tolist()) for rows, y in in_parts(lambda x: 2 * x, [np.arange(3)], 2)]
+    [([0, 1], [0, 2]), ([2, 2], [4, 4])]
+    """
+    if which is None:
+        which = np.arange(len(jax.tree.leaves(trees)[0]))
+
+    def rows(first: int) -> np.ndarray:
+        """Those of the part from `which[first]` on."""
+        return which[np.minimum(np.arange(first, first + size), len(which) - 1)]
+
+    def result(first: int) -> Any:
+        """What the function makes of this part."""
+        chosen = rows(first)
+        pick = partial(jax.tree.map, lambda x: x[chosen] if eqx.is_array(x) else x)
+        return jax.device_get(function(*map(pick, trees)))
+
+    starts = range(0, len(which), size)
+    yield from zip(map(rows, starts), in_threads(result, starts, workers, compiles))
 
 
 def _settings() -> Callable[[], Any]:

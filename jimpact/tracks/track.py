@@ -12,6 +12,7 @@ from jimpact.core.scene import Scene, dense_mass
 from jimpact.fits.covariances import covariance_of
 from jimpact.fits.data import ROUNDING, Experiments
 from jimpact.tools.checks import check_kind, check_values
+from jimpact.tools.records import counted
 from jimpact.tracks.arcs import Arcs
 
 # A jump of velocities lies in the cone of a scene's impulses up to so many standard errors. Ten
@@ -73,7 +74,7 @@ class Track:
         count, frames = len(self.impacts), len(self.t)
         noise = ", ".join(f"{s:.3g}" for s in self.sigma)
         lines = [
-            f"{count} impact{'s' * (count != 1)} in {frames} frames, {len(self.flights)} flights",
+            f"{counted(count, 'impact')} in {frames} frames, {len(self.flights)} flights",
             f"sigma {noise}",
         ]
         for k, each in enumerate(self.impacts, 1):

@@ -16,7 +16,7 @@ import numpy as np
 
 import jimpact as ji
 
-TABLE = Path(ji.__file__).parent / "data" / "engine_impacts.csv"
+TABLE = Path(__file__).parents[3] / "jimpact" / "data" / "engine_impacts.csv"  # of this checkout
 SCENES = ji.data.ENGINE_SCENES
 LAWS = {
     "Moreau": ji.Moreau,
