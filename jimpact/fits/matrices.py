@@ -210,7 +210,7 @@ def _square(a: jax.Array, x: jax.Array) -> jax.Array:
 
 
 class SearchedMatrix(Protocol):
-    """What is asked of a fit: an entry of the law is `fixed`, or `scale` times y of its `owner`."""
+    """A fit, as its matrix sees it: entries are `fixed`, or `scale` times y of their `owner`."""
 
     @property
     def law(self) -> Law:

@@ -74,7 +74,7 @@ def crossover(scene: Scene, law: Law, velocity: Any, offset: Any) -> Crossover:
 
 
 class SampledGaps(Protocol):
-    """What is asked of a run of `ji.monte_carlo`: covariance of its gaps, and its outcomes (n,)."""
+    """A result of `ji.monte_carlo`: covariance of its gaps, and statistics of v+ (n,)."""
 
     @property
     def gap_covariance(self) -> np.ndarray:

@@ -38,7 +38,7 @@ def noise(q: np.ndarray) -> np.ndarray:
 
 
 def _differences(x: np.ndarray, order: int, step: int = 1) -> np.ndarray:
-    """Differences of seen positions (T,); of those alone where frames are lost by turns."""
+    """Differences of positions (T,); where every other frame is lost, of those that were seen."""
 
     def all_of(x: np.ndarray) -> np.ndarray:
         for _ in range(order):
