@@ -16,9 +16,9 @@ from jimpact.fits.parts_of_motion import LawInMotion, with_parts_of_motion
 from jimpact.fits.problem import FitProblem
 from jimpact.fits.report import Fit
 from jimpact.fits.search import Search
-from jimpact.motion.methods import as_method
+from jimpact.motion.methods import as_method, start_by
 from jimpact.motion.record import Motion
-from jimpact.motion.simulate import checked_start, simulate
+from jimpact.motion.simulate import simulate
 from jimpact.motion.system import System
 from jimpact.tools.checks import as_float_array, check_function, check_values, in_common_dtype
 from jimpact.tools.status import STATUS
@@ -149,7 +149,7 @@ def fit_motion(
     method = as_method(options.get("method", "events"), options.get("step"))
     for q, v in zip(q0.reshape(-1, q0.shape[-1]), v0.reshape(-1, v0.shape[-1])):
         there, _, q, v = in_common_dtype(system, law, q, v)
-        checked_start(there, q, v, t_end, method)  # in the fit `simulate` cannot raise
+        start_by(method, there, law, q, v, t_end)  # in the fit `simulate` cannot raise
     observable = MotionObservable(system, q0, v0, {"t_end": t_end} | options, observe or _positions)
     named = {entry_of(name)[0] for name in as_names("free", free)}
     law = with_parts_of_motion(law, system, q0, v0, named)

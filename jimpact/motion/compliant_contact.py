@@ -6,7 +6,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jimpact.core.law import Law
 from jimpact.events.contact_flow import Phase
+from jimpact.laws.forces import Force
 from jimpact.motion.compliant_flow import (
     Phases,
     compliant_flow,
@@ -84,6 +86,27 @@ class _CompliantRun(NamedTuple):
     status: jax.Array
     apart: jax.Array  # whether all contacts are open and none closes
     vanished: jax.Array  # () [s] when steps last vanished at an end of slip, -inf before
+
+
+def force_of(law: Law) -> Force:
+    """The contact force of a law, for motions.
+
+    Raises:
+        TypeError: a law without one, or whose force yields: motions do not keep what that depends
+            on.
+    """
+    force: Force | None = law.contact_force
+    if force is None or not law.uses_gaps:
+        raise TypeError(
+            "Argument `law` must use gaps and have a `contact_force` (Compliant) for "
+            f"method='contact_forces', but is {law!r}."
+        )
+    if force.bound is not None:
+        raise TypeError(
+            "Argument `law` must have a force without bound in a motion: what yields is for "
+            f"`impact`, but the force is {force!r}."
+        )
+    return force
 
 
 def compliant_motion(problem: MotionProblem, max_events: int, until_apart: bool) -> Course:

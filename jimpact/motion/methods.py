@@ -1,13 +1,18 @@
 """How a motion is computed: the methods of `simulate`, and the options of each."""
 
+import warnings
 from dataclasses import dataclass
 from typing import Any
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jimpact.core.law import Law
+from jimpact.motion.dynamics import is_pile
 from jimpact.motion.flow import check_rtol
 from jimpact.motion.pile_contacts import PileContacts, contacts_of_step
+from jimpact.motion.start import Start, start_of
 from jimpact.motion.system import System
 from jimpact.tools.checks import (
     as_whole,
@@ -18,10 +23,14 @@ from jimpact.tools.checks import (
     short_repr,
 )
 
+# Contacts of a pile above which motions by events warn: 1 100 compile for more than two minutes.
+# Ten times more, and nobody is warned of that.
+MANY = 200
 TOLERANCES = {"float64": (1e-10, 1e-12), "float32": (1e-5, 1e-7)}  # rtol, atol of the flights
 # Share of the largest gap velocity: a slower contact that is pressed back remains closed. Ten times
 # more passes an accumulation a few impacts earlier, and loses a hundred times the energy there.
 SLOW = 1e-6
+MOST_STEPS = np.iinfo(np.int32).max  # of time stepping: they are counted in 32 bits
 MAX_STEPS = 100_000  # of the flights by default; ten times more only delays the status `max_steps`
 
 
@@ -165,6 +174,7 @@ class TimeStepping:
         >>> found.bodies.tolist(), [round(float(p) / 1e-3, 3) for p in found.impulse]
         ([[0, 1], [1, -1]], [10.0, 30.0])
         """
+        substeps_of(self, t, t + self.step, 2)  # raises for a step that cannot be one
         return contacts_of_step(system, law, q, v, t, self.step, self.closed_below)
 
 
@@ -205,6 +215,48 @@ def as_method(method: str | Method, step: float | None = None, **options: Any) -
 def name_of(method: Method) -> str:
     """The word for a method."""
     return next(name for name, kind in METHODS.items() if isinstance(method, kind))
+
+
+def substeps_of(method: TimeStepping, start: Any, end: Any, samples: int) -> jax.Array:
+    """Steps () between two of so many samples, none longer than `step`."""
+    if is_traced((start, end)):
+        raise ValueError("Argument `t_end` must not be traced in time stepping.")
+    between = (float(end) - float(start)) / (samples - 1)
+    count = max(1.0, np.ceil(between / float(method.step) * (1 - 1e-9)))
+    if count * (samples - 1) > MOST_STEPS:
+        raise ValueError(
+            f"Argument `step` must give at most {MOST_STEPS} steps, but has value {method.step:g}."
+        )
+    return jnp.asarray(int(count), jnp.int32)  # an array: one program for all steps
+
+
+def start_by(
+    method: Method, system: System, law: Law, q: jax.Array, v: jax.Array, t_end: Any
+) -> Start:
+    """The start of a motion by this method; contact forces may begin in penetration.
+
+    Warns of piles whose events take long. Raises a ValueError as `start_of`, and for friction of a
+    pile, which only time stepping has.
+    """
+    if isinstance(method, ContactForces):
+        start = start_of(system, law, q, v, t_end, may_penetrate=True)
+    else:
+        start = start_of(system, law, q, v, t_end, method.closed_below)
+    if isinstance(method, TimeStepping) or not is_pile(system):
+        return start
+    name, body = name_of(method), type(system.body).__name__
+    if start.friction is not None:
+        raise ValueError(
+            f"Argument `friction` must be 0 for the contacts of {body} by method={name!r}: use "
+            "method='time_stepping', or name the `pairs` of few `Bodies`."
+        )
+    if start.contacts > MANY:
+        warnings.warn(
+            f"Argument `method` {name!r} computes all {start.contacts} contacts of {body} at each "
+            "event, and compiles for minutes: use method='time_stepping' for many bodies.",
+            stacklevel=4,  # the line that calls `simulate`, through `full_precision`
+        )
+    return start
 
 
 def tolerances(method: EventDriven | ContactForces, dtype: jnp.dtype) -> tuple[float, float]:

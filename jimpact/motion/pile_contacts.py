@@ -3,20 +3,14 @@
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jimpact.bodies.closed_pairs import listed_pairs
 from jimpact.core.law import Law
 from jimpact.core.scene import Scene
-from jimpact.motion.arguments import (
-    check_motion,
-    check_stepped_law,
-    closed_gaps,
-    friction_of,
-    substeps_of,
-)
 from jimpact.motion.dynamics import is_pile
+from jimpact.motion.start import start_of
+from jimpact.motion.step_contacts import check_stepped_law
 from jimpact.motion.stepping import step_of_pile
 from jimpact.motion.system import System
 from jimpact.tools.checks import as_float_array, check_concrete, check_kind, in_common_dtype
@@ -67,13 +61,9 @@ def contacts_of_step(
     q, v = as_float_array("q", q), as_float_array("v", v)
     check_concrete("q", q)
     system, law, q, v = in_common_dtype(system, law, q, v)
-    substeps_of(step, t, t + step, 2)
-    times = jnp.asarray([t, t + step], q.dtype)
-    f = check_motion(system, q, v, *times)
-    mu = friction_of(system, law, q)
-    check_stepped_law(system, law, q, law.joins_step and system.friction is None)
-    below, _ = closed_gaps(q, f, closed_below)
-    pairs, impulse, after, status = jax.device_get(_step(system, law, mu, q, v, times, below))
+    start = start_of(system, law, q, v, (t, t + step), closed_below)
+    check_stepped_law(system, law, start.contacts, law.joins_step and system.friction is None)
+    pairs, impulse, after, status = jax.device_get(_step(start, law))
     if not pairs.filled:
         raise ValueError("Arguments `q` and `v` must lead to a contact within the step.")
     order, bodies, ways, scene = listed_pairs(pairs, system.mass)

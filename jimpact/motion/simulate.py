@@ -8,23 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.bodies.base import check_penetration
 from jimpact.core.law import Law
 from jimpact.laws.forces import Force
-from jimpact.motion.arguments import (
-    as_times,
-    check_motion,
-    check_pile,
-    check_stepped_law,
-    closed_gaps,
-    contacts_of,
-    force_of,
-    friction_in_space,
-    friction_of,
-    substeps_of,
-    without_closures,
-)
-from jimpact.motion.compliant_contact import compliant_motion
+from jimpact.motion.compliant_contact import compliant_motion, force_of
 from jimpact.motion.dynamics import is_pile, kinetic, potential, recorded_gaps
 from jimpact.motion.event_driven import empty_checkpoint, event_driven
 from jimpact.motion.flow import Settings
@@ -34,10 +20,13 @@ from jimpact.motion.methods import (
     Method,
     TimeStepping,
     as_method,
-    name_of,
+    start_by,
+    substeps_of,
     tolerances,
 )
 from jimpact.motion.record import Events, Motion, joined
+from jimpact.motion.start import Start, as_times
+from jimpact.motion.step_contacts import check_stepped_law
 from jimpact.motion.stepping import time_stepping
 from jimpact.motion.system import System
 from jimpact.motion.tables import Course, MotionProblem, Past
@@ -118,52 +107,29 @@ def simulate(
     check_kind("law", law, Law)
     q, v = as_float_array("q0", q0), as_float_array("v0", v0)
     system, law, q, v = in_common_dtype(system, law, q, v)
-    dtype = q.dtype
     method = as_method(method, step)
-    start, end, below, rounding = checked_start(system, q, v, t_end, method)
+    start = start_by(method, system, law, q, v, t_end)
     count = as_whole("samples", samples, 2)
     rows = CHUNK if max_events is None else as_whole("max_events", max_events, 1)
-    mu = friction_of(system, law, q)
-    check_pile(system, q, mu, name_of(method))
-    system = without_closures(system, q, v, start)
     arguments: Any
     if isinstance(method, TimeStepping):
-        substeps = substeps_of(method.step, *as_times(t_end), count)
+        substeps = substeps_of(method, *as_times(t_end), count)
         joint = law.joins_step and system.friction is None
-        check_stepped_law(system, law, q, joint)
-        arguments = system, law, mu, q, v, start, end, below, substeps, count, joint, rows
-        return _waited(_stepped, arguments, method.progress)
+        check_stepped_law(system, law, start.contacts, joint)
+        return _waited(_stepped, (start, law, substeps, count, joint, rows), method.progress)
     slow = SLOW if isinstance(method, ContactForces) else method.slow
     settings = Settings(
-        *tolerances(method, dtype), below, rounding, method.max_steps, mu is not None,
-        friction_in_space(system, mu, q), end - start,
-        jnp.asarray(slow, dtype),
+        *tolerances(method, q.dtype), start.closed_below, start.gap_rounding, method.max_steps,
+        start.friction is not None, start.in_space, start.end - start.time,
+        jnp.asarray(slow, q.dtype),
     )  # fmt: skip
     if isinstance(method, ContactForces):
-        force = force_of(law)
-        arguments = system, force, mu, settings, q, v, start, end, count, rows, method.until_apart
+        arguments = start, force_of(law), settings, count, rows, method.until_apart
         return _waited(_forced, arguments, method.progress)
-    arguments = system, law, mu, settings, q, v, start, end
-    if _on_host(arguments):
+    if _on_host((start, law, settings)):
         most = MOST_EVENTS if max_events is None else max_events
-        return _in_runs(arguments, count, most, method.progress)
-    return _events(*(*arguments, None, count, rows))[0]
-
-
-def checked_start(
-    system: System, q: jax.Array, v: jax.Array, t_end: Any, method: Method
-) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Start and end [s] of a motion; gaps [m] below which a contact is closed, and is rounding.
-
-    Raises for what cannot move like this; penetration is allowed with contact forces only.
-    """
-    start, end = (as_float_array("t_end", t).astype(q.dtype) for t in as_times(t_end))
-    gaps = check_motion(system, q, v, start, end)
-    if isinstance(method, ContactForces):
-        return start, end, *closed_gaps(q, gaps, None)
-    below, rounding = closed_gaps(q, gaps, method.closed_below)
-    check_penetration("q0", gaps, jnp.maximum(below, system.body.overlap))
-    return start, end, below, rounding
+        return _in_runs(start, law, settings, count, most, method.progress)
+    return _events(start, law, settings, None, count, rows)[0]
 
 
 def _on_host(arguments: Any) -> bool:
@@ -179,84 +145,71 @@ def _waited(run: Callable[..., Motion], arguments: Any, progress: float | None) 
         return jax.block_until_ready(run(*arguments))
 
 
-def _in_runs(arguments: tuple[Any, ...], samples: int, most: int, progress: float | None) -> Motion:
+def _in_runs(
+    start: Start, law: Law, settings: Settings, samples: int, most: int, progress: float | None
+) -> Motion:
     """The motion in runs of `CHUNK` events, each of which goes on where the last one ended."""
-    system, *_, q, v, start, end = arguments
-    numbers: Any = empty_checkpoint(q, v, contacts_of(system, q), samples)
+    numbers: Any = empty_checkpoint(start.q, start.v, start.contacts, samples)
     parts: list[Events] = []
+    duration = float(settings.duration)
     with progress_bar(progress) as show:
-        show("motion", 0.0, float(end - start))
+        show("motion", 0.0, duration)
         while True:
             left = jnp.asarray(np.int32(most - CHUNK * len(parts)))
-            motion, numbers = _events(*(*arguments, Past(left, numbers), samples, CHUNK))
+            motion, numbers = _events(start, law, settings, Past(left, numbers), samples, CHUNK)
             parts.append(motion.events)
             if int(motion.status) != CODE["max_events"] or CHUNK * len(parts) >= most:
                 return dataclasses.replace(motion, events=joined(parts, most))
-            show("motion", float(motion.events.time[-1] - start), float(end - start))
+            show("motion", float(motion.events.time[-1] - start.time), duration)
 
 
 @quick_jit
 def _events(
-    system: System,
+    start: Start,
     law: Law,
-    mu: jax.Array | None,
     settings: Settings,
-    q: jax.Array,
-    v: jax.Array,
-    start: jax.Array,
-    end: jax.Array,
     past: Past | None,
     samples: int,
     max_events: int,
 ) -> tuple[Motion, jax.Array | None]:
     """The motion by events, and what the next run takes over."""
-    times = _equal_times(start, end, samples)
-    problem = MotionProblem(system, law, mu, settings, q, v, times, contacts_of(system, q), past)
+    problem = _problem(start, law, settings, samples, past)
     course, numbers = event_driven(problem, max_events)
-    return _recorded(system, times, course), numbers
+    return _recorded(start.system, problem.times, course), numbers
 
 
 @quick_jit
 def _forced(
-    system: System,
+    start: Start,
     force: Force,
-    mu: jax.Array | None,
     settings: Settings,
-    q: jax.Array,
-    v: jax.Array,
-    start: jax.Array,
-    end: jax.Array,
     samples: int,
     max_events: int,
     until_apart: bool,
 ) -> Motion:
     """The motion with contact forces."""
-    times = _equal_times(start, end, samples)
-    m = contacts_of(system, q)
-    problem = MotionProblem(system, force, mu, settings, q, v, times, m)
+    problem = _problem(start, force, settings, samples)
     course = compliant_motion(problem, max_events, until_apart)
-    return _recorded(system, times, course)
+    return _recorded(start.system, problem.times, course)
 
 
 @quick_jit
 def _stepped(
-    system: System,
-    law: Law,
-    mu: jax.Array | None,
-    q: jax.Array,
-    v: jax.Array,
-    start: jax.Array,
-    end: jax.Array,
-    closed_below: jax.Array,
-    substeps: jax.Array,
-    samples: int,
-    joint: bool,
-    max_events: int,
+    start: Start, law: Law, substeps: jax.Array, samples: int, joint: bool, max_events: int
 ) -> Motion:
     """The motion by time stepping."""
-    times = _equal_times(start, end, samples)
-    course = time_stepping(system, law, mu, q, v, times, closed_below, substeps, joint, max_events)
-    return _recorded(system, times, course)
+    times = _equal_times(start, samples)
+    course = time_stepping(start, law, times, substeps, joint, max_events)
+    return _recorded(start.system, times, course)
+
+
+def _problem(
+    start: Start, law: Law | Force, settings: Settings, samples: int, past: Past | None = None
+) -> MotionProblem:
+    """What determines the motion between events, sampled at equally spaced instants."""
+    times = _equal_times(start, samples)
+    system, mu = start.system, start.friction
+    return MotionProblem(system, law, mu, settings, start.q, start.v, times, start.contacts, past)
 
 
 def _recorded(system: System, times: jax.Array, course: Course) -> Motion:
@@ -294,7 +247,7 @@ def _one_by_one(function: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
     return lambda *rows: jax.lax.map(lambda row: function(*row), rows)
 
 
-def _equal_times(start: jax.Array, end: jax.Array, samples: int) -> jax.Array:
+def _equal_times(start: Start, samples: int) -> jax.Array:
     """`samples` instants from start to end."""
-    share = jnp.arange(samples, dtype=start.dtype) / (samples - 1)
-    return start + share * (end - start)
+    share = jnp.arange(samples, dtype=start.time.dtype) / (samples - 1)
+    return start.time + share * (start.end - start.time)

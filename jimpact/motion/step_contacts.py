@@ -10,9 +10,11 @@ import jax
 import jax.numpy as jnp
 
 from jimpact.bodies.closed_pairs import ActivePairs, block, over_blocks, with_block
+from jimpact.core.law import Law
 from jimpact.motion.dynamics import is_pile, mass_at, seen_from_base
 from jimpact.motion.system import System
 from jimpact.numerics.dense import solve_mass_matrix
+from jimpact.tools.checks import check_per_contact, check_shape
 
 
 class AllContacts(NamedTuple):
@@ -180,3 +182,20 @@ def contacts_of_step(
     moved = solve_mass_matrix(mass, directions.reshape(n, -1)).reshape(directions.shape)
     matrix = jnp.tensordot(directions, moved, axes=([0], [0]))
     return AllContacts(gap, normals, closed, directions, moved, matrix)
+
+
+def check_stepped_law(system: System, law: Law, contacts: int, joint: bool) -> None:
+    """Raise unless time stepping of the system can use the law; `joint` as in `time_stepping`."""
+    if not joint:
+        if is_pile(system):
+            raise ValueError(
+                "Argument `law` must be Moreau's, with its own `friction` and without a matrix, "
+                f"for the many contacts of {type(system.body).__name__}, but is {law!r}."
+            )
+        return
+    for name in ("restitution", "tangential_restitution"):
+        value = getattr(law, name)
+        if is_pile(system):
+            check_shape(name, value, (), "one for all contacts of a pile")
+        elif value is not None:
+            check_per_contact(name, value, contacts)

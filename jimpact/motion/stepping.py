@@ -42,6 +42,7 @@ from jimpact.motion.dynamics import (
 )
 from jimpact.motion.flow import State, out_of_range, status_at_start
 from jimpact.motion.record import KIND_CODE, Events, no_events, with_row
+from jimpact.motion.start import Start
 from jimpact.motion.step_contacts import ActiveContacts, AllContacts, PileImpulses, contacts_of_step
 from jimpact.motion.system import System
 from jimpact.motion.tables import Course
@@ -141,13 +142,9 @@ class _Trial(NamedTuple):
 
 
 def time_stepping(
-    system: System,
+    start: Start,
     law: Law,
-    mu: jax.Array | None,
-    q0: jax.Array,
-    v0: jax.Array,
     times: jax.Array,
-    closed_below: jax.Array,
     substeps: jax.Array,
     joint: bool,
     max_events: int,
@@ -156,13 +153,11 @@ def time_stepping(
 
     `joint`: the law is a condition on v' that joins the problem of the step (`Law.joins_step`).
     """
-    system, law, mu, q0, v0, times = without_derivatives(
-        (system, law, mu, q0, v0, times), NotImplementedError(WHY)
-    )
-    h = (times[1] - times[0]) / substeps.astype(q0.dtype)
-    problem = _StepProblem(system, law, mu, h, closed_below, joint)
-    start = _begin(problem, q0, v0, times, substeps, max_events)
-    dtype = q0.dtype
+    start, law, times = without_derivatives((start, law, times), NotImplementedError(WHY))
+    h = (times[1] - times[0]) / substeps.astype(times.dtype)
+    problem = _StepProblem(start.system, law, start.friction, h, start.closed_below, joint)
+    first = _begin(problem, start.q, start.v, times, substeps, max_events)
+    dtype = times.dtype
 
     def to_sample(progress: _Progress, t: jax.Array) -> tuple[_Progress, State]:
         """The motion up to the next sample, from t."""
@@ -177,29 +172,23 @@ def time_stepping(
         fine = progress.status == CODE["ok"]
         return progress, jax.tree.map(lambda x: jnp.where(fine, x, jnp.nan), progress.state)
 
-    end, later = jax.lax.scan(to_sample, start, times[:-1])
-    samples = jax.tree.map(lambda x, rest: jnp.concatenate([x[None], rest]), start.state, later)
+    end, later = jax.lax.scan(to_sample, first, times[:-1])
+    samples = jax.tree.map(lambda x, rest: jnp.concatenate([x[None], rest]), first.state, later)
     steps = substeps * (times.shape[0] - 1)
     status = jnp.where(end.status == CODE["ok"], end.reported, end.status)
     return Course(samples, end.events, steps, status)
 
 
-def step_of_pile(
-    system: System,
-    law: Law,
-    mu: jax.Array | None,
-    q: jax.Array,
-    v: jax.Array,
-    times: jax.Array,
-    closed_below: jax.Array,
-) -> tuple[ActivePairs, jax.Array, jax.Array, jax.Array]:
-    """The step of a pile between two `times`: contacts, impulses (K, b), v' (n,), status ()."""
-    problem = _StepProblem(system, law, mu, times[1] - times[0], closed_below, joint=True)
-    start = _begin(problem, q, v, times, jnp.int32(1), 1)
-    setup = _set_up(problem, start, times[0])
-    trial = _solve(problem, start, setup)
-    state, _ = _end_state(problem, start, setup, trial)
-    status, reported = _status(problem, start, setup, trial, state)
+def step_of_pile(start: Start, law: Law) -> tuple[ActivePairs, jax.Array, jax.Array, jax.Array]:
+    """The one step of a pile from start to end: contacts, impulses (K, b), v' (n,), status ()."""
+    times = jnp.stack([start.time, start.end])
+    h = start.end - start.time
+    problem = _StepProblem(start.system, law, start.friction, h, start.closed_below, joint=True)
+    first = _begin(problem, start.q, start.v, times, jnp.int32(1), 1)
+    setup = _set_up(problem, first, times[0])
+    trial = _solve(problem, first, setup)
+    state, _ = _end_state(problem, first, setup, trial)
+    status, reported = _status(problem, first, setup, trial, state)
     contacts = setup.contacts
     assert isinstance(contacts, ActiveContacts)
     return contacts.pairs, trial.solution.impulse, trial.v, jnp.where(status > 0, status, reported)

@@ -19,6 +19,7 @@ from jimpact.tools.checks import (
 )
 
 Base = Callable[[jax.Array], jax.Array]  # t () -> displacement y_b (d,) [m]
+DIFFERENTIATED = ("gap_function", "tangent_function", "potential", "base")
 
 
 class System(eqx.Module):
@@ -228,3 +229,73 @@ class HarmonicBase(eqx.Module):
             return y[None]
         pair = (0 * y, y) if self.direction == "vertical" else (y, 0 * y)
         return jnp.stack(pair)
+
+
+def check_functions(system: System, q: jax.Array, v: jax.Array, t: jax.Array) -> None:
+    """Raise where a function of the system cannot be called, or returns what cannot be used."""
+    body, n, precision = system.body, v.shape[0], q.dtype
+    mass = _shape_of("mass", body.mass_matrix, {"q": q}, precision)
+    if mass not in ((n,), (n, n)):
+        raise ValueError(
+            f"Argument `system` must have a mass of shape ({n},) or ({n}, {n}) as `v0` has {n} "
+            f"velocities, but has one of shape {mass}."
+        )
+    f = _shape_of("gap_function", body.gap_function, {"q": q}, precision)
+    fits = len(f) == 1 and f[0] > 0
+    _check_returned("gap_function", f, "(m,), a gap for each of m >= 1 contacts", fits)
+    h = _shape_of("tangent_function", body.tangent_function, {"q": q}, precision)
+    if h is not None:
+        _check_returned("tangent_function", h, "(m,), one displacement a contact", len(h) == 1)
+    if system.force is not None:
+        force = _shape_of("force", system.force, {"q": q, "v": v, "t": t}, precision)
+        _check_returned("force", force, f"({n},), one per velocity", force == (n,))
+    if system.potential is not None:
+        energy = _shape_of("potential", system.potential, {"q": q}, precision)
+        _check_returned("potential", energy, "(), an energy", energy == ())
+    if system.base is not None:
+        assert system.base_directions is not None
+        d = system.base_directions.shape[1]
+        check_shape("base_directions", system.base_directions, (n, d), "a row for each velocity")
+        place = _shape_of("base", system.base, {"t": t}, precision)
+        fits = place == (d,) or (place == () and d == 1)
+        _check_returned("base", place, f"({d},), as `base_directions` has {d} columns", fits)
+
+
+def _shape_of(name: str, function: Any, values: dict[str, jax.Array], precision: Any) -> Any:
+    """The shape that a function of the system returns; None where that is None."""
+
+    def call(*traced: jax.Array) -> jax.Array | None:
+        out = function(*traced)
+        return None if out is None else jnp.asarray(out)
+
+    try:
+        out = jax.eval_shape(call, *values.values())
+    except Exception as error:
+        reason = next(iter(str(error).splitlines()), "")
+        raise TypeError(
+            f"Argument `system` must have a `{name}` that takes JAX arrays ({', '.join(values)}) "
+            f"and returns one, but it raises {type(error).__name__}: {reason}"
+        ) from error
+    if out is None:
+        return None
+    whole = not jnp.issubdtype(out.dtype, jnp.floating)
+    if whole and name in DIFFERENTIATED:
+        raise TypeError(
+            f"Argument `system` must have a `{name}` that returns floating numbers, but it "
+            f"returns {out.dtype}."
+        )
+    if not whole and jnp.finfo(out.dtype).bits > jnp.finfo(precision).bits:
+        raise TypeError(
+            f"Argument `system` must compute in the precision of `q0`, {precision}, but its "
+            f"`{name}` returns {out.dtype}: give `q0` in it, too."
+        )
+    return out.shape
+
+
+def _check_returned(name: str, shape: Any, allowed: str, fits: bool) -> None:
+    """Raise unless what a function of the system returns `fits`."""
+    if not fits:
+        raise ValueError(
+            f"Argument `system` must have a `{name}` that returns shape {allowed}, "
+            f"but it returns {shape}."
+        )

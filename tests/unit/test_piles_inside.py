@@ -9,7 +9,7 @@ import pytest
 
 import jimpact as ji
 from jimpact.bodies.neighbours import crowd_of, near_pairs
-from jimpact.motion.arguments import check_pile
+from jimpact.motion.methods import as_method, start_by
 
 
 def brute_force(points, distance):
@@ -65,8 +65,9 @@ def test_piles_of_many_contacts_warn_by_events():
     for count, warns in ((20, False), (21, True)):  # 190 and 210 contacts
         pile = ji.Bodies([ji.Disc(0.1)] * count, (), room=4 * count)
         at = pile.at(np.stack([0.3 * np.arange(count), np.zeros(count)], axis=1))
-        arguments = ji.System(pile), jnp.asarray(at), None
-        check_pile(*arguments, "time_stepping")
+        at = jnp.asarray(at)
+        arguments = ji.System(pile), ji.Moreau(0.5), at, jnp.zeros_like(at), 1.0
+        start_by(as_method("time_stepping", 0.1), *arguments)
         with warnings.catch_warnings(record=True) as said:
-            check_pile(*arguments, "events")
+            start_by(as_method("events"), *arguments)
         assert ["compiles for minutes" in str(x.message) for x in said] == [True] * warns

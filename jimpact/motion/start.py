@@ -1,0 +1,231 @@
+"""The start of a motion, checked: a `Start` that exists is right."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact.bodies.base import check_penetration, check_range
+from jimpact.core.law import Law
+from jimpact.core.scene import check_mass
+from jimpact.motion.dynamics import is_pile, mass_at, recorded_gaps, seen_from_base
+from jimpact.motion.system import System, check_functions
+from jimpact.tools.checks import as_float_array, check_shape, check_values, is_traced
+from jimpact.tools.compiling import precise_jit
+from jimpact.tools.precision import precision
+
+# Instants at which the base must be finite before a motion starts; what is not finite in between
+# ends the motion with the status `not_finite`.
+BASE_INSTANTS = 64
+# [m] Contacts with smaller gaps take part in an impact. Ten times more, and balls a few nanometres
+# apart are struck together.
+CLOSED_BELOW = 1e-9
+ROUNDING_GAP = 1e-5  # of the gap that counts as closed: smaller gaps are rounding, hops as well
+# What counts as closed is so many times more than what a gap may be off by. In metres and double
+# precision it does not matter.
+MORE_CLOSED = 10
+
+
+class Start(NamedTuple):
+    """Where a motion of n velocities and m contacts begins."""
+
+    system: System  # arrays that its functions close over are leaves, where they are traced
+    q: jax.Array  # (n,)
+    v: jax.Array  # (n,)
+    time: jax.Array  # () [s]
+    end: jax.Array  # () [s]
+    friction: jax.Array | None  # mu (m,), () of a pile; None: no contact has friction
+    closed_below: jax.Array  # () [m] contacts with smaller gaps are closed
+    gap_rounding: jax.Array  # () [m] smaller gaps are rounding
+    contacts: int  # m
+    in_space: bool  # whether contacts with friction have two tangents each
+
+
+def start_of(
+    system: System,
+    law: Law,
+    q: jax.Array,
+    v: jax.Array,
+    t_end: Any,
+    closed_below: float | None = None,
+    may_penetrate: bool = False,
+) -> Start:
+    """The start of a motion at q (n,), v (n,) that ends at `t_end`, or lasts from t_start to it.
+
+    `closed_below` [m] as of `EventDriven`.
+
+    Raises:
+        ValueError: for shapes and values that cannot be used, penetration but where it `may` be.
+            TypeError: for functions of the system that JAX cannot trace.
+    """
+    start, end = (as_float_array("t_end", t).astype(q.dtype) for t in as_times(t_end))
+    _check_coordinates(system, q, v, start, end)
+    here = _at_start(system, q, v, start, end)
+    if is_traced(here):  # `q`, an array of the system, or one that its functions close over
+        system = _with_closures_as_leaves(system, q, v, start)
+    else:
+        _check_values_at_start(system, here, start, end)
+    below, rounding = _closed_gaps(q, here.gaps, closed_below)
+    if not may_penetrate:
+        check_penetration("q0", here.gaps, jnp.maximum(below, system.body.overlap))
+    friction = _friction_of(system, law, here)
+    in_space = friction is not None and here.tangents == 2 * here.contacts and not is_pile(system)
+    return Start(system, q, v, start, end, friction, below, rounding, here.contacts, in_space)
+
+
+def as_times(t_end: Any) -> tuple[Any, Any]:
+    """Start and end of a motion, which begins at 0 where only its end is said."""
+    if not isinstance(t_end, tuple | list) and np.ndim(t_end) == 0:
+        return 0.0, t_end
+    if len(t_end) != 2:
+        raise ValueError(
+            f"Argument `t_end` must be a time or a pair (t_start, t_end), but has value {t_end!r}."
+        )
+    start, end = t_end
+    return start, end
+
+
+def _check_coordinates(
+    system: System, q: jax.Array, v: jax.Array, start: jax.Array, end: jax.Array
+) -> None:
+    """Raise for coordinates, velocities and times of wrong shapes or values."""
+    if q.ndim != 1:
+        raise ValueError(f"Argument `q0` must have shape (n,), but has shape {q.shape}.")
+    coordinates, mass = system.body.coordinates, system.body.mass
+    if coordinates is not None:
+        check_shape("q0", q, (coordinates,), "the coordinates of the body")
+    elif not callable(mass):
+        check_shape("q0", q, mass.shape[:1], "the coordinates of the body, as many as its mass has")
+    if coordinates is None:
+        check_shape("v0", v, q.shape, "one velocity per coordinate of `q0`")
+    elif not callable(mass):
+        check_shape("v0", v, mass.shape[:1], "the velocities of the body, as many as its mass has")
+    for time in (start, end):
+        check_shape("t_end", time, (), "a time, or a pair (t_start, t_end)")
+    for name, value in (("q0", q), ("v0", v), ("t_end", start), ("t_end", end)):
+        check_values(name, value)
+    if not is_traced((start, end)) and not float(end) > float(start):
+        raise ValueError(
+            f"Argument `t_end` must be after the start at {float(start):g} s, "
+            f"but has value {float(end):g}."
+        )
+
+
+class _AtStart(NamedTuple):
+    """What the functions of a system give at the start."""
+
+    mass: jax.Array  # M (n,) or (n, n)
+    gaps: jax.Array  # (m,), of a pile the least one (1,)
+    valid: jax.Array  # () margin of the range of the gap function
+    base: jax.Array | None  # (BASE_INSTANTS, d) [m] displacements at equally spaced instants
+    others: list[Any]  # values of all other functions: traced where one closes over traced arrays
+    contacts: int  # m
+    tangents: int | None  # number of tangential displacements; None: no friction is possible
+
+
+@precise_jit
+def _at_start(
+    system: System, q: jax.Array, v: jax.Array, start: jax.Array, end: jax.Array
+) -> _AtStart:
+    """The functions of a system at the start; they are checked here, where they are traced."""
+    check_functions(system, q, v, start)
+    body = system.body
+    base = None
+    if system.base is not None:
+        displacement, instants = system.base, jnp.linspace(start, end, BASE_INSTANTS)
+        base = jax.vmap(lambda t: jnp.atleast_1d(displacement(t)))(instants)
+    loads = (system.potential, (q,)), (system.force, (q, v, start))
+    others = [*loads, *((function, (q,)) for function in body.functions)]
+    tangents = jax.eval_shape(body.tangents, q)
+    return _AtStart(
+        mass=mass_at(system, q),
+        gaps=recorded_gaps(system, q, start),
+        valid=body.valid(seen_from_base(system, q, start)),
+        base=base,
+        others=[function(*args) for function, args in others if callable(function)],
+        contacts=jax.eval_shape(body.gap_function, q).shape[0],
+        tangents=None if tangents is None else tangents.shape[1],
+    )
+
+
+def _check_values_at_start(
+    system: System, here: _AtStart, start: jax.Array, end: jax.Array
+) -> None:
+    """Raise for values of the functions that no motion can begin with."""
+    if callable(system.body.mass):
+        check_mass(here.mass)
+    check_range("q0", system.body, here.valid)
+    if here.base is None:
+        return
+    bad = ~np.isfinite(np.asarray(here.base)).all(axis=1)
+    if bad.any():
+        instants = np.linspace(float(start), float(end), BASE_INSTANTS)
+        raise ValueError(
+            "Argument `system` must have a finite base motion, but base(t) has value "
+            f"{np.asarray(here.base)[bad][0]} at t = {instants[bad][0]:g} s."
+        )
+
+
+def _with_closures_as_leaves(system: System, q: jax.Array, v: jax.Array, t: jax.Array) -> System:
+    """The system; where functions close over traced arrays these become its leaves."""
+
+    def converted(function: Any, *args: jax.Array) -> Any:
+        """The function as a pytree of the arrays that it closes over, if they are traced."""
+        if isinstance(function, eqx.Module) or not callable(function):
+            return function
+        args = tuple(jnp.zeros(x.shape, x.dtype) for x in args)
+        if not is_traced(function(*args)):
+            return function
+        new = eqx.filter_closure_convert(function, *args)
+        return new if is_traced(new) else function
+
+    def parts(s: System) -> list[Any]:
+        """All functions of a system."""
+        return [s.force, s.potential, s.base, *s.body.functions]
+
+    args = [(q, v, t), (q,), (t,), *[(q,)] * len(system.body.functions)]
+    new = [converted(function, *x) for function, x in zip(parts(system), args)]
+    return eqx.tree_at(parts, system, new, is_leaf=lambda x: x is None)
+
+
+def _closed_gaps(
+    q: jax.Array, f: jax.Array, closed_below: float | None
+) -> tuple[jax.Array, jax.Array]:
+    """Gaps () [m] below which a contact is closed, and below which a gap is rounding."""
+    q, f = jax.lax.stop_gradient((q, f))
+    numpy: Any = jnp if is_traced((q, f)) else np  # on the host nothing is compiled
+    off = precision(q.dtype).noise * numpy.maximum(numpy.abs(q).max(), numpy.abs(f).max())
+    below = numpy.maximum(CLOSED_BELOW, MORE_CLOSED * off) if closed_below is None else closed_below
+    rounding = numpy.maximum(ROUNDING_GAP * below, off)
+    return jnp.asarray(below, q.dtype), jnp.asarray(rounding, q.dtype)
+
+
+def _friction_of(system: System, law: Law, here: _AtStart) -> jax.Array | None:
+    """mu (m,), () of a pile: that of the system, or of the law; None without friction."""
+    own = system.friction is not None
+    mu = system.friction if own else getattr(law, "friction", None)
+    if mu is None:
+        return None
+    mu, dtype, m = jnp.asarray(mu), here.gaps.dtype, here.contacts
+    if not is_traced(mu) and not np.asarray(mu).any():
+        return None  # frictionless systems pay nothing
+    if here.tangents is None:
+        raise ValueError(
+            "Argument `system` must have tangents for the friction of its "
+            f"{'contacts' if own else 'law'}, but its `tangent_function` gives none."
+        )
+    if is_traced(mu):
+        mu = jnp.where(mu >= 0, mu, jnp.nan)  # the motion is `not_finite` then
+    if here.tangents not in (m, 2 * m):
+        raise ValueError(
+            "Argument `system` must have one tangent a contact in the plane, two in space: "
+            f"{m} or {2 * m} for its {m} contacts, but has {here.tangents}."
+        )
+    if is_pile(system):
+        check_shape("friction", mu, (), "one for all contacts of a pile")
+        return mu.astype(dtype)
+    if mu.shape not in ((), (m,)):
+        raise ValueError(f"Argument `friction` must have shape () or ({m},), but has {mu.shape}.")
+    return jnp.broadcast_to(mu, (m,)).astype(dtype)
