@@ -65,7 +65,7 @@ class Judged:
         self.shots = np.unique(of_value)
         self.used = used = np.append(here, np.ones(len(problem.priors), bool))
         # where the law fails, what a search takes for the residual is no error
-        errors = problem.independent(problem.measured - solution.predicted)
+        errors = problem.measurement.independent(problem.measured - solution.predicted)
         self.residual = np.append(errors, -minimum.residual[errors.size :])[used]
         self.jacobian = minimum.jacobian[used]
         self.squares = float(self.residual @ self.residual)
@@ -117,7 +117,11 @@ def unusable(problem: FitProblem, solution: Solution) -> np.ndarray:
     if not isinstance(problem.observe, Shots):
         return np.zeros(1, bool)
     slope = np.abs(problem.of_data(solution.starts[0].jacobian))
-    allowed = ABSURD * float(problem.unit) * np.asarray(problem.weight, float)[..., None]
+    allowed = (
+        ABSURD
+        * float(problem.measurement.unit)
+        * np.asarray(problem.measurement.weight, float)[..., None]
+    )
     fails = [STATUS[code].name in UNUSABLE for code in solution.status]
     used = ~np.isnan(problem.measured).all(axis=1)
     return used & (np.array(fails) | ~(slope <= allowed).all(axis=(1, 2)))
@@ -127,11 +131,17 @@ def _conserved(problem: FitProblem) -> list[np.ndarray]:
     """Of every shot the directions (n, c) in which residuals are momentum: orthonormal columns."""
     assert problem.experiments is not None
     bases, balances = [], problem.experiments.balances(problem.scene)
-    for k, ((rows, _, _), w) in enumerate(zip(balances, np.asarray(problem.weight, float))):
+    for k, ((rows, _, _), w) in enumerate(
+        zip(balances, np.asarray(problem.measurement.weight, float))
+    ):
         whole = (w > 0).all() and len(rows)
         back = (rows / w).T if whole else np.zeros((len(w), 0))
-        if whole and problem.mixing is not None:
-            own = problem.mixing[k] if problem.mixing.ndim == 3 else problem.mixing[k, :, k]
+        if whole and problem.measurement.mixing is not None:
+            own = (
+                problem.measurement.mixing[k]
+                if problem.measurement.mixing.ndim == 3
+                else problem.measurement.mixing[k, :, k]
+            )
             back = np.linalg.solve(np.asarray(own, float).T, back)
         bases.append(np.linalg.qr(back)[0])
     return bases
@@ -169,7 +179,7 @@ def _reading_variance(problem: FitProblem) -> float:
     largest = np.abs(values).max()
     for digits in range(9):
         if np.abs(values - values.round(digits)).max() <= ROUNDING * largest:
-            return float(problem.weight.max()) ** 2 * 10.0 ** (-2 * digits) / 12
+            return float(problem.measurement.weight.max()) ** 2 * 10.0 ** (-2 * digits) / 12
     return 0.0
 
 

@@ -16,12 +16,14 @@ from jimpact.core.law import StaticNumber, StaticNumbers
 from jimpact.core.scene import PairNormals
 from jimpact.fits.findings import Finding
 from jimpact.fits.matrices import AdmissibleMatrices
+from jimpact.fits.measurement import Measurement
 from jimpact.fits.observables import Shots
 from jimpact.fits.parameters import LawInScene, Parameters, Prior
 from jimpact.fits.parts_of_motion import LawInMotion
 from jimpact.fits.problem import FitProblem
 from jimpact.fits.search import FitMinimum
 from jimpact.fits.uncertainty import Profile
+from jimpact.fits.variables import Variables
 from jimpact.numerics.sparse import Neighbours
 
 _PACKAGES = ("jimpact", "jax", "jaxlib", "equinox", "numpy", "scipy")
@@ -35,7 +37,7 @@ _PARTS = {
     kind.__name__: kind
     for kind in (
         *(AdmissibleMatrices, Finding, FitMinimum, FitProblem, LawInMotion, LawInScene),
-        *(Neighbours, PairNormals, Parameters, Profile, Shots),
+        *(Measurement, Neighbours, PairNormals, Parameters, Profile, Shots, Variables),
     )
 }
 
@@ -104,12 +106,24 @@ def _class_of(place: str) -> Any:
     return getattr(jimpact, name)
 
 
+def _grouped(fields: dict[str, Any]) -> dict[str, Any]:
+    """Fields of a `FitProblem` of files before November 2026, which held those of its parts."""
+    rest, parts = dict(fields), {}
+    for name, part in (("variables", Variables), ("measurement", Measurement)):
+        own = [field.name for field in dataclasses.fields(part)]
+        of_part = {key: rest.pop("measured" if key == "value" else key) for key in own}
+        parts[name] = {"class": part.__name__, "fields": of_part}
+    return rest | parts
+
+
 def instance_of(cls: Any, fields: dict[str, Any]) -> Any:
     """An instance of a class with these fields, which are all that it has."""
     if not dataclasses.is_dataclass(cls):
         raise TypeError(f"{cls!r} is no class of a law, scene or result")
     known = {field.name for field in dataclasses.fields(cls)}
     fields = dict.fromkeys(known & _LATER) | fields
+    if cls is FitProblem and "owner" in fields:
+        fields = _grouped(fields)
     if known != set(fields):
         name = getattr(cls, "__name__", cls)
         raise TypeError(f"{name} has the fields {sorted(known)}, the file {sorted(fields)}")

@@ -289,7 +289,7 @@ def fit_many(
     for k, data in enumerate(many):
         check_kind(f"many[{k}]", data, Experiments)
     first = of_shots(law, scene, many[0], *choice)
-    same = scene is not None and first.mixing is None
+    same = scene is not None and first.measurement.mixing is None
     same &= getattr(first.law, "rtol", None) != COARSE_RTOL  # where the noise allows it
     problems = [first]
     for data in many[1:]:
@@ -416,16 +416,16 @@ def bootstrap(
         raise ValueError("Argument `fit` must have a known noise, but its noise is not finite.")
     problem = fit.problem
     z = np.random.default_rng(seed).normal(size=(samples, *fit.predicted.shape))
-    errors = problem.errors_of(fit.noise * np.moveaxis(z, 0, -1))
+    errors = problem.measurement.errors_of(fit.noise * np.moveaxis(z, 0, -1))
     measured = fit.predicted + np.moveaxis(errors, -1, 0)
     means = np.tile(problem.prior_mean, (samples, 1))  # as if they had been measured anew
     z = np.random.default_rng((seed, 1)).normal(size=(samples, len(problem.priors)))
     for prior, drawn in zip(problem.priors, z.T):
         i = prior.parameter
         means[:, i] = fit.value[i] + fit.noise * prior.std * drawn
-    dtype = problem.low.dtype
+    dtype = problem.dtype
     pairs = zip(measured.astype(dtype), means)
-    again = [replace(problem, measured=values, prior_mean=mean) for values, mean in pairs]
+    again = [problem.measured_again(values, mean) for values, mean in pairs]
     return _refits(fit, again, workers, progress)
 
 

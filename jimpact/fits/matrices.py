@@ -6,7 +6,7 @@ and then to the admissible matrix of the least sum of squares.
 """
 
 from itertools import product
-from typing import Any, Protocol
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -16,6 +16,8 @@ import numpy as np
 from jimpact.core.contact import decoupled, delassus_matrix, kinetic_norm
 from jimpact.core.law import Law
 from jimpact.core.scene import Scene
+from jimpact.fits.parameters import Ties
+from jimpact.fits.variables import Variables
 from jimpact.laws.kinematic import RestitutionMatrix
 from jimpact.numerics.lcp import solve_lcp
 from jimpact.numerics.tridiagonal import as_matrix, scaled
@@ -209,62 +211,25 @@ def _square(a: jax.Array, x: jax.Array) -> jax.Array:
     return jnp.einsum("sfi,sij,sfj->sf", x, a, x)
 
 
-class SearchedMatrix(Protocol):
-    """A fit, as its matrix sees it: entries are `fixed`, or `scale` times y of their `owner`."""
-
-    @property
-    def law(self) -> Law:
-        """At its start."""
-
-    @property
-    def low(self) -> jax.Array:
-        """Lowest y (Q,)."""
-
-    @property
-    def high(self) -> jax.Array:
-        """Highest y (Q,)."""
-
-    @property
-    def owner(self) -> np.ndarray:
-        """Which parameter each entry is, -1: none."""
-
-    @property
-    def scale(self) -> np.ndarray:
-        """By how much an entry changes with y."""
-
-    @property
-    def fixed(self) -> np.ndarray:
-        """Values of entries that are not free."""
-
-    @property
-    def start(self) -> np.ndarray:
-        """Parameters at the start (P,)."""
-
-    @property
-    def ties(self) -> Any:
-        """Entries that are functions of parameters, each with its `field`."""
-
-    def point(self, x: np.ndarray) -> np.ndarray:
-        """y (Q,) of the parameters x (P,)."""
-
-
-def matrix_region(problem: SearchedMatrix, scenes: list[Scene]) -> AdmissibleMatrices | None:
+def matrix_region(
+    law: Law, scenes: list[Scene], variables: Variables, start: np.ndarray, ties: Ties
+) -> AdmissibleMatrices | None:
     """The y whose (m, m) `RestitutionMatrix` is admissible in each scene; None for other laws.
 
     Raises:
         ValueError: redundant contacts, too many contacts, a start that is not admissible, fixed
             entries that leave no admissible choice, a tied matrix.
     """
-    law, owner = problem.law, problem.owner
     if not encloses(law, scenes[0].contacts):
         return None
-    if any(tie.field == "matrix" for tie in problem.ties):
+    if any(tie.field == "matrix" for tie in ties):
         raise ValueError("Argument `ties` must not tie a `matrix` that has to stay admissible.")
-    moves = np.where(owner[:, None] == np.arange(len(owner)), problem.scale, 0.0)
-    origin, start = np.where(owner < 0, problem.fixed, 0.0), problem.point(problem.start)
-    bounds = np.stack([problem.low, problem.high])
+    owner = variables.owner
+    moves = np.where(owner[:, None] == np.arange(len(owner)), variables.scale, 0.0)
+    origin, start = np.where(owner < 0, variables.fixed, 0.0), variables.point(start)
+    bounds = np.stack([variables.low, variables.high])
     is_bounded = np.isfinite(bounds[:, np.any(moves != 0, axis=0)]).any()
-    dtype = problem.low.dtype
+    dtype = variables.low.dtype
     region = _region(scenes, dtype, origin, moves, bounds if is_bounded else None, start)
     slack, _ = _host_conditions(region, start)
     for name, kind in zip(_FACES, _kinds(region)):

@@ -168,7 +168,7 @@ class _Inner:
         reach = self.reach(z / r)
         move = reach * jnp.tanh(r / reach)
         y = self.region.center.at[: self.count].add(move * z / r)
-        x = y[: self.count] * self.problem.scale[: self.count]
+        x = y[: self.count] * self.problem.variables.scale[: self.count]
         # of dmove/dr = 1 / cosh^2, in a form that does not overflow
         slope = -2 * (jnp.logaddexp(r / reach, -r / reach) - jnp.log(2.0))
         return x, slope + (self.count - 1) * jnp.log(move / r)

@@ -108,7 +108,9 @@ class Deviances:
         for k, (which, values, _) in enumerate(trials):
             points[k, which], fixed[k, which] = values, True
         solver = Solver(max_steps=PASSES, show=self.show, damping=NEAR)
-        ends = minimize([self.problem], points, solver, _STOP, what="fixed values", fixed=fixed)
+        ends = minimize(
+            [self.problem.least_squares()], points, solver, _STOP, what="fixed values", fixed=fixed
+        )
         least = int(np.argmin(ends.squares))
         if self._is_below(ends.squares[least], self.lowest.squares):
             self.lowest = Lowest(float(ends.squares[least]), ends.y[least])
@@ -124,11 +126,17 @@ class Deviances:
 
     def values(self, i: int, y: Any) -> Any:
         """Values of the i-th parameter of scaled ones."""
-        return unscaled(y, float(self.problem.scale[i]), bool(self.problem.log[i]))
+        return unscaled(
+            y, float(self.problem.variables.scale[i]), bool(self.problem.variables.log[i])
+        )
 
     def reach(self, i: int) -> tuple[float, float]:
         """The bounds of the i-th parameter, scaled; infinite ones as far as starts reach."""
-        low, high, best = self.problem.low[i], self.problem.high[i], self.best.y[i]
+        low, high, best = (
+            self.problem.variables.low[i],
+            self.problem.variables.high[i],
+            self.best.y[i],
+        )
         low = low if np.isfinite(low) else best - START_SCALES
         return float(low), float(high if np.isfinite(high) else best + START_SCALES)
 
@@ -421,7 +429,10 @@ def contour(
         deviances, width = Deviances(fit, limit, show), _BEYOND * np.sqrt(limit)
         values = []
         for i in pair:
-            pieces, scale = fit.linearized_interval(i, width), np.asarray(fit.problem.scale)[i]
+            pieces, scale = (
+                fit.linearized_interval(i, width),
+                np.asarray(fit.problem.variables.scale)[i],
+            )
             outer = np.array([pieces[0][0], pieces[-1][1]])
             outer = scaled(outer, scale, fit.problem.parameters.log[i])
             low, high = np.clip(outer, *deviances.reach(i)).tolist()

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,6 +10,7 @@ import numpy as np
 from scipy.special import chdtrc
 
 from jimpact.fits.observables import Shots
+from jimpact.fits.problem import FitProblem, outcome_at
 from jimpact.fits.solve import (
     COARSE,
     RANK_TOLERANCE,
@@ -19,16 +20,12 @@ from jimpact.fits.solve import (
     Method,
     Solver,
     minimize,
-    outcome_at,
     stacked,
     step_limit,
 )
 from jimpact.tools.checks import as_whole, check_choice, check_values
 from jimpact.tools.compiling import quick_jit
 from jimpact.tools.threads import in_parts
-
-if TYPE_CHECKING:
-    from jimpact.fits.problem import FitProblem
 
 # Random starts: a stiffness within this factor of the user's, a parameter without two bounds
 # within this many natural scales of the user's.
@@ -165,13 +162,13 @@ class Solution:
 
 
 def solution(
-    problem: "FitProblem", ends: Ends, counts: np.ndarray | None = None, lost: int = 0
+    problem: FitProblem, ends: Ends, counts: np.ndarray | None = None, lost: int = 0
 ) -> Solution:
     """The distinct minima among ends; counts: of the starts that an end is for."""
     counts = np.ones(len(ends.y), int) if counts is None else counts
     count, measured = len(problem.names), problem.measured
     # without what filled up, and parameters that have no prior
-    first_prior = ends.residual.shape[1] - len(problem.low)
+    first_prior = ends.residual.shape[1] - len(problem.variables.low)
     own = [*range(measured.size), *(first_prior + prior.parameter for prior in problem.priors)]
     groups, minima = _groups(problem, ends), []
     best = groups[0][0]
@@ -192,13 +189,13 @@ def solution(
         slopes=end.slopes,
         converged=bool(end.converged),
         stuck=bool(end.stuck),
-        at_bound=((end.y <= problem.low) | (end.y >= problem.high))[:count],
+        at_bound=((end.y <= problem.variables.low) | (end.y >= problem.variables.high))[:count],
         steps=int(np.max(ends.steps)),
         lost_starts=lost + int(counts.sum()) - sum(minimum.count for minimum in minima),
     )
 
 
-def find_minima(problem: "FitProblem", starts: int | None, seed: int, solver: Solver) -> Solution:
+def find_minima(problem: FitProblem, starts: int | None, seed: int, solver: Solver) -> Solution:
     """All starts to where their minima can be told apart, and the best of these to its end.
 
     Two thirds of the starts are those of `start_points`. The law is only piecewise smooth, so that
@@ -210,7 +207,7 @@ def find_minima(problem: "FitProblem", starts: int | None, seed: int, solver: So
     rng = np.random.default_rng(seed)
     if starts == 1:
         points = start_points(problem, 1, rng)
-        return solution(problem, minimize([problem], points, solver, what="starts"))
+        return solution(problem, minimize([problem.least_squares()], points, solver, what="starts"))
 
     def again(ends: Ends, turn: int) -> Ends | None:
         """From twice as many points as before, where sigma contradicts what was found."""
@@ -222,7 +219,7 @@ def find_minima(problem: "FitProblem", starts: int | None, seed: int, solver: So
     ends = _rough_ends(problem, starts, rng, solver)
     ends = _extended(ends, 0 if starts else TURNS - 1, len(problem.names), again)
     best = _groups(problem, ends)[0][:1]
-    fine = minimize([problem], ends.y[best], solver, what="minima")
+    fine = minimize([problem.least_squares()], ends.y[best], solver, what="minima")
     fine = fine._replace(steps=fine.steps + ends.steps[best])
     for leaf, value in zip(jax.tree.leaves(ends), jax.tree.leaves(fine)):
         leaf[best] = value
@@ -232,7 +229,7 @@ def find_minima(problem: "FitProblem", starts: int | None, seed: int, solver: So
 
 
 def _rough_ends(
-    problem: "FitProblem",
+    problem: FitProblem,
     starts: int | None,
     rng: np.random.Generator,
     solver: Solver,
@@ -250,7 +247,7 @@ def _rough_ends(
 
     def rough(points: np.ndarray) -> Ends:
         """To where minima can be told apart."""
-        return minimize([problem], points, solver, COARSE, noise, "starts")
+        return minimize([problem.least_squares()], points, solver, COARSE, noise, "starts")
 
     def around(ends: Ends, _: int) -> Ends | None:
         """From points around the best; None: the data see none of the parameters."""
@@ -284,11 +281,13 @@ def _extended(
     return ends
 
 
-def _box(problem: "FitProblem") -> np.ndarray:
+def _box(problem: FitProblem) -> np.ndarray:
     """Ends (2, P) of y between which starts lie."""
     log, count = problem.parameters.log, len(problem.names)
     own = problem.point(problem.start)[:count]
-    low, high = (np.array(end, float)[:count] for end in (problem.low, problem.high))
+    low, high = (
+        np.array(end, float)[:count] for end in (problem.variables.low, problem.variables.high)
+    )
     reach = np.where(log, np.log(START_FACTOR), START_SCALES)
     low = np.where(log | np.isinf(low), np.maximum(low, own - reach), low)
     high = np.where(log | np.isinf(high), np.minimum(high, own + reach), high)
@@ -297,7 +296,7 @@ def _box(problem: "FitProblem") -> np.ndarray:
     return np.stack([low, high])
 
 
-def start_points(problem: "FitProblem", starts: int, rng: np.random.Generator) -> np.ndarray:
+def start_points(problem: FitProblem, starts: int, rng: np.random.Generator) -> np.ndarray:
     """Starts y (S, Q): the law's own values, then a Latin hypercube inside the bounds."""
     low, high = _box(problem)
     slices = rng.permuted(np.tile(np.arange(starts), (len(low), 1)), axis=1).T
@@ -306,7 +305,7 @@ def start_points(problem: "FitProblem", starts: int, rng: np.random.Generator) -
     return points
 
 
-def _first_points(problem: "FitProblem", count: int, rng: np.random.Generator) -> np.ndarray:
+def _first_points(problem: FitProblem, count: int, rng: np.random.Generator) -> np.ndarray:
     """The law's own y, the lowest of many points, and those of each ratio where few are free."""
     ratios = np.flatnonzero(problem.parameters.log)
     corners = 2 ** len(problem.parameters.log)
@@ -315,11 +314,15 @@ def _first_points(problem: "FitProblem", count: int, rng: np.random.Generator) -
     for i in ratios if len(ratios) <= SCANS else ():
         line = np.tile(points[0], (SCANNED // 2, 1))
         line[:, i] += np.linspace(-np.log(SCAN_FACTOR), np.log(SCAN_FACTOR), len(line))
-        chosen.append(_lowest(problem, np.clip(line, problem.low, problem.high), count // 2))
+        chosen.append(
+            _lowest(
+                problem, np.clip(line, problem.variables.low, problem.variables.high), count // 2
+            )
+        )
     return np.concatenate(chosen)
 
 
-def _lowest(problem: "FitProblem", points: np.ndarray, count: int) -> np.ndarray:
+def _lowest(problem: FitProblem, points: np.ndarray, count: int) -> np.ndarray:
     """Of points (S, Q) the lowest that are lower than their nearest neighbours, at most so many."""
     law, parameters = problem.law, len(problem.names)
     if getattr(law, "rtol", SCAN_RTOL) is None:
@@ -327,7 +330,10 @@ def _lowest(problem: "FitProblem", points: np.ndarray, count: int) -> np.ndarray
     if isinstance(problem.observe, Shots) and hasattr(law, "max_steps"):
         steps = min(SCAN_STEPS * problem.observe.bodies, law.max_steps)
         law = replace(law, max_steps=steps)  # type: ignore[call-arg]
-    squares, many = np.empty(len(points)), stacked([replace(problem, law=law)], len(points))
+    squares, many = (
+        np.empty(len(points)),
+        stacked([replace(problem, law=law).program()], len(points)),
+    )
     for rows, some in in_parts(_squares, (many, points), SCAN_LANES, np.arange(len(points))):
         squares[rows] = np.nan_to_num(some, nan=np.inf)
     width = np.ptp(points[:, :parameters], axis=0)
@@ -344,13 +350,13 @@ def _squares(problems: Any, points: jax.Array) -> jax.Array:
 
 
 def _near(
-    problem: "FitProblem", ends: Ends, count: int, noise: float, rng: np.random.Generator
+    problem: FitProblem, ends: Ends, count: int, noise: float, rng: np.random.Generator
 ) -> np.ndarray:
     """Points (count, Q) in bounds, as far off as standard errors and more, around the best.
 
     Minima that fit as well take turns: another one may lie next to each.
     """
-    measured = int(np.sum(problem.weight > 0))
+    measured = int(np.sum(problem.measurement.weight > 0))
     variance = max(np.nanmin(ends.squares) / measured, noise**2)
     distinct = [group[0] for group in _groups(problem, ends)]
     best = [i for i in distinct if ends.squares[i] <= ends.squares[distinct[0]] + variance]
@@ -364,10 +370,10 @@ def _near(
     spread = np.exp(rng.uniform(np.log(NEAR_SPREAD), np.log(FAR_SPREAD), (count, 1)))
     z = rng.normal(size=(count, len(error[0])))
     move = np.minimum(spread * error[centre], START_SCALES) * z
-    return np.clip(ends.y[best][centre] + move, problem.low, problem.high)
+    return np.clip(ends.y[best][centre] + move, problem.variables.low, problem.variables.high)
 
 
-def _groups(problem: "FitProblem", ends: Ends) -> list[list[int]]:
+def _groups(problem: FitProblem, ends: Ends) -> list[list[int]]:
     """Ends in the same minimum, best minimum first.
 
     Of equally good ends a converged one comes first, then the earliest start: the first start is
@@ -390,7 +396,7 @@ def _groups(problem: "FitProblem", ends: Ends) -> list[list[int]]:
     return groups
 
 
-def _same_values(problem: "FitProblem", ends: Ends, first: int, apart: np.ndarray) -> bool:
+def _same_values(problem: FitProblem, ends: Ends, first: int, apart: np.ndarray) -> bool:
     """Whether values (P,) so far apart from those of an end are the same."""
     if np.abs(apart).max() < SAME_VALUE:
         return True
@@ -406,8 +412,8 @@ def _same_values(problem: "FitProblem", ends: Ends, first: int, apart: np.ndarra
 
 
 def settled(
-    problems: "list[FitProblem]", points: np.ndarray, solver: Solver, stop: float = 0.0
-) -> "tuple[list[FitProblem], Ends]":
+    problems: list[FitProblem], points: np.ndarray, solver: Solver, stop: float = 0.0
+) -> tuple[list[FitProblem], Ends]:
     """Minima next to points (S, Q), equally many of each problem.
 
     Errors of v- are passed on by the law of each problem's best minimum, until both agree. `stop`:
@@ -415,7 +421,7 @@ def settled(
     """
     each, start = len(points) // len(problems), points
     for _ in range(SETTLING):
-        ends = minimize(problems, start, solver, stop)
+        ends = minimize([p.least_squares() for p in problems], start, solver, stop)
         if ends.slopes is None:
             return problems, ends
         best = np.nanargmin(ends.squares.reshape(-1, each), axis=1)
@@ -425,7 +431,7 @@ def settled(
         start = ends.y
         if not moved.any():  # residuals and Jacobians with the weights of the final law
             last = solver._replace(max_steps=1)
-            return problems, minimize(problems, start, last)
+            return problems, minimize([p.least_squares() for p in problems], start, last)
     return problems, ends._replace(converged=ends.converged & ~moved)
 
 
@@ -433,8 +439,8 @@ def settled(
 
 
 def robust_minimum(
-    problem: "FitProblem", found: Solution, loss: str, solver: Solver
-) -> "tuple[FitProblem, Solution, float]":
+    problem: FitProblem, found: Solution, loss: str, solver: Solver
+) -> tuple[FitProblem, Solution, float]:
     """Least squares again and again, with weights `psi(u) / u` of the last residuals u.
 
     Equation: the covariance is `s^2 mean(psi^2) / mean(psi')^2 (J^T J)^-1` (Huber, 1981).
@@ -442,14 +448,14 @@ def robust_minimum(
     here = ~np.isnan(problem.measured)
     for _ in range(LOSS_ROUNDS):
         problem = problem.with_errors_before(found.slopes)
-        error = problem.independent(problem.measured - found.predicted)
+        error = problem.measurement.independent(problem.measured - found.predicted)
         scale = 1.0
         if problem.sigma is None:
             scale = max(MEDIAN * float(np.median(np.abs(error[here]))), np.finfo(float).tiny)
         share, slope = LOSSES[loss](error / scale)
         factor, before = np.sqrt(share), problem.point(found.value)
         weighed = problem.weighed(factor)
-        found = solution(weighed, minimize([weighed], before[None], solver))
+        found = solution(weighed, minimize([weighed.least_squares()], before[None], solver))
         if np.abs(problem.point(found.value) - before).max() <= SETTLED:
             break
     else:

@@ -457,18 +457,20 @@ def _errors_left_out(result: Fit) -> np.ndarray:
 
 def _linearized(result: Fit) -> np.ndarray:
     """The same by one Gauss-Newton step: `(I - J_k (J^T J)^-1 J_k^T)^-1 r_k`."""
-    jacobian, residual = map(result.problem.independent, (result.jacobian, result.residual))
+    jacobian, residual = map(
+        result.problem.measurement.independent, (result.jacobian, result.residual)
+    )
     flat = jacobian.reshape(-1, jacobian.shape[-1])
     inverse = np.linalg.pinv(flat.T @ flat, rcond=1e-12, hermitian=True)
     hat = jacobian @ inverse @ np.swapaxes(jacobian, 1, 2)
     rest = np.eye(hat.shape[-1]) - hat
     error = np.stack([np.linalg.lstsq(a, b, rcond=1e-9)[0] for a, b in zip(rest, residual)])
-    return result.problem.errors_of(error)
+    return result.problem.measurement.errors_of(error)
 
 
 def _per_shot(result: Fit, error: np.ndarray) -> np.ndarray:
     """Weighted squares (K,) of these errors; NaN where a shot has none."""
-    squares = np.sum(result.problem.independent(error) ** 2, axis=1)
+    squares = np.sum(result.problem.measurement.independent(error) ** 2, axis=1)
     return np.where(np.isnan(error).all(axis=1), np.nan, squares)
 
 

@@ -7,10 +7,10 @@ One pass evaluates residual and Jacobian together, so that an impact is compiled
 """
 
 import time
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -58,6 +58,9 @@ _SHORT = 10.0  # damping from which on steps shorten, perhaps towards a kink tha
 _FLAT = 1e-10  # curvatures below this share of the largest are damped as if they had it
 _ADAM_RATE, _SGD_RATE, _SGD_MOMENTUM = 0.1, 0.3, 0.9  # in y, where ranges are of order 1
 
+# Problems that a program solves side by side: starts of one, and many problems. With ten times
+# more of them, all wait for the one whose impacts take longest; an accelerator has idle cores.
+LANES, LANES_OF_MANY, LANES_ON_ACCELERATOR = 2, 64, 1024
 PASSES = 4  # of a program, between two looks at the clock
 # A solve that lowers its sum of squares by less than this share in PASSES passes, although its
 # derivatives promise more, creeps along a kink of the law, where the sequence of contacts changes,
@@ -71,25 +74,35 @@ RANK_TOLERANCE = {"float64": 1e-6, "float32": 1e-3}
 SETTLED, SETTLING = 1e-5, 10  # change (natural scales) and rounds, where errors of v- are passed on
 
 
-class LeastSquares(Protocol):
-    """What a solver asks of a problem: its box, and residual r (R,) with Jacobian at y (Q,)."""
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class LeastSquares:
+    """Minimize `|r(y)|^2 / 2` for `low <= y <= high`: all that a solver knows of a fit.
 
-    @property
-    def low(self) -> jax.Array:
-        """Lowest y (Q,)."""
+    Attributes:
+        evaluate: y (Q,) -> r (R,), dr/dy (R, Q), and what is kept of the best point; a pytree.
+        low, high: (Q,) the box.
+        size: () what r was divided by.
+        project: (y, H, g) -> allowed z of the least `g^T (z - y) + (z - y)^T H (z - y) / 2`; None:
+            all of the box is allowed.
+        zeros: shaped like what `evaluate` gives.
+        short: whether `evaluate` takes so little time that many problems may wait for each other.
+    """
 
-    @property
-    def high(self) -> jax.Array:
-        """Highest y (Q,)."""
+    evaluate: Callable[[jax.Array], tuple[jax.Array, jax.Array, Any]]
+    low: Any
+    high: Any
+    size: Any
+    project: Callable[[jax.Array, jax.Array, jax.Array], jax.Array] | None
+    zeros: Any
+    short: bool = field(metadata={"static": True})
 
-    def evaluate(self, y: jax.Array) -> tuple[jax.Array, jax.Array, Any]:
-        """r (R,), dr/dy (R, Q), and what else is kept of the best point."""
-
-    def program(self) -> "LeastSquares":
-        """The problem as a compiled function takes it."""
-
-    def point(self, x: np.ndarray) -> np.ndarray:
-        """y (Q,) of the parameters x (P,)."""
+    def lanes(self, count: int) -> int:
+        """How many of `count` such problems are solved side by side."""
+        if not self.short:
+            return LANES if count > 1 else 1
+        many = LANES_OF_MANY if jax.default_backend() == "cpu" else LANES_ON_ACCELERATOR
+        return LANES if count <= LANES_OF_MANY else many
 
 
 def _free_gradient(problem: LeastSquares, y: jax.Array, gradient: jax.Array) -> jax.Array:
@@ -178,7 +191,7 @@ def begin(problems: Any, y: Any, solver: "Solver") -> SolverState:
     costs = all_are(np.inf), all_are(np.inf)
     ends = all_are(0, int), all_are(False, bool), all_are(False, bool)
     trial = np.clip(y, problems.low, problems.high)
-    residual, jacobian, aux = problems.blank(y)
+    residual, jacobian, aux = problems.zeros
     state = SolverState(y, residual, jacobian, aux, *costs, trial, memory, *ends)
     return jax.tree.map(np.array, state)  # copies: states are written in place
 
@@ -326,25 +339,25 @@ def minimize(
     others. `stop`: see `FINE`, which it is at least. `noise`: all are starts of one problem, whose
     residuals have this noise at least, and every few passes the worse half of them is given up
     (successive halving). Progress counts `what`. `fixed` (S, Q): which entries of y stay as they
-    are. A matrix that must be admissible is sought without that, and then the best admissible one.
+    are. Where not all of the box is allowed, that is left aside at first, and then holds.
     """
     many = stacked(problems, len(points) // len(problems))
     points = points.astype(many.low.dtype)
-    dtype, matrix = str(points.dtype), many.matrix
+    dtype, project = str(points.dtype), many.project
     if fixed is not None:
         low, high = (np.where(fixed, points, end) for end in (many.low, many.high))
-        many, matrix = replace(many, low=low, high=high), None
-    many = replace(many, matrix=None)
+        many, project = replace(many, low=low, high=high), None
+    many = replace(many, project=None)
     rule = (max(FINE[dtype], stop), noise, what)
     states, converged = _descended(many, points, solver, *rule)
     y, steps, stuck = np.asarray(states.y), states.steps, states.stuck
-    once, moved = solver._replace(max_steps=1), np.full(len(y), matrix is not None)
+    once, moved = solver._replace(max_steps=1), np.full(len(y), project is not None)
     for _ in range(SETTLING):
         if not moved.any():
             break
         inside = np.empty_like(y)
         lanes, workers = many.lanes(len(y)), solver.workers
-        for rows, nearest in in_parts(best_inside, (matrix, states), lanes, workers=workers):
+        for rows, nearest in in_parts(best_allowed, (project, states), lanes, workers=workers):
             inside[rows] = nearest
         states, _ = _descended(many, inside, once, *rule)
         moved, y = np.abs(inside - y).max(axis=1) > SETTLED, inside
@@ -363,24 +376,17 @@ def minimize(
     )
 
 
-def outcome_at(problem: LeastSquares, x: Any) -> Ends:
-    """Residual, derivatives and predictions at x (P,), by the program that searches."""
-    point = problem.point(np.asarray(x))[None]
-    once, every = Solver(max_steps=1), np.ones(point.shape, bool)
-    return minimize([problem], point, once, fixed=every)
-
-
 @quick_jit
-def best_inside(matrix: Any, states: SolverState) -> jax.Array:
-    """The admissible points where the linearized residuals are least."""
+def best_allowed(project: Any, states: SolverState) -> jax.Array:
+    """The allowed points where the linearized residuals are least."""
 
-    def one(matrix: Any, state: SolverState) -> jax.Array:
+    def one(project: Any, state: SolverState) -> jax.Array:
         """Of one problem."""
         jacobian = state.jacobian
         hessian, gradient = jacobian.T @ jacobian, jacobian.T @ state.residual
-        return matrix.nearest(state.y, hessian, gradient)
+        return project(state.y, hessian, gradient)
 
-    return jax.vmap(one)(matrix, states)
+    return jax.vmap(one)(project, states)
 
 
 def _descended(
@@ -399,6 +405,7 @@ def _descended(
         limit = np.asarray(limit)  # one program serves all limits
     rule: Any = {"method": solver.method, "max_steps": limit, "stop": np.asarray(stop, dtype)}
     advance, states = partial(advance_all, **rule), begin(problems, points, solver)
+    problems = replace(problems, zeros=None)
     converged = np.zeros(count, bool)
     active, lanes = np.arange(count), problems.lanes(count)
     first = True
@@ -438,9 +445,8 @@ def _converged(states: SolverState, enough: float) -> np.ndarray:
     return small | (squares <= EXACT[str(states.y.dtype)]) | states.stuck
 
 
-def stacked(problems: Sequence[LeastSquares], each: int = 1) -> Any:
-    """The problems as compiled functions take them, side by side, each so many times."""
-    filled = [problem.program() for problem in problems]
+def stacked(problems: Sequence[Any], each: int = 1) -> Any:
+    """Problems of one structure side by side, each so many times."""
 
     def side_by_side(*leaves: Any) -> Any:
         """Arrays with a leading axis; what is no array is the same for all."""
@@ -448,4 +454,4 @@ def stacked(problems: Sequence[LeastSquares], each: int = 1) -> Any:
             return leaves[0]
         return np.repeat(np.stack([np.asarray(leaf) for leaf in leaves]), each, axis=0)
 
-    return jax.tree.map(side_by_side, *filled)
+    return jax.tree.map(side_by_side, *problems)

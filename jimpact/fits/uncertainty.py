@@ -15,9 +15,9 @@ from jimpact.core.scene import Scene
 from jimpact.fits.data import Experiments
 from jimpact.fits.findings import Finding
 from jimpact.fits.parameters import LawInScene, tied_names, tied_value
-from jimpact.fits.problem import FitProblem
+from jimpact.fits.problem import FitProblem, outcome_at
 from jimpact.fits.search import FitMinimum, Solution, solution
-from jimpact.fits.solve import RANK_TOLERANCE, outcome_at
+from jimpact.fits.solve import RANK_TOLERANCE
 from jimpact.tools.checks import check_choice, check_kind, check_shape, check_values
 from jimpact.tools.records import Column, Table, Tabular, counted, plain
 from jimpact.tools.status import STATUS
@@ -418,7 +418,7 @@ class FitResult(Solution, Uncertainty, Tabular, Generic[AnyLaw]):
         if sigma is not None:
             stretched = 1.0 if self.problem.sigma is None else self.noise
             return stretched * np.asarray(sigma, float)
-        weight = np.ma.masked_equal(np.asarray(self.problem.weight, float), 0.0)
+        weight = np.ma.masked_equal(np.asarray(self.problem.measurement.weight, float), 0.0)
         # NaN: never measured
         return self.noise * np.sqrt((1 / weight**2).mean(axis=0)).filled(np.nan)
 

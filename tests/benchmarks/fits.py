@@ -85,7 +85,7 @@ def by_scipy(start, scene, data, free, truth):
             point = np.zeros((1, len(fitted.low)))
             point[0, : len(y)] = y
             everything = np.ones(point.shape, bool)
-            ends = minimize([fitted], point, Solver(max_steps=1), fixed=everything)
+            ends = minimize([fitted.least_squares()], point, Solver(max_steps=1), fixed=everything)
             known[y.tobytes()] = ends.residual[0], ends.jacobian[0, :, : len(y)]
         return known[y.tobytes()]
 

@@ -204,7 +204,7 @@ def covered(row, fits):
         y = best.copy()
         y[:, i] = [f.problem.point(truth)[i] for f in fits]
         fixed = np.broadcast_to(np.arange(y.shape[1]) == i, y.shape)
-        squares = minimize(problems, y, Solver(), fixed=fixed).squares
+        squares = minimize([p.least_squares() for p in problems], y, Solver(), fixed=fixed).squares
         more = squares - [f.starts[0].sum_of_squares for f in fits]
         inside.append(more <= [(f.quantile(0.95) * f.noise) ** 2 for f in fits])
     return linear.mean(axis=0), np.mean(inside, axis=1)
