@@ -78,7 +78,7 @@ class Pile(Protocol):
     def placed_at(self, at: jax.Array, points: jax.Array) -> Placed:
         """The same of some bodies."""
 
-    def speeds(self, at: jax.Array, point: jax.Array, ways: jax.Array) -> jax.Array:
+    def contact_jacobian(self, at: jax.Array, point: jax.Array, ways: jax.Array) -> jax.Array:
         """Rows of velocities of points along directions."""
 
 
@@ -287,5 +287,6 @@ def _of_contacts(
         lowest = corners[row, corner] - bodies.rims[i][:, None] * n
         point = jnp.where(on_plane, lowest, point)
     ways = jnp.concatenate([n[:, None], tangents_of(n)], axis=1)
-    sides = bodies.speeds(at[i], point, ways), -bodies.speeds(at[other], point, ways)
+    jacobian = bodies.contact_jacobian
+    sides = jacobian(at[i], point, ways), -jacobian(at[other], point, ways)
     return i, jnp.minimum(partner, bodies.count), jnp.stack(sides, axis=2)

@@ -294,10 +294,16 @@ class RigidBodies(Body):
         """Unit tangents (m, d - 1, d) of normals (m, d)."""
         return tangents_of(normal)
 
-    def speeds(self, at: jax.Array, point: jax.Array, ways: jax.Array) -> jax.Array:
-        """(.., k, velocities of a body): of points (.., d) along ways (.., k, d).
+    def contact_jacobian(self, at: jax.Array, point: jax.Array, ways: jax.Array) -> jax.Array:
+        """Rows (.., k, velocities of a body): velocity of a point along k directions.
 
-        Of bodies at (.., coordinates); leading axes of all three are broadcast.
+        Equation: row k is `J_k = [d_k, r x d_k]`, r the lever arm from the body to the point; with
+        quaternions `r x d_k` in the axes of the body.
+
+        Args:
+            at: coordinates of the bodies (.., c); leading axes of all three are broadcast.
+            point: (.., d) [m].
+            ways: unit vectors d_k (.., k, d).
         """
         lever = (point - at[..., : self.dimension])[..., None, :]
         if self.dimension == 2:
@@ -313,11 +319,12 @@ class RigidBodies(Body):
         """(n, m, k): velocities along ways (m, k, d) of all bodies."""
         pairs = self.pairs_in_contact()
         sides = pairs if (pairs[:, 1] >= 0).any() else pairs[:, :1]  # a plane does not move
-        speeds = self.speeds(self.of_bodies(q)[sides], point[:, None], ways[:, None])
-        speeds = speeds.at[:, 1:].multiply(-1.0)  # (m, sides, k, velocities)
+        at = self.of_bodies(q)[sides]
+        jacobian = self.contact_jacobian(at, point[:, None], ways[:, None])
+        jacobian = jacobian.at[:, 1:].multiply(-1.0)  # (m, sides, k, velocities)
         # by JAX: of thousands of bodies only the shapes are needed, and this would fill the memory
         own = jnp.asarray(sides)[:, :, None] == np.arange(self.count, dtype=np.int32)[None, None]
-        rows = jnp.sum(jnp.where(own[..., None, None], speeds[:, :, None], 0.0), axis=1)
+        rows = jnp.sum(jnp.where(own[..., None, None], jacobian[:, :, None], 0.0), axis=1)
         velocities = self.count * (self.dimension + self.angular)
         return rows.transpose(1, 3, 0, 2).reshape(velocities, *ways.shape[:2])
 

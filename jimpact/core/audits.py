@@ -172,10 +172,10 @@ def summary(out: Impact, scene: Scene, velocity: Any, names: Sequence[str] = ())
     broken = audit(scene, velocity, out).broken
     words = [f"{name} {'VIOLATED' if name in broken else 'ok'}" for name in CONSISTENCIES]
     reason = nothing_approaches(scene, velocity)
-    quiet = reason is not None and not np.asarray(out.impulse).any()
+    nothing_happens = reason is not None and not np.asarray(out.impulse).any()
     lines = [
         f"status         {row.name}: {row.message}",
-        *([f"impact         none: {reason}"] if quiet else []),
+        *([f"impact         none: {reason}"] if nothing_happens else []),
         f"energy         {before:.6g} J before, change {formatted(change, '.6g')} J "
         f"({100 * remaining:.4g} % kept)",
         f"audit          {', '.join(words)}",

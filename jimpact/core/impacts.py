@@ -124,7 +124,8 @@ def impact(
     check_kind("law", law, Law)
     check_kind("scene", scene, Scene)
     v = as_velocity(scene, velocity, finite=True)
-    check_constrained(scene, v)
+    if scene.constraints is not None:
+        check_constrained(scene, v)
     law, scene, v = in_common_dtype(law, scene, v)
     check_law(law, scene, v.dtype)
     for name, speed in (("noise", noise), ("approach", approach)):
@@ -135,7 +136,8 @@ def impact(
         None if noise is None else jnp.asarray(noise, v.dtype),
         None if approach is None else jnp.asarray(approach, v.dtype),
     )
-    _warn_of_unused_gaps(law, scene, v)
+    if scene.gaps is not None and not law.uses_gaps:
+        _warn_of_unused_gaps(law, scene, v)
     separable = is_separable(law)
     groups = coupled_groups(scene) if separable else None
     few = scene.contacts <= SHARED and scene.walls != (True, True) and scene.tangents is None
@@ -148,7 +150,7 @@ def impact(
 
 def _warn_of_unused_gaps(law: Law, scene: Scene, v: jax.Array) -> None:
     """Warn where only open contacts approach, and the law leaves these out."""
-    if scene.gaps is None or law.uses_gaps or is_traced((scene, v)):
+    if is_traced((scene, v)):
         return
     with jax.ensure_compile_time_eval():  # inside jit, too, where scene and v are known
         approaches, stored = np.asarray(gap_velocity(scene, v)) < 0, law.stored
@@ -243,7 +245,7 @@ def _impact_of_padded_scene(law: Law, scene: Scene, v: jax.Array, offsets: _Offs
 
 def check_constrained(scene: Scene, velocity: jax.Array) -> None:
     """A velocity that breaks a bilateral constraint is an error."""
-    if scene.constraints is None or is_traced((scene.constraints, velocity)):
+    if is_traced((scene.constraints, velocity)):
         return
     h, v = np.asarray(scene.constraints), np.asarray(velocity)
     keeps = _keeps_constraints(h, v)

@@ -222,12 +222,12 @@ class FrictionFlow(ContactFlow):
         resting = loaded & rests & ((slip != 0) | closed)
         check = any_of(stopped | (closed & resting))
         to_check = check & loaded & (stopped | resting | (slip == 0))
-        still, state = jax.lax.stop_gradient((self, y))
-        f = still.soon(modes, state)
-        most = still.friction * f
+        constant, state = jax.lax.stop_gradient((self, y))
+        f = constant.soon(modes, state)
+        most = constant.friction * f
         slides = jnp.where(to_check | ~loaded, 0.0, -slip.astype(u.dtype) * most)
-        b = times(jnp.swapaxes(still.normal_tangent, 0, 1), f) + times(still.tangent, slides)
-        stick, towards = distribute(still.tangent, b, most, to_check)
+        b = times(jnp.swapaxes(constant.normal_tangent, 0, 1), f) + times(constant.tangent, slides)
+        stick, towards = distribute(constant.tangent, b, most, to_check)
         towards = jnp.where(stick, 0, jnp.sign(towards).astype(slip.dtype))
         slip = jnp.where(to_check, towards, slip)
         y = self._at_rest(modes, y, to_check, jnp.where(stick, most, 0.0))

@@ -81,11 +81,11 @@ class Problem(NamedTuple):
     taking_part: jax.Array  # (1,) contacts that are not open for good
     step: jax.Array  # (1,) of the impulse form: the tolerance itself, whatever the stiffnesses
     viscous: Viscous | None = None
-    sides: "Sides | None" = None
+    tangential: "Tangential | None" = None
     limit: jax.Array | None = None  # indentation at which the force stays
 
 
-class Sides(NamedTuple):
+class Tangential(NamedTuple):
     """The tangential block with friction: normalized as the normal one."""
 
     block: TangentialBlock  # K_nt (m, t), K_tt (t, t), u- (t,)
@@ -156,11 +156,11 @@ def dimensionless(
     return problem, ImpactUnits(q, time, root, x_ref, jax.lax.stop_gradient(rtol * fastest))
 
 
-def sides_of(contact: Contact, friction: jax.Array, units: ImpactUnits) -> Sides:
+def tangential_of(contact: Contact, friction: jax.Array, units: ImpactUnits) -> Tangential:
     """The tangential block of the contacts in the units of the normal one."""
     assert contact.tangential_block is not None  # see `check_law`
     block = contact.tangential_block.scaled(units.root, units.velocity)
-    return Sides(block, friction * jnp.ones_like(units.root))
+    return Tangential(block, friction * jnp.ones_like(units.root))
 
 
 def normal_coupling(problem: Problem, structure: Structure) -> jax.Array:
@@ -210,10 +210,10 @@ def flow_of(
         limit=problem.limit,
     )
     x = first_indentation(problem, exponent)
-    if problem.sides is None:
+    if problem.tangential is None:
         flow = ContactFlow(**parts, watches=tighten < 1 and problem.exponent is not None)
         return flow, *flow.start(problem.gamma, x)
-    (normal_tangent, tangent, slip), friction = problem.sides
+    (normal_tangent, tangent, slip), friction = problem.tangential
     kind = FrictionFlow if len(slip) == m else SlipFlow
     frictional = kind(**parts, normal_tangent=normal_tangent, tangent=tangent, friction=friction)
     return frictional, *frictional.start_with(problem.gamma, x, slip)
@@ -221,26 +221,33 @@ def flow_of(
 
 @dataclasses.dataclass(frozen=True)
 class ImpulseProgram:
-    """From the leaves of a `Problem` in columns to impulses (m, B), (t, B), and of (1, B) the time
-    (of the last event; of the end where `whole`: no closed form ends it), status and passes."""
+    """From the leaves of a `Problem` in columns to impulses (m, B), (t, B), time, status, passes.
+
+    Of (1, B) is the time of the last event (of the end where `with_end_time`: no closed form ends
+    it), the status and the number of passes.
+    """
 
     tree: Any
     exponent: float | tuple[float, ...] | None
     structure: Structure
     most: int
-    sides: int = 0  # tangential rows
-    whole: bool = False
+    tangents: int = 0  # tangential impulses
+    with_end_time: bool = False
     finely: bool = False  # at the tolerance of derivatives
     checkpoints: bool = False  # its loops have the reverse mode, in the place of the forward mode
 
     def flow(self, problem: Problem, tighten: float) -> tuple[ContactFlow, jax.Array, jax.Array]:
         """The flow of a problem, its first modes and state."""
         flow, modes, y = flow_of(problem, self.exponent, self.structure, tighten)
-        return dataclasses.replace(flow, closed_form=flow.closed_form and not self.whole), modes, y
+        return (
+            dataclasses.replace(flow, closed_form=flow.closed_form and not self.with_end_time),
+            modes,
+            y,
+        )
 
     def queues(self, *leaves: Any) -> bool:
         """Whether a batch of any size is worked through as a queue (`until_over`): in space."""
-        return self.sides > jax.tree.unflatten(self.tree, leaves).omega.shape[0]
+        return self.tangents > jax.tree.unflatten(self.tree, leaves).omega.shape[0]
 
     @property
     def takes_duals(self) -> bool:
@@ -250,8 +257,8 @@ class ImpulseProgram:
     def results(self, *kinds: Kind) -> tuple[Kind, ...]:
         """Of the results from leaves of these kinds."""
         normal = jax.tree.unflatten(self.tree, kinds).gamma
-        one, whole = normal._replace(shape=(1,)), Kind((1,), jnp.dtype(jnp.int32))
-        return normal, normal._replace(shape=(self.sides,)), one, whole, whole
+        one, code = normal._replace(shape=(1,)), Kind((1,), jnp.dtype(jnp.int32))
+        return normal, normal._replace(shape=(self.tangents,)), one, code, code
 
     def __call__(self, *leaves: Any) -> tuple[Any, ...]:
         """The results from the leaves of a problem; see the class."""
@@ -260,10 +267,10 @@ class ImpulseProgram:
         flow, modes, y = pushforward(lambda problem: self.flow(problem, tighten), problem)
         gamma = value_of(problem.gamma)
         rows = 3 * gamma.shape[0]
-        sides = slice(rows + self.sides, rows + 2 * self.sides)
+        tangential = slice(rows + self.tangents, rows + 2 * self.tangents)
         if value_of(flow).at_once:
             state = pushforward(lambda flow, y: flow.finish(modes, y)[1], flow, y)
-            results = pushforward(lambda y: (y[rows - 1 : rows], y[sides], y[-1:]), state)
+            results = pushforward(lambda y: (y[rows - 1 : rows], y[tangential], y[-1:]), state)
             none = jnp.full(gamma.shape, CODE["ok"], jnp.int32)
             return *results, none, none
         end = run(flow, gamma, modes, y, self.most, inspect, self.checkpoints)
@@ -273,7 +280,7 @@ class ImpulseProgram:
             last = flow, problem.gamma, state
             plastic = pushforward(lambda f, g, y: final_impulses(f, g, y, end.carries), *last)
             p = Dual(p, plastic.tangents) if is_dual(plastic) else plastic
-        rest = pushforward(lambda y: (y[sides], y[-1:]), state)
+        rest = pushforward(lambda y: (y[tangential], y[-1:]), state)
         return p, *rest, end.status, end.carry.progress[3:4].astype(jnp.int32)
 
 
@@ -294,13 +301,13 @@ class ImplicitProgram(ImpulseProgram):
         coupling, m = coupling_of(problem, self.structure), problem.omega.shape[0]
         friction, velocity = jnp.zeros_like(problem.omega), problem.gamma
         sliding = None
-        if problem.sides is not None:
-            (across, tangent, slip), friction = problem.sides
+        if problem.tangential is not None:
+            (across, tangent, slip), friction = problem.tangential
             back, normal = jnp.swapaxes(across, 0, 1), normal_coupling(problem, self.structure)
             rows = [jnp.concatenate(x, axis=1) for x in ((normal, across), (back, tangent))]
             coupling = Dense(jnp.concatenate(rows))
-            still = jax.lax.stop_gradient(coupling.matrix)
-            sliding = descent_lengths(still, m, friction_only=True)
+            constant = jax.lax.stop_gradient(coupling.matrix)
+            sliding = descent_lengths(constant, m, friction_only=True)
             velocity = jnp.concatenate([velocity, slip])
         flow = ImplicitSteps(
             coupling=coupling,
@@ -361,19 +368,19 @@ class Dynamics(NamedTuple):
     @property
     def tangents(self) -> int:
         """Tangential rows t."""
-        return 0 if self.problem.sides is None else self.problem.sides.block.slip.shape[0]
+        return 0 if self.problem.tangential is None else self.problem.tangential.block.slip.shape[0]
 
     def columns(self) -> tuple[tuple[jax.Array, ...], Any]:
         """The arrays of the problem with the batch last, and its structure."""
         leaves, tree = jax.tree.flatten(self.problem)
         return tuple(x[..., None] for x in leaves), tree
 
-    def program(self, whole: bool = False) -> ImpulseProgram:
+    def program(self, with_end_time: bool = False) -> ImpulseProgram:
         """From `columns` to impulses; `whole`: no closed form ends it."""
         kind = ImplicitProgram if self.method == "implicit" else ImpulseProgram
         tree = self.columns()[1]
         parts = tree, self.static_exponent, self.structure, self.max_steps, self.tangents
-        return kind(*parts, whole=whole)
+        return kind(*parts, with_end_time=with_end_time)
 
 
 def solve(
@@ -422,26 +429,26 @@ def perturbed(problem: Problem) -> Problem:
 
     This shows how far errors grow also where rounding limits them, not the tolerance.
     """
-    still = jax.lax.stop_gradient(problem)
-    gamma, tolerance = still.gamma, still.tolerance
+    constant = jax.lax.stop_gradient(problem)
+    gamma, tolerance = constant.gamma, constant.tolerance
     held = precision(gamma.dtype).noise
     finer = jnp.maximum(FINER * tolerance, held)
     coarser = APART * jnp.maximum(tolerance, held)
     last = held * (1 - 2 * (jnp.arange(len(gamma), dtype=gamma.dtype) % 2))
-    return still._replace(
+    return constant._replace(
         gamma=gamma * (1 + last),
-        omega=still.omega * (1 - last),
+        omega=constant.omega * (1 - last),
         tolerance=jnp.where(APART * finer <= tolerance, finer, coarser),
     )
 
 
-def velocity_changes(contact: Contact, p: jax.Array, sides: jax.Array | None) -> jax.Array:
+def velocity_changes(contact: Contact, p: jax.Array, p_t: jax.Array | None) -> jax.Array:
     """Changes (m,) or (m + t,) of gap velocities and slip [m/s] that impulses make."""
-    if sides is None:
+    if p_t is None:
         return contact.delassus @ p
     assert contact.tangential_block is not None
     cross, tangent, _ = contact.tangential_block
-    return jnp.concatenate([contact.delassus @ p + cross @ sides, cross.T @ p + tangent @ sides])
+    return jnp.concatenate([contact.delassus @ p + cross @ p_t, cross.T @ p + tangent @ p_t])
 
 
 def evaluate(program: ImpulseProgram, leaves: Arrays, adjoint: str = "jacobian") -> Arrays:

@@ -43,7 +43,7 @@ class HistoryProgram:
     largest force of each contact (m, B), the status (1, B) as a floating-point number.
     """
 
-    outcome: ImpulseProgram  # `whole`: no closed form ends it
+    outcome: ImpulseProgram  # `with_end_time`: no closed form ends it
     samples: int
 
     def each(self, x: jax.Array) -> jax.Array:
@@ -59,18 +59,18 @@ class HistoryProgram:
         problem = jax.tree.unflatten(self.outcome.tree, leaves)
         flow, modes, y = self.outcome.flow(problem, 1.0)
         gamma, most, checkpoints = problem.gamma, self.outcome.most, self.outcome.checkpoints
-        still = jax.lax.stop_gradient((flow, gamma, modes, y))
-        duration = run(*still, most, inspect, checkpoints).reached[-1:]
+        constant = jax.lax.stop_gradient((flow, gamma, modes, y))
+        duration = run(*constant, most, inspect, checkpoints).reached[-1:]
         t = self.parts(y.dtype)[:, None, None] * jax.lax.stop_gradient(duration)[None]
 
         def observe(seen: Seen, now: stepper.StepperState, accept: jax.Array) -> Seen:
             """With this step where it may contain a sample."""
             force = flow.contact_states(now.step.modes, now.y).force
-            begun = accept[None] & (now.y[None, -1:] <= t)
+            may_hold_sample = accept[None] & (now.y[None, -1:] <= t)
             return Seen(
-                jnp.where(begun, now.y[None], seen.states),
-                jnp.where(begun, now.step.modes[None], seen.modes),
-                jnp.where(begun, now.step.clock[None], seen.clock),
+                jnp.where(may_hold_sample, now.y[None], seen.states),
+                jnp.where(may_hold_sample, now.step.modes[None], seen.modes),
+                jnp.where(may_hold_sample, now.step.clock[None], seen.clock),
                 jnp.where(accept & (force > seen.force), force, seen.force),
             )
 
@@ -116,8 +116,8 @@ class ImplicitHistoryProgram(HistoryProgram):
         outcome = self.outcome
         flow, start = outcome.steps(jax.tree.unflatten(outcome.tree, leaves))
         m, most, checkpoints = flow.contacts, outcome.most, outcome.checkpoints
-        still = jax.lax.stop_gradient((flow, start))
-        duration = implicit_steps.run(*still, most, checkpoints).state.time
+        constant = jax.lax.stop_gradient((flow, start))
+        duration = implicit_steps.run(*constant, most, checkpoints).state.time
         t = self.parts(duration.dtype)[:, None, None] * jax.lax.stop_gradient(duration)[None]
 
         def force(s: ImplicitState) -> jax.Array:
@@ -127,8 +127,8 @@ class ImplicitHistoryProgram(HistoryProgram):
         def observe(seen: Any, now: ImplicitState, accept: jax.Array) -> Any:
             """With the state before this step where it may contain a sample."""
             states, largest = seen
-            begun = accept[None] & (now.time[None] <= t)
-            kept = jax.tree.map(lambda a, b: jnp.where(begun, a[None], b), now, states)
+            may_hold_sample = accept[None] & (now.time[None] <= t)
+            kept = jax.tree.map(lambda a, b: jnp.where(may_hold_sample, a[None], b), now, states)
             return kept, jnp.where(accept, jnp.maximum(force(now), largest), largest)
 
         seen = jax.tree.map(self.each, start), force(start)

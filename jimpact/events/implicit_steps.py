@@ -313,15 +313,17 @@ class ImplicitSteps:
         root = jnp.exp(jnp.log(jnp.where(some, part, 1.0)) / self.eta)
         return jnp.where(some, root, 0.0)
 
-    def lost(self, begun: jax.Array, last: jax.Array, x: jax.Array, gamma: jax.Array) -> jax.Array:
+    def lost(
+        self, x_before: jax.Array, last: jax.Array, x: jax.Array, gamma: jax.Array
+    ) -> jax.Array:
         """Speed over e (1, B) that contacts would still have gained from what they stored last.
 
         Not the speed itself: where others push a contact open, at e = 0, its expansion decides.
         """
         if self.viscous is not None:
             return jnp.zeros_like(self.tolerance)
-        left = self.energy(jnp.where(last > 0, last, begun))
-        gone = (begun > 0) & (x <= 0) & (gamma > 0)
+        left = self.energy(jnp.where(last > 0, last, x_before))
+        gone = (x_before > 0) & (x <= 0) & (gamma > 0)
         root = jnp.sqrt(left)
         faster = self.least * left / jnp.where(gamma > 0, gamma, 1.0)
         speed = jnp.where(gone, jnp.minimum(root, faster), 0.0)
@@ -339,7 +341,7 @@ class ImplicitSteps:
         return jnp.max(jnp.where(turns, part * load, 0.0), axis=0, keepdims=True)
 
     def slackened(
-        self, begun: jax.Array, x: jax.Array, before: jax.Array, after: jax.Array, h: jax.Array
+        self, x_before: jax.Array, x: jax.Array, before: jax.Array, after: jax.Array, h: jax.Array
     ) -> jax.Array:
         """Impulse (1, B) of a damped force that ends, or sets in again, within the step.
 
@@ -347,8 +349,8 @@ class ImplicitSteps:
         """
         if self.viscous is None:
             return jnp.zeros_like(self.tolerance)
-        first, last = self.force_of(begun, before), self.force_of(x, after)
-        turns = (begun > 0) & (x > 0) & ((first > 0) != (last > 0))
+        first, last = self.force_of(x_before, before), self.force_of(x, after)
+        turns = (x_before > 0) & (x > 0) & ((first > 0) != (last > 0))
         return jnp.max(jnp.where(turns, h / 2 * (first + last), 0.0), axis=0, keepdims=True)
 
     def unseen(self, s: ImplicitState, end: ImplicitState, h: jax.Array) -> jax.Array:

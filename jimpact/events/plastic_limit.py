@@ -60,16 +60,16 @@ def inspect(
     """
     flow, values = _values(flow, carry)
     gamma, rest = jax.lax.stop_gradient((gamma, rest))
-    quiet = which & at_rest(flow, values) if at_end else jnp.zeros_like(rest.contacts)
-    due = any_of(quiet) if at_end else which
+    resting = which & at_rest(flow, values) if at_end else jnp.zeros_like(rest.contacts)
+    due = any_of(resting) if at_end else which
     rest = cond(
         jnp.any(due),
-        lambda: contacts_at_rest(flow, gamma, values, rest, quiet),
+        lambda: contacts_at_rest(flow, gamma, values, rest, resting),
         lambda: rest,
     )
     if not flow.looks_ahead:
         return rest
-    look = due & ~rest.ended & ~any_of(quiet) & flow.look_due(values.progress[3:4])
+    look = due & ~rest.ended & ~any_of(resting) & flow.look_due(values.progress[3:4])
     return cond(
         jnp.any(look),
         lambda: block_at_rest(flow, gamma, values, rest, look),
@@ -82,12 +82,12 @@ def at_rest(flow: ContactFlow, end: stepper.StepperState) -> jax.Array:
     m, modes = flow.contacts, end.step.modes
     gamma = flow.scales(modes) * flow.rows(end.y)[1]
     # no wider than what ended the impact: a ball of a long chain may be slower
-    quiet = jnp.abs(gamma) <= QUIET * flow.patience(end.progress[3:4])
-    return quiet & any_of(quiet & (modes[m : 2 * m] >= ENDLESS))
+    resting = jnp.abs(gamma) <= QUIET * flow.patience(end.progress[3:4])
+    return resting & any_of(resting & (modes[m : 2 * m] >= ENDLESS))
 
 
 def contacts_at_rest(
-    flow: ContactFlow, gamma: jax.Array, carry: stepper.StepperState, last: Rest, quiet: jax.Array
+    flow: ContactFlow, gamma: jax.Array, carry: stepper.StepperState, last: Rest, resting: jax.Array
 ) -> Rest:
     """Which contacts are at rest at the end, or would come to rest after a pause.
 
@@ -100,7 +100,7 @@ def contacts_at_rest(
     most, before = (jnp.max(x, axis=0, keepdims=True) for x in (count, last.closings))
     paused = (carry.progress[2:3] == Mark.PAUSED) & (most > before) & (most >= OFTEN)
     often = paused & (2 * since >= jnp.max(since, axis=0, keepdims=True)) & (count > 0)
-    rest = quiet | often
+    rest = resting | often
     now = gamma + flow.change(state)
 
     start = often | (rest & (now < 0))
@@ -116,9 +116,9 @@ def contacts_at_rest(
     settled = ~flow.at_work(modes, state, flow.tolerance)[0] & (after >= -flow.tolerance)
     meets = jnp.where(often, carries, settled) & jnp.all(returns, axis=0)
     ends = paused & ~any_of(~meets) & any_of(often & (flow.restitution < 1))
-    rest = quiet | (often & ends)
+    rest = resting | (often & ends)
     new = Rest(rest, rest & carries, rows.at[2].set(dp), count, ends)
-    fresh = paused | any_of(quiet)
+    fresh = paused | any_of(resting)
     return jax.tree.map(lambda a, b: jnp.where(fresh, a, b), new, last)
 
 

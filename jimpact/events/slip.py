@@ -473,15 +473,15 @@ class SlipFlow(FrictionFlow):
         slip = jnp.where(slips, Slip.SLIPS, slip)
         check = any_of(stopped | (closed & resting))
         to_check = check & loaded & (stopped | resting | stick)
-        still, state = jax.lax.stop_gradient((self, y))
-        f = still.soon(modes, state)
-        most = still.friction * f
+        constant, state = jax.lax.stop_gradient((self, y))
+        f = constant.soon(modes, state)
+        most = constant.friction * f
         slides = jnp.where(
             (to_check | ~loaded)[:, None], 0.0, polar(jax.lax.stop_gradient(q[:, 1]))[0]
         )
-        b = times(jnp.swapaxes(still.normal_tangent, 0, 1), f)
-        b = b - times(still.tangent, flat(most[:, None] * slides))
-        inside, towards = distribute(still.tangent, b, most, to_check)
+        b = times(jnp.swapaxes(constant.normal_tangent, 0, 1), f)
+        b = b - times(constant.tangent, flat(most[:, None] * slides))
+        inside, towards = distribute(constant.tangent, b, most, to_check)
         towards = angle_of(pairs(towards))
         begins = jnp.stack([jnp.zeros_like(towards), jnp.where(inside, 0.0, towards)], 1)
         lost = jnp.where((closed & resting & inside)[:, None], q, 0.0)

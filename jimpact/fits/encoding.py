@@ -127,7 +127,7 @@ def instance_of(cls: Any, fields: dict[str, Any]) -> Any:
     if known != set(fields):
         name = getattr(cls, "__name__", cls)
         raise TypeError(f"{name} has the fields {sorted(known)}, the file {sorted(fields)}")
-    instance: Any = object.__new__(cls)  # type: ignore[arg-type]  # as it was: its fields have been checked and converted
+    instance: Any = object.__new__(cls)  # as it was: its fields have been checked and converted
     for key, value in fields.items():
         object.__setattr__(instance, key, decoded(value))
     return instance

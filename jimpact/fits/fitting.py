@@ -29,7 +29,7 @@ from jimpact.fits.search import (
     find_minima,
     robust_minimum,
     settled,
-    solution,
+    solution_of,
     start_points,
 )
 from jimpact.fits.solve import (
@@ -142,21 +142,21 @@ def fit(
     deadline = np.inf if search.limit is None else time.monotonic() + float(search.limit)
     with progress_bar(search.progress) as show:
         solver = Solver(method, steps, show, deadline)
-        found = find_minima(problem, starts, seed, solver)
-        while (lost := unusable(problem, found)).any() and not lost.all():
+        solution = find_minima(problem, starts, seed, solver)
+        while (lost := unusable(problem, solution)).any() and not lost.all():
             problem = _without(problem, lost)
-            found = find_minima(problem, starts, seed, solver)
-        _check_derivatives(problem, found)
-        if found.slopes is not None:
-            points = problem.point(np.array([minimum.value for minimum in found.starts]))
-            problem = problem.with_errors_before(found.slopes)
+            solution = find_minima(problem, starts, seed, solver)
+        _check_derivatives(problem, solution)
+        if solution.slopes is not None:
+            points = problem.point(np.array([minimum.value for minimum in solution.starts]))
+            problem = problem.with_errors_before(solution.slopes)
             (problem,), ends = settled([problem], points, solver)
-            counts = np.array([minimum.count for minimum in found.starts])
-            found = solution(problem, ends, counts, found.lost_starts)
+            counts = np.array([minimum.count for minimum in solution.starts])
+            solution = solution_of(problem, ends, counts, solution.lost_starts)
         robust = None
         if search.loss != "squares":
-            problem, found, robust = robust_minimum(problem, found, search.loss, solver)
-    result = replace(as_fit(problem, found, method, robust), loss=search.loss, seed=seed)
+            problem, solution, robust = robust_minimum(problem, solution, search.loss, solver)
+    result = replace(as_fit(problem, solution, method, robust), loss=search.loss, seed=seed)
     if profiles or (profiles is None and needs_profiles(result)):
         more = PROFILE_STARTS if profiles else 0
         every = range(len(result.names))
@@ -169,8 +169,8 @@ def _with_profiles(result: Fit[AnyLaw], profiles: tuple[Profile, ...]) -> Fit[An
     if (better := profiles[0].better) is not None:
         values = ", ".join(f"{name} {x:.4g}" for name, x in zip(result.names, better))
         line = f"A profile found a lower minimum than the fit ({values}): allow more `starts`."
-        found = Finding("lower_minimum", line, "a profile found a lower minimum")
-        result = replace(result, findings=(*result.findings, found))
+        finding = Finding("lower_minimum", line, "a profile found a lower minimum")
+        result = replace(result, findings=(*result.findings, finding))
     return replace(result, profiles=profiles)
 
 
@@ -203,32 +203,32 @@ def _without(problem: FitProblem, lost: np.ndarray) -> FitProblem:
 
 
 def as_fit(
-    problem: FitProblem, found: Solution, method: Method, robust: float | None = None
+    problem: FitProblem, solution: Solution, method: Method, robust: float | None = None
 ) -> Fit[Any]:
     """The fit at the end of a search: errors, rank and warnings.
 
     `robust`: noise times the root of the degrees of freedom, of a loss that outliers move little.
     """
-    judged = Judged(replace(problem, scene=problem.to_scene(found.value)), found, robust)
+    judged = Judged(replace(problem, scene=problem.to_scene(solution.value)), solution, robust)
     errors = judged.errors
-    residual = np.asarray(problem.measured, float) - found.predicted
-    starts, limit = [], found.starts[0].sum_of_squares + HARDLY_WORSE * errors.noise**2
-    for end in found.starts:
+    residual = np.asarray(problem.measured, float) - solution.predicted
+    starts, limit = [], solution.starts[0].sum_of_squares + HARDLY_WORSE * errors.noise**2
+    for end in solution.starts:
         matters = not end.sum_of_squares > limit  # also where the noise is not known
         error = uncertainty(problem, end, errors.noise).standard_error if matters else None
         starts.append(FitMinimum(end.sum_of_squares, end.value, end.count, error))
     return Fit(
-        law=problem.to_law(found.value),
+        law=problem.to_law(solution.value),
         method=method if isinstance(method, str) else "optax",
         names=problem.names,
         bounds=(problem.domains[:, 0], problem.domains[:, 1]),
         residual=residual,
         rms=rms(problem, residual),
         **vars(errors),
-        **vars(replace(found, starts=tuple(starts))),
+        **vars(replace(solution, starts=tuple(starts))),
         findings=tuple(fit_findings(judged)),
         problem=problem,
-        jacobian=problem.derivatives(found.starts[0]),
+        jacobian=problem.derivatives(solution.starts[0]),
     )
 
 
@@ -304,19 +304,19 @@ def fit_many(
             points = start_points(first, starts, np.random.default_rng(seed))
             points = np.tile(points, (len(members), 1))
             some = [problems[k] for k in members]
-            found, ends = settled(some, points, solver, FINE_OF_MANY)
-            for i, (k, problem) in enumerate(zip(members, found)):
+            settled_problems, ends = settled(some, points, solver, FINE_OF_MANY)
+            for i, (k, problem) in enumerate(zip(members, settled_problems)):
                 each[k] = ends.rows(slice(i * starts, (i + 1) * starts))
                 problems[k] = problem
 
     @functools.cache
     def made(k: int) -> Fit[AnyLaw]:
         """The fit of one; shots that cannot be used are left out in a new one."""
-        found = solution(problems[k], each[k])
-        if unusable(problems[k], found).any():
+        solution = solution_of(problems[k], each[k])
+        if unusable(problems[k], solution).any():
             search = Search(seed=seed, max_steps=max_steps, progress=False)
             return fit(problems[k], starts=starts, profiles=False, search=search)
-        return as_fit(problems[k], found, "levenberg-marquardt")
+        return as_fit(problems[k], solution, "levenberg-marquardt")
 
     best = [each[k].rows(np.nanargmin(each[k].squares)) for k in range(len(many))]
     value = problems[0].values_at(np.array([end.y for end in best]))

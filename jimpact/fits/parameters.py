@@ -568,7 +568,7 @@ def with_parts_of_scene(law: Law, scene: Scene | None, own_scenes: bool, free: A
 
 
 def limits_with_scene(
-    parameters: Parameters, law: Law, limits: Limits, priors: tuple[Prior, ...]
+    parameters: Parameters, law: LawInScene, limits: Limits, priors: tuple[Prior, ...]
 ) -> Limits:
     """Limits of all parameters, those of the scene no farther away than their priors allow.
 
@@ -579,7 +579,7 @@ def limits_with_scene(
     low, high = (end.copy() for end in limits)
     start = entries(law, parameters.fields)[parameters.first]
     for i, (name, field) in enumerate(zip(parameters.names, parameters.of_fields)):
-        if field not in OF_A_SCENE or not isinstance(law, LawInScene):
+        if field not in OF_A_SCENE:
             continue
         if i not in known:
             raise ValueError(

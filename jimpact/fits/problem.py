@@ -245,7 +245,12 @@ class FitProblem:
         return replace(self, measurement=_in(self.dtype, self.measurement.weighed(factor)))
 
     def measured_again(self, measured: np.ndarray, prior_mean: np.ndarray) -> "FitProblem":
-        """With other measured values of the same errors, and other means of the priors (Q,)."""
+        """With other measured values of the same errors, and other means of the priors.
+
+        Args:
+            measured: shaped like that of the problem.
+            prior_mean: (Q,).
+        """
         measurement = replace(self.measurement, value=measured)
         return replace(self, measurement=measurement, prior_mean=prior_mean)
 
@@ -314,7 +319,8 @@ class FitProblem:
     def law_in_scene(self, x: Any) -> Law:
         """The law with parameters x (P,), and with the parts of the scene that are fitted."""
         values = self.variables.entries(jnp.asarray(x, self.dtype))
-        return tied(with_entries(self.law, self.fields, values), self.ties)
+        law = with_entries(self.law, self.fields, values)
+        return tied(law, self.ties) if self.ties else law
 
     def to_law(self, x: Any) -> Law:
         """The law with parameters x (P,)."""
@@ -551,12 +557,15 @@ def _build(
     for name, pairs in (("bounds", bounds), ("priors", prior), ("ties", tie)):
         if pairs is not None:
             check_kind(name, pairs, Mapping)
-    ties = checked_ties(law, tie)
-    law = tied(law, ties)
+    ties: Ties = ()
+    if tie:
+        ties = checked_ties(law, tie)
+        law = tied(law, ties)
     parameters, notes = free_parameters(law, free, getattr(observe, "absolute", False), ties)
     limits = bounds_of(parameters, law, bounds)
-    priors = priors_of(parameters, limits, prior)
-    limits = limits_with_scene(parameters, law, limits, priors)
+    priors = priors_of(parameters, limits, prior) if prior else ()
+    if isinstance(law, LawInScene):
+        limits = limits_with_scene(parameters, law, limits, priors)
     if priors and measurement.sigma is None:
         raise ValueError(
             "Argument `priors` must be left out where no `sigma` (or `resolution`) of the measured "

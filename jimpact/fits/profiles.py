@@ -15,7 +15,7 @@ import numpy as np
 
 from jimpact.fits.parameters import as_names, scaled, unscaled
 from jimpact.fits.report import Fit
-from jimpact.fits.search import SAME_VALUE, START_SCALES, FitMinimum, find_minima, solution
+from jimpact.fits.search import SAME_VALUE, START_SCALES, FitMinimum, find_minima, solution_of
 from jimpact.fits.solve import RANK_TOLERANCE, Ends, Solver, minimize
 from jimpact.fits.uncertainty import Profile, check_level
 from jimpact.tools.checks import as_whole, check_choice, check_kind
@@ -245,7 +245,7 @@ def profiles_of(
             if lines.lowest is lines.best:
                 break
             end = lines.minimize([((), (), lines.lowest.y)])
-            lines.add_starts(solution(fit.problem, end).starts)
+            lines.add_starts(solution_of(fit.problem, end).starts)
     return profiles
 
 

@@ -161,7 +161,7 @@ class Solution:
         return self.starts[0].value
 
 
-def solution(
+def solution_of(
     problem: FitProblem, ends: Ends, counts: np.ndarray | None = None, lost: int = 0
 ) -> Solution:
     """The distinct minima among ends; counts: of the starts that an end is for."""
@@ -207,7 +207,9 @@ def find_minima(problem: FitProblem, starts: int | None, seed: int, solver: Solv
     rng = np.random.default_rng(seed)
     if starts == 1:
         points = start_points(problem, 1, rng)
-        return solution(problem, minimize([problem.least_squares()], points, solver, what="starts"))
+        return solution_of(
+            problem, minimize([problem.least_squares()], points, solver, what="starts")
+        )
 
     def again(ends: Ends, turn: int) -> Ends | None:
         """From twice as many points as before, where sigma contradicts what was found."""
@@ -225,7 +227,7 @@ def find_minima(problem: FitProblem, starts: int | None, seed: int, solver: Solv
         leaf[best] = value
     total = len(ends.y)
     solver.show(f"fit: {total} of {total} starts done", total, total)
-    return solution(problem, ends)
+    return solution_of(problem, ends)
 
 
 def _rough_ends(
@@ -439,7 +441,7 @@ def settled(
 
 
 def robust_minimum(
-    problem: FitProblem, found: Solution, loss: str, solver: Solver
+    problem: FitProblem, solution: Solution, loss: str, solver: Solver
 ) -> tuple[FitProblem, Solution, float]:
     """Least squares again and again, with weights `psi(u) / u` of the last residuals u.
 
@@ -447,21 +449,21 @@ def robust_minimum(
     """
     here = ~np.isnan(problem.measured)
     for _ in range(LOSS_ROUNDS):
-        problem = problem.with_errors_before(found.slopes)
-        error = problem.measurement.independent(problem.measured - found.predicted)
+        problem = problem.with_errors_before(solution.slopes)
+        error = problem.measurement.independent(problem.measured - solution.predicted)
         scale = 1.0
         if problem.sigma is None:
             scale = max(MEDIAN * float(np.median(np.abs(error[here]))), np.finfo(float).tiny)
         share, slope = LOSSES[loss](error / scale)
-        factor, before = np.sqrt(share), problem.point(found.value)
+        factor, before = np.sqrt(share), problem.point(solution.value)
         weighed = problem.weighed(factor)
-        found = solution(weighed, minimize([weighed.least_squares()], before[None], solver))
-        if np.abs(problem.point(found.value) - before).max() <= SETTLED:
+        solution = solution_of(weighed, minimize([weighed.least_squares()], before[None], solver))
+        if np.abs(problem.point(solution.value) - before).max() <= SETTLED:
             break
     else:
-        found = replace(found, converged=False)
+        solution = replace(solution, converged=False)
     psi = (share * error / scale)[here]
     noise = scale * np.sqrt(np.sum(psi**2)) / max(slope[here].mean(), LEAST_SLOPE)
     # weighted as in the problem, without the factors of the loss
-    starts = solution(problem, outcome_at(problem, found.value)).starts
-    return problem, replace(found, starts=starts), float(noise)
+    starts = solution_of(problem, outcome_at(problem, solution.value)).starts
+    return problem, replace(solution, starts=starts), float(noise)

@@ -16,7 +16,7 @@ from jimpact.fits.data import Experiments
 from jimpact.fits.findings import Finding
 from jimpact.fits.parameters import LawInScene, tied_names, tied_value
 from jimpact.fits.problem import FitProblem, outcome_at
-from jimpact.fits.search import FitMinimum, Solution, solution
+from jimpact.fits.search import FitMinimum, Solution, solution_of
 from jimpact.fits.solve import RANK_TOLERANCE
 from jimpact.tools.checks import check_choice, check_kind, check_shape, check_values
 from jimpact.tools.records import Column, Table, Tabular, counted, plain
@@ -394,7 +394,7 @@ class FitResult(Solution, Uncertainty, Tabular, Generic[AnyLaw]):
         largest = own if scenes is None else max(scenes, key=lambda each: each.contacts)
         self._check_scene(largest, len(units))
         problem = self.problem.of_other(data, own)
-        there = solution(problem, outcome_at(problem, self.value))
+        there = solution_of(problem, outcome_at(problem, self.value))
         error = self.errors_of(problem.derivatives(there.starts[0]))
         value, noise = there.predicted, np.broadcast_to(self._noise_of(sigma), data.pre.shape)
         half = quantile * np.hypot(error, noise)

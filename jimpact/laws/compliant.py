@@ -15,11 +15,11 @@ from jimpact.events.impact_dynamics import (
     METHODS,
     Dynamics,
     dimensionless,
-    sides_of,
     solve,
+    tangential_of,
 )
 from jimpact.laws.forces import Bistiffness, Force, HuntCrossley, KelvinVoigt, KuwabaraKono
-from jimpact.laws.lzb import check_friction, check_rtol, solver_of
+from jimpact.laws.lzb import check_few_contacts, check_rtol, solver_of
 from jimpact.numerics.derive import ADJOINTS
 from jimpact.numerics.tridiagonal import diagonal
 from jimpact.tools.checks import check_choice, check_values
@@ -105,8 +105,10 @@ class Compliant(Law):
 
     def check(self, scene: Scene, dtype: jnp.dtype) -> None:
         """Raise for a tolerance finer than the precision can hold, and too many contacts."""
-        check_rtol(self.rtol, dtype)
-        check_friction(self.friction, scene)
+        if self.rtol is not None:
+            check_rtol(self.rtol, dtype)
+        if self.friction is not None:
+            check_few_contacts(scene)
 
     def accuracy(self, contact: Contact) -> float:
         """`rtol`, or its default at this `contact`."""
@@ -142,7 +144,7 @@ class Compliant(Law):
             depth = (force.bound / k) ** (1 / jnp.asarray(exponent, k.dtype))
             problem = problem._replace(limit=depth / units.indentation)
         if self.friction is not None:
-            problem = problem._replace(sides=sides_of(contact, self.friction, units))
+            problem = problem._replace(tangential=tangential_of(contact, self.friction, units))
         structure, most = contact.structure, self.max_steps
         return Dynamics(problem, units, exponent, structure, most, method, self.adjoint)
 

@@ -83,7 +83,8 @@ def history(law: Law, scene: Scene, velocity: Any, samples: int = 200) -> Histor
     as_whole("samples", samples, 2)
     v = as_velocity(scene, velocity)
     check_values("velocity", v)
-    check_constrained(scene, v)
+    if scene.constraints is not None:
+        check_constrained(scene, v)
     law, scene, v = in_common_dtype(law, scene, v)
     check_law(law, scene, v.dtype)
     with naming_the_adjoint():
@@ -98,7 +99,7 @@ def _history(law: Law, scene: Scene, v: jax.Array, samples: int, traced: Traced)
     harmless = jnp.where(happens, gamma, -jnp.ones_like(gamma))
     dynamics = law.dynamics(eqx.tree_at(lambda c: c.gap_velocity, contact, harmless))
     t, units = dynamics.tangents, dynamics.units
-    program, leaves = dynamics.program(whole=True), dynamics.columns()[0]
+    program, leaves = dynamics.program(with_end_time=True), dynamics.columns()[0]
     walked = dataclasses.replace(program, checkpoints=dynamics.adjoint == "checkpoints")
     values, fine = history_program(program, samples), history_program(walked, samples)
     time, energy, *rest = in_lanes(values, fine, *leaves, adjoint=dynamics.adjoint)

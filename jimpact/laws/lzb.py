@@ -22,8 +22,8 @@ from jimpact.events.impact_dynamics import (
     Dynamics,
     dimensionless,
     method_for,
-    sides_of,
     solve,
+    tangential_of,
 )
 from jimpact.laws.forces import Bistiffness
 from jimpact.numerics.derive import ADJOINTS
@@ -53,19 +53,19 @@ def solver_of(law: Any, contact: Contact) -> tuple[str, float]:
     return method, law.rtol or default_rtol(method, contact.gap_velocity.dtype)
 
 
-def check_rtol(rtol: float | None, dtype: jnp.dtype) -> None:
+def check_rtol(rtol: float, dtype: jnp.dtype) -> None:
     """Raise a ValueError where the precision cannot hold this tolerance."""
     finest = precision(dtype).noise
-    if rtol is not None and rtol < finest:
+    if rtol < finest:
         raise ValueError(
             f"Argument `rtol` must be at least {finest:.2g} in {dtype}, "
             f"but has value {rtol:g}: enable jax_enable_x64 for finer tolerances."
         )
 
 
-def check_friction(friction: Any, scene: Scene) -> None:
+def check_few_contacts(scene: Scene) -> None:
     """Raise a ValueError where too many contacts have friction."""
-    if friction is not None and scene.contacts > MOST_WITH_FRICTION:
+    if scene.contacts > MOST_WITH_FRICTION:
         raise ValueError(
             f"Argument `scene` must have at most {MOST_WITH_FRICTION} contacts for impact dynamics "
             f"with friction, but has {scene.contacts}: algebraic laws such as Moreau take more."
@@ -145,8 +145,10 @@ class LZB(Law):
 
     def check(self, scene: Scene, dtype: jnp.dtype) -> None:
         """Raise for a tolerance finer than the precision can hold, and too many contacts."""
-        check_rtol(self.rtol, dtype)
-        check_friction(self.friction, scene)
+        if self.rtol is not None:
+            check_rtol(self.rtol, dtype)
+        if self.friction is not None:
+            check_few_contacts(scene)
 
     def accuracy(self, contact: Contact) -> float:
         """`rtol`, or its default at this `contact`."""
@@ -181,7 +183,7 @@ class LZB(Law):
             closed=contact.closed,
         )
         if self.friction is not None:
-            problem = problem._replace(sides=sides_of(contact, self.friction, units))
+            problem = problem._replace(tangential=tangential_of(contact, self.friction, units))
         structure, most = contact.structure, self.max_steps
         return Dynamics(problem, units, self.exponent, structure, most, method, self.adjoint)
 

@@ -133,9 +133,9 @@ class Comparison(Tabular):
             named = ", ".join(self.closest)
             notes.append(f"closest to the measured velocities: {named} (rms {rms:.3g} m/s)")
         notes += left_out_notes(self.left_out)
-        quiet = nothing_approaches(self.scene, self.velocity)
-        if quiet is not None:
-            notes.append(f"no impact: {quiet}")
+        why_no_impact = nothing_approaches(self.scene, self.velocity)
+        if why_no_impact is not None:
+            notes.append(f"no impact: {why_no_impact}")
         return Table(columns, rows, notes=notes)
 
 

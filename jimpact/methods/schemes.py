@@ -74,7 +74,7 @@ class Scaled(NamedTuple):
         units, tangential = self.dynamics.units, None
         impulse = jnp.where(self.happens, p * units.momentum, 0.0)
         finite = jnp.all(jnp.isfinite(impulse))
-        if self.dynamics.problem.sides is not None:
+        if self.dynamics.problem.tangential is not None:
             tangential = jnp.where(self.happens, side * per_tangent(units.momentum, side), 0.0)
             finite = finite & jnp.all(jnp.isfinite(tangential))
         code = jnp.where(self.happens, code, CODE["ok"])
@@ -186,8 +186,8 @@ def field_of(problem: Scaled) -> Field:
         coupling = unit(upper) + upper + upper.T
     none = jnp.zeros((m, 0), off.dtype)
     cross, tangent, slip, friction = none, none[:0], none[0], jnp.zeros_like(one)
-    if inputs.sides is not None:
-        block, friction = inputs.sides
+    if inputs.tangential is not None:
+        block, friction = inputs.tangential
         cross, tangent, slip = block.normal_tangent, block.tangent, block.slip
     eta: Any = dynamics.static_exponent if inputs.exponent is None else inputs.exponent
     return Field(
@@ -210,7 +210,7 @@ def aligned(law: LZB, scene: Scene, velocity: Any, setting: Any) -> Solution:
     dynamics = problem.dynamics._replace(method="time")
     program, leaves = dynamics.program(), dynamics.columns()[0]
     p, side, _, code, passes = evaluate(program, leaves)
-    _, _, t, _, _ = evaluate(dataclasses.replace(program, whole=True), leaves)
+    _, _, t, _, _ = evaluate(dataclasses.replace(program, with_end_time=True), leaves)
     evaluations = (STAGES + 1) * passes[0, 0]  # of all passes, rejected ones included
     return problem.solution(p[:, 0], t[0, 0], evaluations, code[0, 0], side[:, 0])
 

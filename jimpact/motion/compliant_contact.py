@@ -122,8 +122,8 @@ def _start(problem: MotionProblem) -> State:
     """The state at the beginning: contacts are as deep as their gaps say."""
     gap = gaps(problem.system, problem.q0, problem.times[0])
     x = jnp.where(jnp.abs(gap) <= problem.settings.closed_below, 0.0, -gap)
-    sides = 0 if problem.mu is None else problem.sides // problem.contacts
-    impulses = jnp.zeros((1 + sides, len(x)), x.dtype)
+    each = 0 if problem.mu is None else problem.tangents // problem.contacts
+    impulses = jnp.zeros((1 + each, len(x)), x.dtype)
     return problem.start._replace(contact=jnp.concatenate([x[None], impulses]))
 
 
@@ -205,10 +205,10 @@ def _with_friction(problem: MotionProblem, run: _CompliantRun) -> _CompliantRun:
         # flow, which share what they hold, can hold them
         assert known.tangent is not None
         moves = direction(by_contact(known.tangent.rate, m))
-        still = Modes(acts, acts & ~slides, jnp.where(slides, moves[:, 0], 1.0))
+        sticking = Modes(acts, acts & ~slides, jnp.where(slides, moves[:, 0], 1.0))
         if settings.spatial:
-            still = still._replace(sign=jnp.ones_like(still.sign))
-        held = forces(known, mu, still, jnp.where(slides[:, None], moves, 0.0))
+            sticking = sticking._replace(sign=jnp.ones_like(sticking.sign))
+        held = forces(known, mu, sticking, jnp.where(slides[:, None], moves, 0.0))
         left = cone_margins(known, mu, held)
         within = WITHIN * friction_acceleration(known, mu, held.normal)
         # what passes the flat position turns: no forces hold both of its corners
@@ -216,8 +216,8 @@ def _with_friction(problem: MotionProblem, run: _CompliantRun) -> _CompliantRun:
         both = jnp.concatenate([held.normal, held.tangential])
         growth = length(by_contact((known.approach + known.delassus @ both)[m:], m))
         holds = (growth <= within) & (left >= jnp.where(let_go, within, 0.0))
-        sticks = jnp.all(~still.stick | holds)
-        chosen = selected(sticks, still, choice.modes)
+        sticks = jnp.all(~sticking.stick | holds)
+        chosen = selected(sticks, sticking, choice.modes)
         if settings.spatial:  # a force that changes as fast as in a contact has slip begin at once
             chosen = chosen._replace(sign=jnp.ones_like(chosen.sign))
         return mode_rows(Phases(phase, chosen))[:, None], choice.consistent | sticks
@@ -302,9 +302,9 @@ def _ended_slip(
 
 def _event(problem: MotionProblem, at: State, opened: jax.Array) -> jax.Array:
     """Numbers of an event: the impulse of contacts that have `opened` (m,); velocities go on."""
-    none = no_jump(at, problem.contacts, problem.sides)
-    zero, (push, *sides) = jnp.zeros_like(at.t), jnp.where(opened, at.contact[1:], 0.0)
+    none = no_jump(at, problem.contacts, problem.tangents)
+    zero, (push, *tangential) = jnp.zeros_like(at.t), jnp.where(opened, at.contact[1:], 0.0)
     jump = none._replace(impulse=push)
-    if sides:
-        jump = jump._replace(tangential=jnp.stack(sides, axis=1).reshape(-1))
+    if tangential:
+        jump = jump._replace(tangential=jnp.stack(tangential, axis=1).reshape(-1))
     return event_numbers(at, After(at, jump, Passed(zero, zero)))

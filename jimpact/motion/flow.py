@@ -173,7 +173,7 @@ class MotionFlow(eqx.Module, stepper.Flow):
     axes: SlipAxes | None
 
     @property
-    def spare(self) -> int:
+    def error_only_rows(self) -> int:
         """Rows in addition to those of the state, which only limit the length of steps.
 
         In space logarithms of slip: steps follow it until little is left.
@@ -203,7 +203,7 @@ class MotionFlow(eqx.Module, stepper.Flow):
         """Rows (k, 1) of margins, with that of the next sample."""
         return (jnp.append(margins, self.sample - at.t) / self.rounding)[:, None]
 
-    def spare_errors(
+    def errors_of_error_only_rows(
         self, settings: Settings, state: State, h: jax.Array, of_q: jax.Array
     ) -> list[jax.Array]:
         """Errors that a step of length h may make in its spare rows; `of_q`: sizes of q in it."""
@@ -271,16 +271,16 @@ class MechanicalFlow(MotionFlow):
     near = 0.01  # steps in time are exact for parabolas: only the last of a landing is not in time
 
     @property
-    def spare(self) -> int:
+    def error_only_rows(self) -> int:
         """Gaps by integration, too: steps follow them where the base moves faster than the body."""
-        return self.like.contact_work.shape[1] + super().spare
+        return self.like.contact_work.shape[1] + super().error_only_rows
 
     @property
     def speed_scale(self) -> jax.Array:
         """That of all kinetic energy."""
         return self.scales.speed
 
-    def spare_errors(
+    def errors_of_error_only_rows(
         self, settings: Settings, state: State, h: jax.Array, of_q: jax.Array
     ) -> list[jax.Array]:
         """Those of gaps first."""
@@ -290,7 +290,7 @@ class MechanicalFlow(MotionFlow):
             jnp.abs(normal.value) + h * jnp.abs(normal.rate) + jnp.abs(normal.gradient).T @ of_u
         )
         errors = settings.atol + settings.rtol * of_gap
-        return [errors, *super().spare_errors(settings, state, h, of_q)]
+        return [errors, *super().errors_of_error_only_rows(settings, state, h, of_q)]
 
     def constants(self, modes: jax.Array) -> Modes:
         """The modes, of each contact."""
@@ -359,7 +359,7 @@ def packed(state: State) -> jax.Array:
 
 
 def unpacked(like: State, y: jax.Array) -> State:
-    """The state of rows (.., 1); `spare` ones come last."""
+    """The state of rows (.., 1); `error_only_rows` ones come last."""
     flat, back = ravel_pytree(like)
     return back(y[: len(flat), 0])
 
@@ -511,7 +511,7 @@ def status_at_start(system: System, at: State, end: jax.Array, closed_below: Any
 
 def _rows(flow: MotionFlow, state: State) -> jax.Array:
     """Rows (.., 1) of the state, with spare ones that are 0."""
-    return jnp.pad(packed(state), ((0, flow.spare), (0, 0)))
+    return jnp.pad(packed(state), ((0, flow.error_only_rows), (0, 0)))
 
 
 def _reached(flow: MotionFlow, aim: stepper.Step, y: jax.Array) -> tuple[State, jax.Array]:
@@ -531,7 +531,7 @@ def _errors(flow: MotionFlow, settings: Settings, allowed: jax.Array, flight: Fl
     of_q = jnp.abs(state.q) + h * jnp.abs(system.body.rates(state.q, state.v))
     of_v = jnp.abs(state.v) + h * jnp.abs(rates)
     errors = [settings.atol + settings.rtol * jnp.concatenate([of_q, of_v]), allowed]
-    return jnp.concatenate([*errors, *flow.spare_errors(settings, state, h, of_q)])
+    return jnp.concatenate([*errors, *flow.errors_of_error_only_rows(settings, state, h, of_q)])
 
 
 def _smallest_step(targets: jax.Array) -> jax.Array:

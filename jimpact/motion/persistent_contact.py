@@ -430,8 +430,8 @@ def choose_with_friction(
     """
     contacts, mu = jax.lax.stop_gradient((contacts, mu))
     assert contacts.tangent is not None
-    begun = jnp.any(before.active & ~before.stick & (before.sign == BEGINS))
-    asked = _ModeQuestion(contacts, mu, touching, released, sliding, begun, slack)
+    slip_began = jnp.any(before.active & ~before.stick & (before.sign == BEGINS))
+    asked = _ModeQuestion(contacts, mu, touching, released, sliding, slip_began, slack)
     now, direction_now = _expected(asked, before)
     no, one = jnp.asarray(False), jnp.ones_like(slack)
     start = _ModeTrial(now, direction_now, touching, one, no, no, no, jnp.asarray(0))
@@ -452,11 +452,11 @@ class _ModeQuestion(NamedTuple):
     touching: jax.Array  # (m,)
     released: jax.Array  # (2 m,)
     sliding: jax.Array  # (m,)
-    begun: jax.Array  # () slip that only began before: now it slides or sticks, nothing begins
+    slip_began: jax.Array  # () slip that only began before: now it slides or sticks, nothing begins
     slack: jax.Array
 
     @property
-    def still(self) -> Modes:
+    def sticking_modes(self) -> Modes:
         """What touches and does not slide sticks."""
         ones = jnp.ones(len(self.mu), self.mu.dtype)
         return Modes(self.touching, self.touching & ~self.sliding, ones)
@@ -491,7 +491,7 @@ def _expected(asked: _ModeQuestion, before: Modes) -> tuple[Modes, jax.Array]:
     slides = jnp.where(sliding[:, None], moves, 0.0 if spatial else now.sign[:, None])
     # sliding begins against the last force of sticking
     held_on = now._replace(active=touching & ~released[:m])
-    tries = jax.tree.map(lambda *x: jnp.stack(x), held_on, asked.still)
+    tries = jax.tree.map(lambda *x: jnp.stack(x), held_on, asked.sticking_modes)
     both = jax.lax.map(lambda modes: forces(contacts, mu, modes, slides), tries)
     held, stuck = (jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1))
     assert held.tangential is not None
@@ -507,7 +507,7 @@ def _expected(asked: _ModeQuestion, before: Modes) -> tuple[Modes, jax.Array]:
 
 def _next_trial(asked: _ModeQuestion, tried: _ModeTrial) -> _ModeTrial:
     """Modes by a complementarity problem, and what the next try must change."""
-    contacts, mu, touching, released, sliding, begun, slack = asked
+    contacts, mu, touching, released, sliding, slip_began, slack = asked
     m, known = len(mu), tried.known
     dtype, diagonal = known.dtype, jnp.diagonal(contacts.delassus)[:m]
     rows = jnp.concatenate([tried.allowed, jnp.repeat(tried.allowed, known.shape[1])])
@@ -530,7 +530,7 @@ def _next_trial(asked: _ModeQuestion, tried: _ModeTrial) -> _ModeTrial:
     if in_space(contacts):
         growth = jnp.sum(turns * slide, axis=1)
         slow = slip_begins(contacts, mu, solution.normal, growth) > 0
-        sign = jnp.where(slow & ~sliding & ~begun, float(BEGINS), 1.0)
+        sign = jnp.where(slow & ~sliding & ~slip_began, float(BEGINS), 1.0)
     modes = Modes(active, active & ~slips, sign)
     # what was taken to slide from rest must do so
     returns = active & is_known & ~sliding & (jnp.sum(known * turns, axis=1) < -slack)

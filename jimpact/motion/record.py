@@ -54,8 +54,8 @@ class Events(eqx.Module):
     accumulation_gap: jax.Array
 
 
-def no_events(size: int, q: jax.Array, v: jax.Array, m: int, sides: int | None = None) -> Events:
-    """An empty table of events of m contacts; `sides`: tangential impulses, None: m."""
+def no_events(size: int, q: jax.Array, v: jax.Array, m: int, tangents: int | None = None) -> Events:
+    """An empty table of events of m contacts; `tangents`: tangential impulses, None: m."""
     dtype, n = q.dtype, v.shape[0]
 
     def blank(*shape: int) -> jax.Array:
@@ -71,7 +71,7 @@ def no_events(size: int, q: jax.Array, v: jax.Array, m: int, sides: int | None =
         velocity_before=blank(n),
         velocity_after=blank(n),
         impulse=blank(m),
-        tangential_impulse=blank(m if sides is None else sides),
+        tangential_impulse=blank(m if tangents is None else tangents),
         energy=blank(2, m),
         status=jnp.zeros(size, jnp.int32),
         accumulation_end=blank(),

@@ -219,7 +219,7 @@ def _begin(
     rest = jnp.zeros((2, m), dtype)
     begin = State(q0, v0, times[0], zero, zero, rest, rest[:0])
     rows = 1 if is_pile(system) else max_events
-    events = no_events(rows, q0, v0, m, sides=m * max(b - 1, 1))
+    events = no_events(rows, q0, v0, m, tangents=m * max(b - 1, 1))
     status = status_at_start(system, begin, times[-1], closed_below)
     fails = (status == CODE["ok"]) & ~within_domains(law)
     status = jnp.where(fails, CODE["law_failed"], status).astype(jnp.int32)

@@ -16,7 +16,7 @@ from jax.flatten_util import ravel_pytree
 from jimpact.motion.flow import Settings, State, packed, unpacked
 from jimpact.motion.record import KIND_CODE, Events
 from jimpact.motion.system import System
-from jimpact.motion.transitions import After, sides_of
+from jimpact.motion.transitions import After, tangent_count_of
 from jimpact.numerics.derive import by_jacobian
 
 # Power of the largest number that makes tangents of 1e-31 (float32) infinite the second time, but
@@ -45,9 +45,9 @@ class MotionProblem(NamedTuple):
     past: Past | None = None  # where the motion may go on, run after run
 
     @property
-    def sides(self) -> int:
+    def tangents(self) -> int:
         """The number of tangential impulses."""
-        return sides_of(self.system, self.q0, self.contacts)
+        return tangent_count_of(self.system, self.q0, self.contacts)
 
     @property
     def start(self) -> State:
@@ -187,7 +187,7 @@ def sampled_states(samples: jax.Array, start: State, reached: jax.Array) -> Stat
 
 def event_width(problem: MotionProblem) -> int:
     """Numbers of an event."""
-    return 3 + problem.q0.size + 2 * problem.v0.size + 3 * problem.contacts + problem.sides
+    return 3 + problem.q0.size + 2 * problem.v0.size + 3 * problem.contacts + problem.tangents
 
 
 def event_numbers(before: State, after: After) -> jax.Array:
@@ -203,7 +203,7 @@ def recorded_events(table: MotionTable, count: jax.Array, problem: MotionProblem
     marks = jnp.where(used[:, None], table.marks[:-1], 0)
     rows = nan_unless(used, table.events[:-1])
     n, m = problem.v0.size, problem.contacts
-    sizes = np.cumsum([1, problem.q0.size, n, n, m, problem.sides, 2 * m])
+    sizes = np.cumsum([1, problem.q0.size, n, n, m, problem.tangents, 2 * m])
     time, q, before, after, impulse, side, energy, passed = jnp.split(rows, sizes, axis=1)
     ends = marks[:, 0] == KIND_CODE["accumulation"]
     return Events(

@@ -62,10 +62,10 @@ class Jump(NamedTuple):
     code: jax.Array  # of the law
 
 
-def no_jump(state: State, m: int, sides: int) -> Jump:
+def no_jump(state: State, m: int, tangents: int) -> Jump:
     """Nothing happens, at m contacts with so many tangential impulses."""
     zero = jnp.zeros_like(state.work)
-    none, side = jnp.zeros(m, state.v.dtype), jnp.zeros(sides, state.v.dtype)
+    none, side = jnp.zeros(m, state.v.dtype), jnp.zeros(tangents, state.v.dtype)
     return Jump(state.v, none, side, jnp.zeros((2, m), none.dtype), zero, jnp.int32(CODE["ok"]))
 
 
@@ -106,7 +106,7 @@ def impact_jump(
     return Jump(out.velocity + carried, out.impulse, tangential, energy, push @ carried, out.status)
 
 
-def sides_of(system: System, q: jax.Array, m: int) -> int:
+def tangent_count_of(system: System, q: jax.Array, m: int) -> int:
     """The number of tangential impulses of m contacts; m without tangents, too."""
     tangents = jax.eval_shape(system.body.tangents, q)
     return m if tangents is None else int(tangents.shape[1])
@@ -281,9 +281,12 @@ def _brought_slow_to_rest(
         stick = stopped | (length(by_contact(contacts.tangent.rate, m)) <= slowly)
 
     def resting(slow: jax.Array) -> _Resting:
-        """What comes to rest if `slow` contacts (m,) may."""
-        slack = _slack(strike)
-        pressed, still, force = pressed_together(contacts, slow, slack)
+        """What comes to rest if `slow` contacts (m,) may.
+
+        A slow contact stops where its normal force in `0 <= lambda _|_ W lambda + approach >= 0`
+        is positive: it would come back.
+        """
+        pressed, kept_closed, force = pressed_together(contacts, slow, _slack(strike))
         stopped = tight | (slow & pressed)
         stop = _brought_to_rest(system, contacts, mu, stopped, stick, strike.t, strike.jump)
         # redundant contacts come to rest with others
@@ -292,7 +295,7 @@ def _brought_slow_to_rest(
         # a contact accumulates if it was brought to rest from more than rounding
         ends = at_rest & ~tight & strike.happens & ~strike.jams
         passed = _passed(stop, ends, -jnp.sum(strike.jump.energy))
-        return _Resting(pressed, still, at_rest, force, ends, stop.jump, passed)
+        return _Resting(pressed, kept_closed, at_rest, force, ends, stop.jump, passed)
 
     slow = closed & (jnp.abs(gamma) <= slowly)
     if m == 1:
@@ -331,7 +334,7 @@ def _next_modes(
         choice = _with_friction(contacts, mu, before, held, released, rest, _slack(strike))
         return choice, held, released
     m = held.shape[0]
-    active = result.pressed | (held & result.still & ~released)
+    active = result.pressed | (held & result.kept_closed & ~released)
     no = jnp.asarray(False)
     modes = no_modes(m, rest.dtype)._replace(active=active)
     return ModeChoice(modes, ~no, rest, no, jnp.zeros(m, bool)), held, released
@@ -357,13 +360,13 @@ def _status(
 
 
 class _Resting(NamedTuple):
-    """What comes to rest of slow contacts: (m,) flags and forces; velocities after it."""
+    """What comes to rest of slow contacts (m,), and the velocities after it."""
 
-    pressed: jax.Array
-    still: jax.Array
-    at_rest: jax.Array
-    force: jax.Array
-    ends: jax.Array
+    pressed: jax.Array  # (m,) contacts with a normal force
+    kept_closed: jax.Array  # (m,) those that neither press nor part
+    at_rest: jax.Array  # (m,) closed, without gap velocity
+    force: jax.Array  # (m,) normal forces [N]
+    ends: jax.Array  # (m,) contacts whose impacts accumulate here
     jump: Jump
     passed: Passed
 
@@ -427,7 +430,7 @@ def _struck(
     return jax.lax.cond(
         strikes,
         lambda: impact_jump(system, law, state.t, state, closed, noise, lead),
-        lambda: no_jump(state, m, sides_of(system, state.q, m)),
+        lambda: no_jump(state, m, tangent_count_of(system, state.q, m)),
     )
 
 

@@ -82,10 +82,10 @@ def solve_lcp(
     largest = jax.lax.stop_gradient(jnp.abs(b).max())
     size = jnp.where(largest > 0, largest, 1.0)
     b = b / size
-    still = jax.lax.stop_gradient((a, b))
-    support, code = _support(*still)
+    constant = jax.lax.stop_gradient((a, b))
+    support, code = _support(*constant)
     z = _solve_on(support, a, -b, symmetric)
-    wrong = _wrong(*still, support, jax.lax.stop_gradient(z))
+    wrong = _wrong(*constant, support, jax.lax.stop_gradient(z))
     code = jnp.where((code == CODE["ok"]) & wrong, CODE["max_steps"], code)
     if symmetric and not regular:
         z, singular = _least_norm(a, b, z)
@@ -102,11 +102,11 @@ def _solve_sparse(matrix: Sparse, q: jax.Array) -> LCP:
     derivatives those of the linear system on its support: where A is singular there, they are
     right for `A z`, and NaN where not even that has any.
     """
-    still, rate = jax.lax.stop_gradient((matrix, q))
+    constant, rate = jax.lax.stop_gradient((matrix, q))
     tolerance = _DESCENT_ROUNDINGS * precision(q.dtype).eps
-    columns = still.diagonal[:, None], rate[:, None]
+    columns = constant.diagonal[:, None], rate[:, None]
     found = solve_many(
-        lambda z: (still @ z[:, 0])[:, None],
+        lambda z: (constant @ z[:, 0])[:, None],
         *columns,
         friction=jnp.zeros_like(rate),
         start=jnp.zeros_like(columns[1]),
@@ -116,7 +116,7 @@ def _solve_sparse(matrix: Sparse, q: jax.Array) -> LCP:
     )
     z = jax.lax.stop_gradient(found.impulse[:, 0])
     support = z > 0
-    scale = 1 / jnp.sqrt(still.diagonal)
+    scale = 1 / jnp.sqrt(constant.diagonal)
     a = matrix.scaled(scale).within(support)
     solved = scale * conjugate_gradients(lambda x: a @ x, jnp.where(support, -q * scale, 0.0))
     z = z + (solved - jax.lax.stop_gradient(solved))

@@ -206,7 +206,7 @@ class _StepVariable(NamedTuple):
 
 def _frame(flow: Flow, s: Step, y: jax.Array) -> tuple[Any, jax.Array, _StepVariable]:
     """Constants of the flow, margins (k, B) at the beginning, and the variable of the step."""
-    begun, h, in_root, lands = _rows(s.clock)
+    variable_at_start, h, in_root, lands = _rows(s.clock)
     const = flow.constants(s.modes)
     c0 = flow.margins(const, s.modes, y)
     # a landing from a margin that is already 0 has length 0, and no root
@@ -214,7 +214,7 @@ def _frame(flow: Flow, s: Step, y: jax.Array) -> tuple[Any, jax.Array, _StepVari
     xi0 = jnp.where(root, jnp.sqrt(jnp.where(root, c0, 1.0)), c0)
     xi0 = total(jnp.where(s.target, xi0, 0.0))
     rooted = total(jnp.where(s.target, root.astype(y.dtype), 0.0)) + in_root
-    start = jnp.where(lands > 0, xi0, begun)
+    start = jnp.where(lands > 0, xi0, variable_at_start)
     # a margin that counts as 0 takes no time, however slow it is; its derivatives remain
     zero_length = (lands > 0) & (jnp.abs(xi0) <= flow.zero_margin)
     length = jnp.where(zero_length, jax.lax.stop_gradient(xi0) - xi0, jnp.where(lands > 0, -xi0, h))
@@ -645,14 +645,14 @@ def _root_of_cubic(
 
 def between(flow: Flow, s: Step, y: jax.Array, ahead: jax.Array) -> jax.Array:
     """The state within the step from y at `ahead` (1, B) after it, in the flow's own time."""
-    begun, in_root, lands = s.clock[:1], s.clock[2:3], s.clock[3:4]
+    variable_at_start, in_root, lands = s.clock[:1], s.clock[2:3], s.clock[3:4]
     in_root = in_root * (1 - lands)
-    begun = begun * in_root
-    reached = begun**2 + ahead
+    variable_at_start = variable_at_start * in_root
+    reached = variable_at_start**2 + ahead
     positive = reached > 0
     root = jnp.where(positive, jnp.sqrt(jnp.where(positive, reached, 1.0)), 0.0)
-    h = jnp.where(in_root > 0, root - begun, ahead)
-    clock = jnp.concatenate([begun, h, in_root, jnp.zeros_like(h)])
+    h = jnp.where(in_root > 0, root - variable_at_start, ahead)
+    clock = jnp.concatenate([variable_at_start, h, in_root, jnp.zeros_like(h)])
     return step_again(flow, Step(s.modes, jnp.zeros_like(s.target), clock), y)
 
 
