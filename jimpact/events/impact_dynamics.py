@@ -281,7 +281,7 @@ class ImpulseProgram:
             plastic = pushforward(lambda f, g, y: final_impulses(f, g, y, end.carries), *last)
             p = Dual(p, plastic.tangents) if is_dual(plastic) else plastic
         rest = pushforward(lambda y: (y[tangential], y[-1:]), state)
-        return p, *rest, end.status, end.carry.progress[3:4].astype(jnp.int32)
+        return p, *rest, end.status, end.carry.passes.astype(jnp.int32)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -24,6 +24,7 @@ from jimpact.events.contact_flow import OFTEN, ContactFlow
 from jimpact.events.look_ahead import comes_to_rest
 from jimpact.events.run import Rest
 from jimpact.numerics import stepper
+from jimpact.numerics.sparse import conjugate_step
 from jimpact.numerics.stepper import Mark, any_of, total
 from jimpact.numerics.tangents import value_of
 from jimpact.tools.loops import cond, fori_loop, scan
@@ -69,7 +70,7 @@ def inspect(
     )
     if not flow.looks_ahead:
         return rest
-    look = due & ~rest.ended & ~any_of(resting) & flow.look_due(values.progress[3:4])
+    look = due & ~rest.ended & ~any_of(resting) & flow.look_due(values.passes)
     return cond(
         jnp.any(look),
         lambda: block_at_rest(flow, gamma, values, rest, look),
@@ -82,7 +83,7 @@ def at_rest(flow: ContactFlow, end: stepper.StepperState) -> jax.Array:
     m, modes = flow.contacts, end.step.modes
     gamma = flow.scales(modes) * flow.rows(end.y)[1]
     # no wider than what ended the impact: a ball of a long chain may be slower
-    resting = jnp.abs(gamma) <= QUIET * flow.patience(end.progress[3:4])
+    resting = jnp.abs(gamma) <= QUIET * flow.patience(end.passes)
     return resting & any_of(resting & (modes[m : 2 * m] >= ENDLESS))
 
 
@@ -98,7 +99,7 @@ def contacts_at_rest(
     count = modes[m : 2 * m]
     since = count - last.closings
     most, before = (jnp.max(x, axis=0, keepdims=True) for x in (count, last.closings))
-    paused = (carry.progress[2:3] == Mark.PAUSED) & (most > before) & (most >= OFTEN)
+    paused = (carry.mark == Mark.PAUSED) & (most > before) & (most >= OFTEN)
     often = paused & (2 * since >= jnp.max(since, axis=0, keepdims=True)) & (count > 0)
     rest = resting | often
     now = gamma + flow.change(state)
@@ -177,16 +178,13 @@ def impulse_of_rest(flow: ContactFlow, carries: jax.Array, after: jax.Array) -> 
     """dp (m, B) of the contacts that carry, with which their gamma+ is 0: conjugate gradients."""
     right = jnp.where(carries, -after, 0.0)
 
-    def step(carry: Any, _: None) -> tuple[Any, None]:
-        """One step of conjugate gradients."""
-        z, residual, direction, size = carry
-        image = jnp.where(carries, flow.coupling.times(direction), 0.0)
-        curvature = total(direction * image)
-        length = jnp.where(curvature > 0, size / jnp.where(curvature > 0, curvature, 1.0), 0.0)
-        z, residual = z + length * direction, residual - length * image
-        new = total(residual * residual)
-        ratio = jnp.where(size > 0, new / jnp.where(size > 0, size, 1.0), 0.0)
-        return (z, residual, residual + ratio * direction, new), None
+    def product(x: jax.Array) -> jax.Array:
+        """G x (m, B) in the contacts that carry."""
+        return jnp.where(carries, flow.coupling.times(x), 0.0)
+
+    def step(at: Any, _: None) -> tuple[Any, None]:
+        """One step of conjugate gradients in each impact."""
+        return conjugate_step(product, lambda x, y: total(x * y), at)[0], None
 
     start = (jnp.zeros_like(right), right, right, total(right * right))
     return scan(step, start, None, length=2 * right.shape[0])[0][0]

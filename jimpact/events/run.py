@@ -60,7 +60,7 @@ class ImpactEnd(NamedTuple):
     @property
     def over(self) -> jax.Array:
         """Whether (1, B) the impact has ended, not given up."""
-        return self.carry.progress[2:3] == Mark.OVER
+        return self.carry.mark == Mark.OVER
 
     @property
     def finishes(self) -> jax.Array:
@@ -121,14 +121,12 @@ def run(
         carry, accept = stepper.advance(flow, now.carry, most)
         if observe is not None:
             now = now._replace(seen=observe(now.seen, now.carry, accept))
-        paused = carry.progress[2:3] == Mark.PAUSED
+        paused = carry.mark == Mark.PAUSED
         if not value_of(flow).self_similar:
             return now._replace(carry=carry)
         rest = inspect(flow, gamma, carry, now.rest, paused, False)
         settled = jnp.where(rest.ended, Mark.OVER, Mark.GOES_ON)
-        mark = jnp.where(paused, settled, carry.progress[2:3])
-        progress = carry.progress.at[2:3].set(jax.lax.stop_gradient(mark))
-        return _OnItsWay(carry._replace(progress=progress), rest, now.seen)
+        return _OnItsWay(carry.marked(paused, settled), rest, now.seen)
 
     start = _OnItsWay(stepper.begin(flow, modes, y), Rest.none(gamma, modes), seen)
     last = until_over(
@@ -141,7 +139,7 @@ def run(
 def _finished(flow: Any, gamma: jax.Array, last: _OnItsWay, inspect: Inspect) -> ImpactEnd:
     """The end; the flow finishes the state where it has ended by itself."""
     carry, rest, seen = last
-    over = (carry.progress[2:3] == Mark.OVER) & ~rest.ended
+    over = (carry.mark == Mark.OVER) & ~rest.ended
 
     def at_end(flow: ContactFlow, y: jax.Array) -> jax.Array:
         """The state, finished where the impact is over."""

@@ -128,20 +128,40 @@ def _iterated(product: Callable[[jax.Array], jax.Array], right: jax.Array) -> ja
         return (square > (_CONVERGED * eps) ** 2 * size) & (done < _MOST * len(right) + 10)
 
     def iterate(state: Any) -> Any:
-        """One step along a conjugate direction."""
-        x, residual, way, square, done = state
-        image = product(way)
-        curvature = jnp.vdot(way, image)
-        step = jnp.where(curvature > 0, square / jnp.where(curvature > 0, curvature, 1.0), 0.0)
-        residual = residual - step * image
-        new = jnp.vdot(residual, residual)
+        """One step, counted."""
+        *at, done = state
+        new, curved = conjugate_step(product, jnp.vdot, tuple(at))
         # a direction without curvature: A is singular, and no step reduces what is left
-        done = jnp.where(curvature > 0, done + 1, _MOST * len(right) + 10)
-        return x + step * way, residual, residual + new / square * way, new, done
+        return *new, jnp.where(curved, done + 1, _MOST * len(right) + 10)
 
     start = jnp.zeros_like(right), right, right, size, jnp.int32(0)
     x, _, _, square, _ = while_loop(going, iterate, start)
     return jnp.where(square <= eps ** (2 * _NO_SOLUTION) * size, x, jnp.nan)
+
+
+def conjugate_step(
+    product: Callable[[jax.Array], jax.Array],
+    dot: Callable[[jax.Array, jax.Array], jax.Array],
+    at: tuple[jax.Array, ...],
+) -> tuple[tuple[jax.Array, ...], jax.Array]:
+    """One step of conjugate gradients, and whether A has curvature along its direction.
+
+    Equation: `x + a d`, `r - a A d`, `r+ + b d` with `a = r^T r / d^T A d`, `b = r+^T r+ / r^T r`.
+
+    Args:
+        product: A times a vector.
+        dot: of two vectors.
+        at: x, the residual r, the direction d, and r^T r.
+    """
+    x, residual, direction, square = at
+    image = product(direction)
+    curvature = dot(direction, image)
+    curved = curvature > 0
+    length = jnp.where(curved, square / jnp.where(curved, curvature, 1.0), 0.0)
+    x, residual = x + length * direction, residual - length * image
+    new = dot(residual, residual)
+    ratio = jnp.where(square > 0, new / jnp.where(square > 0, square, 1.0), 0.0)
+    return (x, residual, residual + ratio * direction, new), curved
 
 
 def components(touches: np.ndarray) -> np.ndarray:

@@ -398,6 +398,22 @@ class StepperState(NamedTuple):
     # `Mark`; number of passes
     progress: jax.Array
 
+    @property
+    def mark(self) -> jax.Array:
+        """`Mark` (1, B) of each impact."""
+        return self.progress[2:3].astype(jnp.int32)
+
+    @property
+    def passes(self) -> jax.Array:
+        """Number of passes (1, B) so far, a whole floating-point number."""
+        return self.progress[3:4]
+
+    def marked(self, which: jax.Array, mark: Any) -> "StepperState":
+        """With this `Mark` where `which` (1, B)."""
+        old = self.progress[2:3]
+        new = jnp.where(which, jnp.asarray(mark, old.dtype), old)
+        return self._replace(progress=self.progress.at[2:3].set(jax.lax.stop_gradient(new)))
+
 
 def begin(flow: Any, modes: jax.Array, start: Any) -> StepperState:
     """The state before the first pass.
@@ -417,7 +433,7 @@ def begin(flow: Any, modes: jax.Array, start: Any) -> StepperState:
 
 def goes_on(carry: StepperState, most: int) -> jax.Array:
     """Impacts (1, B) that are neither over nor given up nor paused."""
-    return (carry.progress[2:3] == Mark.GOES_ON) & (carry.progress[3:4] < most)
+    return (carry.mark == Mark.GOES_ON) & (carry.passes < most)
 
 
 def advance(flow: Flow, state: StepperState, most: int) -> tuple[StepperState, jax.Array]:
