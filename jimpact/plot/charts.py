@@ -23,6 +23,7 @@ from jimpact.plot.style import (
     by_code,
     colour_of,
     in_words,
+    label_ends,
     legend_below,
     logarithmic,
     new_figure,
@@ -61,8 +62,8 @@ def work_precision(result: WorkPrecision, title: str = "") -> Figure:
     """Panels: error of v+ against time and against evaluations, and that of the gradient if known.
 
     Times are per impact in a batch, with error bars from quartile to quartile; a hollow marker on
-    a line is a failure by status; laws are grey markers at their model error; below the grey band's
-    edge the reference is no better.
+    a line is a failure by status. Lines have their names at their ends; laws are grey markers at
+    their model error; below the grey band's edge the reference is no better.
 
     Args:
         result: what `ji.work_precision` returned.
@@ -86,9 +87,12 @@ def work_precision(result: WorkPrecision, title: str = "") -> Figure:
     figure, panels = new_panels(count, height, title=title)
     styles = _styles(result.points)
     for axes, (quantity, against, label) in zip(panels, _PANELS):
+        ends: dict[str, Any] = {}
         for name, row in result.points.items():
-            _draw(axes, row, quantity, against, styles[name])
+            ends[name] = _draw(axes, row, quantity, against, styles[name])
         _finish(axes, result.reference.uncertainty[quantity], label, _ERRORS[quantity])
+        lines = {x: end for x, end in ends.items() if end and styles[x]["ls"] != "none"}
+        label_ends(axes, lines, [styles[name]["color"] for name in lines])
     if not gradients:
         legend_below(figure, 2, note=_note(result))
     else:  # next to the three panels
@@ -123,8 +127,8 @@ _PANELS = (  # error, and what it is drawn against
 
 def _draw(
     axes: Axes, row: tuple[Point, ...], quantity: str, against: str, style: dict[str, Any]
-) -> None:
-    """One line; none where no point has a time or a count, and an error."""
+) -> tuple[float, float] | None:
+    """One line, and where it ends; None where no point has a time or a count, and an error."""
     given = [getattr(point, against) for point in row]
     spans = [
         1e6 * np.array(x) if isinstance(x, Timing) else np.full(3, np.nan if x is None else x)
@@ -134,7 +138,7 @@ def _draw(
     y = np.maximum([point.error[quantity] for point in row], _LEAST)
     known = np.isfinite(x) & np.isfinite(y)
     if not known.any():
-        return
+        return None
     bars = np.array([x - low, high - x])[:, known]
     label = row[int(np.argmax(known))].label
     axes.errorbar(
@@ -148,6 +152,7 @@ def _draw(
     )
     failed = known & [STATUS[CODE[point.status]].failure for point in row]
     axes.plot(x[failed], y[failed], **style | {"ls": "none", "mfc": "white", "zorder": 4})
+    return float(x[known][-1]), float(y[known][-1])
 
 
 def _finish(axes: Axes, uncertainty: float, x: str, y: str) -> None:

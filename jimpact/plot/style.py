@@ -3,7 +3,7 @@
 import functools
 import inspect
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
@@ -157,6 +158,28 @@ def legend_below(
     if entries:
         place: Any = {"loc": "outside lower center", "ncols": min(columns, len(entries))}
         figure.legend(handles=entries, title=note or None, **place)
+
+
+def label_ends(axes: Axes, ends: Mapping[str, tuple[float, float]], colours: Sequence[str]) -> None:
+    """Names of lines beside their ends (x, y), moved up where two would overlap.
+
+    The axes have their final limits and scales.
+    """
+    figure = axes.get_figure(root=True)
+    assert figure is not None
+    figure.draw_without_rendering()  # the layout decides where points are on the page
+    boxes: list[Any] = []
+    lowest_first = sorted(zip(ends.items(), colours), key=lambda end: end[0][1][1])
+    for (name, at), colour in lowest_first:
+        place: Any = {"textcoords": "offset points", "xytext": (5, 0), "va": "center"}
+        text = axes.annotate(name, at, **place, fontsize=SMALL - 1, color=colour, zorder=5)
+        text.set_path_effects([withStroke(linewidth=2, foreground="white")])
+        box = text.get_window_extent()
+        up = 0.0
+        while any(box.translated(0, up).overlaps(other) for other in boxes):
+            up += box.height / 4
+        text.xyann = (5, up * 72 / figure.dpi)
+        boxes.append(box.translated(0, up))
 
 
 def mark(axes: Axes, point: Any, name: str, i: int, admissible: bool) -> None:
