@@ -20,6 +20,7 @@ from jimpact.plot.style import (
     HIGHLIGHT,
     MARKERS,
     SMALL,
+    LineEnd,
     by_code,
     colour_of,
     in_words,
@@ -85,20 +86,20 @@ def work_precision(result: WorkPrecision, title: str = "") -> Figure:
     gradients = any(point.gradient is not None for row in result.points.values() for point in row)
     count, height = (4, 3.6) if gradients else (2, 4.6)
     figure, panels = new_panels(count, height, title=title)
-    styles = _styles(result.points)
+    styles, ends = _styles(result.points), []
     for axes, (quantity, against, label) in zip(panels, _PANELS):
-        ends: dict[str, Any] = {}
         for name, row in result.points.items():
-            ends[name] = _draw(axes, row, quantity, against, styles[name])
+            at = _draw(axes, row, quantity, against, styles[name])
+            if at is not None and styles[name]["ls"] != "none":
+                ends.append(LineEnd(axes, at, name, styles[name]["color"]))
         _finish(axes, result.reference.uncertainty[quantity], label, _ERRORS[quantity])
-        lines = {x: end for x, end in ends.items() if end and styles[x]["ls"] != "none"}
-        label_ends(axes, lines, [styles[name]["color"] for name in lines])
     if not gradients:
         legend_below(figure, 2, note=_note(result))
     else:  # next to the three panels
         lines = {x.get_label(): x for axes in panels for x in axes.get_legend_handles_labels()[0]}
         panels[3].axis("off")
         panels[3].legend(handles=list(lines.values()), title=_note(result), loc="center")
+    label_ends(figure, ends)
     return figure
 
 

@@ -3,9 +3,9 @@
 import functools
 import inspect
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import matplotlib.style
 import numpy as np
@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.transforms import Bbox
 
 from jimpact.bodies.base import split_name
 from jimpact.core.scene import Scene, dense_mass
@@ -160,22 +161,30 @@ def legend_below(
         figure.legend(handles=entries, title=note or None, **place)
 
 
-def label_ends(axes: Axes, ends: Mapping[str, tuple[float, float]], colours: Sequence[str]) -> None:
-    """Names of lines beside their ends (x, y), moved up where two would overlap.
+class LineEnd(NamedTuple):
+    """Where a line of a panel ends, x and y, its name and its colour."""
 
-    The axes have their final limits and scales.
+    axes: Axes
+    at: tuple[float, float]
+    name: str
+    colour: str
+
+
+def label_ends(figure: Figure, ends: Iterable[LineEnd]) -> None:
+    """Names of lines beside their ends, moved up where two would overlap.
+
+    The panels have their final limits and scales.
     """
-    figure = axes.get_figure(root=True)
-    assert figure is not None
-    figure.draw_without_rendering()  # the layout decides where points are on the page
-    boxes: list[Any] = []
-    lowest_first = sorted(zip(ends.items(), colours), key=lambda end: end[0][1][1])
-    for (name, at), colour in lowest_first:
-        place: Any = {"textcoords": "offset points", "xytext": (5, 0), "va": "center"}
-        text = axes.annotate(name, at, **place, fontsize=SMALL - 1, color=colour, zorder=5)
+    place: dict[str, Any] = {"textcoords": "offset points", "va": "center", "fontsize": SMALL}
+    lowest_first, texts = sorted(ends, key=lambda end: end.at[1]), []
+    for axes, at, name, colour in lowest_first:
+        text = axes.annotate(name, at, xytext=(5, 0), color=colour, zorder=5, **place)
         text.set_path_effects([withStroke(linewidth=2, foreground="white")])
-        box = text.get_window_extent()
-        up = 0.0
+        texts.append(text)
+    figure.draw_without_rendering()  # the layout decides where points are on the page
+    boxes: list[Bbox] = []
+    for text in texts:
+        box, up = text.get_window_extent(), 0.0
         while any(box.translated(0, up).overlaps(other) for other in boxes):
             up += box.height / 4
         text.xyann = (5, up * 72 / figure.dpi)
