@@ -15,6 +15,7 @@ from jimpact.plot.style import COLOURS, GREY, SMALL, new_figure, new_panels, sty
 from jimpact.tools.checks import check_choice, check_kind
 
 _TITLE = 45  # letters of a line of a panel's title
+_PARTS = 16  # of a profile between two of its points, as straight lines
 _TOP = 3.0  # of a profile's axis, over the limit: only what is below matters
 MOST = 6  # parameters of a corner plot: more panels could not be read
 _WIDE = 3.5  # standard errors to each side in a corner plot
@@ -25,6 +26,8 @@ _TWO_SIDED = 1.96  # standard errors: 95 % of normal noise lies within
 @styled()
 def profiles(result: tuple[Profile, ...] | list[Profile]) -> Figure:
     """Deviance over each parameter, with the limit and the interval below it.
+
+    Between computed points, the dots, its root is drawn as linear: a parabola is one.
 
     Args:
         result: what `ji.profile` returned.
@@ -45,7 +48,11 @@ def profiles(result: tuple[Profile, ...] | list[Profile]) -> Figure:
         check_kind("result", each, Profile)
     figure, grid = new_panels(len(result), 2.8)
     for axes, each in zip(grid, result):
-        axes.plot(each.value, each.deviance, ".-", color=COLOURS[0], ms=3, lw=1)
+        places = np.linspace(0, len(each.value) - 1, _PARTS * (len(each.value) - 1) + 1)
+        between = np.interp(places, range(len(each.value)), each.value)
+        root = np.interp(between, each.value, np.sqrt(each.deviance))
+        axes.plot(between, root**2, color=COLOURS[0], lw=1)
+        axes.plot(each.value, each.deviance, ".", color=COLOURS[0], ms=4)
         axes.axhline(each.limit, color=GREY, lw=0.8, ls="--")
         for low, high in each.intervals:
             axes.axvspan(low, high, color=COLOURS[4], alpha=0.25, lw=0)
