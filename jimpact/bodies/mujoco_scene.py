@@ -40,6 +40,11 @@ _DRIFT = 1e-2
 # have gaps of 1e-17 m. Ten times more closes gaps of 10 nm in a model of a metre.
 _TOUCHING = 1e-9
 
+# By so much of the model's extent its bounding volumes grow: before version 3.14 MuJoCo compares
+# them in single precision, and sees no contact of balls in a row that touch. Ten times more, and
+# pairs that are apart are looked at in vain.
+_BOUNDING = 1e-6
+
 # MuJoCo's names of constraints that are no contacts of geoms, of their objects; words for them.
 _EQUALITIES = "mjCNSTR_EQUALITY"
 _LIMITS = (
@@ -163,6 +168,7 @@ def from_mujoco(model: Any, data: Any, margin: float = 0.0) -> MujocoScene:
     model.pair_margin += margin + touching
     for margins in (model.jnt_margin, model.tendon_margin):
         margins += margin + touching
+    _grow_bounding_volumes(model, _BOUNDING * model.stat.extent)
     mujoco.mj_fwdPosition(model, data)
     mass = _mass(mujoco, model, data)
     root = np.linalg.cholesky(mass)
@@ -198,6 +204,13 @@ def from_mujoco(model: Any, data: Any, margin: float = 0.0) -> MujocoScene:
         )
     velocity = jnp.asarray(_admissible(root, constraints, np.array(data.qvel)))
     return MujocoScene(scene, velocity, friction, names + limits)
+
+
+def _grow_bounding_volumes(model: Any, by: float) -> None:
+    """Make spheres and boxes, by which pairs that may touch are found, larger by this [m]."""
+    model.geom_rbound += by * (model.geom_rbound > 0)  # 0 means without bound
+    for boxes in (model.geom_aabb, model.bvh_aabb):
+        boxes[:, 3:] += by  # their half sizes
 
 
 def _mass(mujoco: ModuleType, model: Any, data: Any) -> np.ndarray:
