@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
-from scipy.sparse import block_diag
+from scipy.sparse import block_diag, coo_array
 from scipy.special import chdtrc, fdtrc
 
 from jimpact.fits.data import ROUNDING, kept_by_corrections
@@ -98,7 +98,8 @@ class Judged:
     def momentum(self) -> Any:
         """(R, C) of shots: the directions in which residuals are momentum, a sparse matrix."""
         of_priors = np.zeros((len(self.problem.priors), 0))
-        return block_diag([*_conserved(self.problem), of_priors], format="csr")[self.used]
+        blocks = [coo_array(block) for block in (*_conserved(self.problem), of_priors)]
+        return block_diag(blocks, format="csr")[self.used]
 
     @property
     def inexact(self) -> bool:
