@@ -240,3 +240,6 @@ def _write(path: Path, content: bytes) -> None:
             f"'{path}' could not be written, {what}; what was there before is intact, and the same "
             "call continues from it",
         ) from error
+    except BaseException:  # ctrl-C
+        temporary.unlink(missing_ok=True)
+        raise
