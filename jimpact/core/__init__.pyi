@@ -30,6 +30,7 @@ from .law import (
     parameters_of as parameters_of,
     value_of as value_of,
     with_entries as with_entries,
+    with_option as with_option,
     with_parameter as with_parameter,
     within_domains as within_domains,
 )

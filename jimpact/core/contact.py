@@ -64,6 +64,7 @@ class Contact(eqx.Module):
         noise: (m,) [m/s] uncertainty of gamma- by the rounding of v-; None: 0.
         tangential_block: (W_nt (m, t), W_tt (t, t), u- (t,) [m/s]), None without tangents; t = m
             in the plane, 2 m in space, contact by contact.
+        rtol: tolerance () for laws that have none of their own; None: their default.
 
     Source: Brogliato, Nonsmooth Mechanics (3rd ed., 2016), (6.22)-(6.35).
 
@@ -81,6 +82,7 @@ class Contact(eqx.Module):
     norm: jax.Array
     noise: jax.Array
     tangential_block: TangentialBlock | None
+    rtol: jax.Array | None
 
     def __init__(
         self,
@@ -93,6 +95,7 @@ class Contact(eqx.Module):
         norm: Any = None,
         noise: Any = None,
         tangential_block: Any = None,
+        rtol: Any = None,
     ):
         own_form = isinstance(delassus, (Tridiagonal, Sparse))
         self.delassus = delassus if own_form else as_float_array("delassus", delassus)
@@ -106,6 +109,7 @@ class Contact(eqx.Module):
         self.tangential_block = None
         if tangential_block is not None:
             self.tangential_block = TangentialBlock(*map(jnp.asarray, tangential_block))
+        self.rtol = rtol
 
     @property
     def contacts(self) -> int:
@@ -186,6 +190,11 @@ class Contact(eqx.Module):
     def approaching(self, speed: jax.Array) -> "Contact":
         """The contact with all gap velocities lower by `speed` () [m/s]."""
         return eqx.tree_at(lambda contact: contact.gap_velocity, self, self.gap_velocity - speed)
+
+    def integrated_to(self, rtol: jax.Array) -> "Contact":
+        """The contact whose laws integrate to `rtol` () where they have none of their own."""
+        each = jnp.broadcast_to(rtol, self.gap_velocity.shape[:-1])
+        return eqx.tree_at(lambda contact: contact.rtol, self, each, is_leaf=lambda x: x is None)
 
     @full_precision
     def gap_velocity_after(self, normal: jax.Array, tangential: jax.Array | None) -> jax.Array:

@@ -82,7 +82,12 @@ class Impact(eqx.Module):
 
 @full_precision
 def impact(
-    law: Law, scene: Scene, velocity: Any, noise: Any = None, approach: Any = None
+    law: Law,
+    scene: Scene,
+    velocity: Any,
+    noise: Any = None,
+    approach: Any = None,
+    rtol: Any = None,
 ) -> Impact:
     """Velocities after the impact of `law` on `scene`; pure: jit, vmap and grad over all three.
 
@@ -102,6 +107,8 @@ def impact(
             rounding of the largest earlier speeds. None: the rounding of v-.
         approach: speed () [m/s] subtracted from every gap velocity before the law is applied; a
             small value starts an impact without collision. None: 0.
+        rtol: tolerance () on v+ for a law whose option `rtol` is None; unlike that option it may be
+            traced. None: the law's default.
 
     Returns:
         `Impact` with `velocity` (n,), `impulse` (m,), `tangential_impulse`, `energy_change` (),
@@ -109,11 +116,12 @@ def impact(
 
     Raises:
         ValueError: shapes or ranges, on the host. Where they are traced, the status reports them:
-            `not_finite` (NaN in the velocity, a gap, `noise` or `approach`), or `out_of_range` (a
-            parameter outside its domain, a normal that is 0, a mass that is asymmetric or not
-            positive, a negative gap, `noise` or `approach`, a velocity that breaks a bilateral
-            constraint). An energy of the impact, `sum gamma-^2 / W_jj`, that the floating type
-            takes for 0 or infinite is `out_of_range` on the host, too: choose other units.
+            `not_finite` (NaN in the velocity, a gap, `noise`, `approach` or `rtol`), or
+            `out_of_range` (a parameter outside its domain, a normal that is 0, a mass that is
+            asymmetric or not positive, a negative gap, `noise`, `approach` or `rtol`, a velocity
+            that breaks a bilateral constraint). An energy of the impact, `sum gamma-^2 / W_jj`,
+            that the floating type takes for 0 or infinite is `out_of_range` on the host, too:
+            choose other units.
             Warns where only open contacts approach and the law leaves those out.
 
     >>> import jimpact as ji
@@ -128,13 +136,13 @@ def impact(
         check_constrained(scene, v)
     law, scene, v = in_common_dtype(law, scene, v)
     check_law(law, scene, v.dtype)
-    for name, speed in (("noise", noise), ("approach", approach)):
-        check_values(name, speed, low=0.0)
-        if speed is not None:
-            check_shape(name, speed, (), "one speed")
-    offsets = _Offsets(
-        None if noise is None else jnp.asarray(noise, v.dtype),
-        None if approach is None else jnp.asarray(approach, v.dtype),
+    check_values("rtol", rtol, low=0.0, high=1.0, open_low=True)
+    for name, number in (("noise", noise), ("approach", approach), ("rtol", rtol)):
+        check_values(name, number, low=0.0)
+        if number is not None:
+            check_shape(name, number, (), "one number")
+    given = _Given(
+        *(None if x is None else jnp.asarray(x, v.dtype) for x in (noise, approach, rtol))
     )
     if scene.gaps is not None and not law.uses_gaps:
         _warn_of_unused_gaps(law, scene, v)
@@ -142,10 +150,10 @@ def impact(
     groups = coupled_groups(scene) if separable else None
     few = scene.contacts <= SHARED and scene.walls != (True, True) and scene.tangents is None
     pads = few and groups is None and separable and law.pads_scenes
-    if pads and not is_traced((law, scene, v, offsets)) and is_top_level_call():
-        return _impact_of_padded_scene(law, scene, v, offsets)
+    if pads and not is_traced((law, scene, v, given)) and is_top_level_call():
+        return _impact_of_padded_scene(law, scene, v, given)
     with naming_the_adjoint():
-        return _impact(law, scene, v, groups, offsets, Traced.of(law, scene, v, offsets))
+        return _impact(law, scene, v, groups, given, Traced.of(law, scene, v, given))
 
 
 def _warn_of_unused_gaps(law: Law, scene: Scene, v: jax.Array) -> None:
@@ -164,19 +172,21 @@ def _warn_of_unused_gaps(law: Law, scene: Scene, v: jax.Array) -> None:
         )
 
 
-class _Offsets(NamedTuple):
-    """`noise` and `approach` of `impact` [m/s]."""
+class _Given(NamedTuple):
+    """`noise` and `approach` of `impact` [m/s], and its `rtol`."""
 
-    noise: jax.Array | None
-    approach: jax.Array | None
+    noise: jax.Array | None = None
+    approach: jax.Array | None = None
+    rtol: jax.Array | None = None
 
     def applied(self, contact: Contact) -> Contact:
-        """The contacts without gap velocities within the noise, and with the added approach."""
+        """The contacts with gap velocities within the noise set to 0, and the others applied."""
         contact = contact if self.noise is None else contact.within(self.noise)
+        contact = contact if self.rtol is None else contact.integrated_to(self.rtol)
         return contact if self.approach is None else contact.approaching(self.approach)
 
 
-NO_OFFSETS = _Offsets(None, None)
+NOTHING_GIVEN = _Given()
 
 
 class Traced(NamedTuple):
@@ -185,17 +195,17 @@ class Traced(NamedTuple):
     law: bool = False
     scene: bool = False
     constrained: bool = False  # whether the velocity keeps the bilateral constraints
-    offsets: bool = False
+    given: bool = False
 
     @classmethod
-    def of(cls, law: Law, scene: Scene, v: jax.Array, offsets: _Offsets = NO_OFFSETS) -> "Traced":
+    def of(cls, law: Law, scene: Scene, v: jax.Array, given: _Given = NOTHING_GIVEN) -> "Traced":
         """Those of an impact."""
         constrained = scene.constraints is not None and is_traced((scene.constraints, v))
-        return cls(is_traced(law), is_traced(scene), constrained, is_traced(offsets))
+        return cls(is_traced(law), is_traced(scene), constrained, is_traced(given))
 
     def status(
         self,
-        arguments: tuple[Law, Scene, jax.Array, _Offsets],
+        arguments: tuple[Law, Scene, jax.Array, _Given],
         code: jax.Array,
         size: jax.Array,
         finite: jax.Array,
@@ -211,9 +221,9 @@ class Traced(NamedTuple):
             code = jnp.where(refused > CODE["ok"], refused, code)
         return code.astype(jnp.int32)
 
-    def _refusal(self, law: Law, scene: Scene, v: jax.Array, offsets: _Offsets) -> jax.Array:
+    def _refusal(self, law: Law, scene: Scene, v: jax.Array, given: _Given) -> jax.Array:
         """`not_finite` or `out_of_range` where an argument is not allowed, else `ok`."""
-        inputs = [x for x, traced in zip((law, scene, None, offsets), self) if traced]
+        inputs = [x for x, traced in zip((law, scene, None, given), self) if traced]
         numbers = [x for x in jax.tree.leaves(inputs) if eqx.is_inexact_array(x)]
         unknown = [jnp.any(jnp.isnan(x)) for x in numbers]
         allowed = [jnp.asarray(True)]
@@ -223,19 +233,19 @@ class Traced(NamedTuple):
             allowed.append(is_allowed(scene))
         if self.constrained:
             allowed.append(jnp.all(_keeps_constraints(scene.constraints, v)))
-        if self.offsets:
-            allowed += [(x >= 0) & (x < jnp.inf) for x in offsets if x is not None]
+        if self.given:
+            allowed += [(x >= 0) & (x < jnp.inf) for x in given if x is not None]
         code = jnp.where(jnp.all(jnp.asarray(allowed)), CODE["ok"], CODE["out_of_range"])
         return jnp.where(jnp.any(jnp.asarray(unknown, bool)), CODE["not_finite"], code)
 
 
-def _impact_of_padded_scene(law: Law, scene: Scene, v: jax.Array, offsets: _Offsets) -> Impact:
+def _impact_of_padded_scene(law: Law, scene: Scene, v: jax.Array, given: _Given) -> Impact:
     """The impact by the program for SHARED contacts: those that are added are open."""
     padded = pad_scene(scene, SHARED)
     velocity: Any = np.zeros(padded.scene.size, v.dtype)
     velocity[padded.coordinates] = v
     on_host = restrict_law(jax.tree.map(np.asarray, law), padded.copied)
-    out = _impact(on_host, padded.scene, velocity, None, offsets, Traced())
+    out = _impact(on_host, padded.scene, velocity, None, given, Traced())
     return dataclasses.replace(
         out,
         velocity=jnp.asarray(np.asarray(out.velocity)[padded.coordinates]),
@@ -269,17 +279,17 @@ def _impact(
     scene: Scene,
     v: jax.Array,
     groups: Groups | None,
-    offsets: _Offsets,
+    given: _Given,
     traced: Traced,
 ) -> Impact:
     """The outcome from the law's impulses: velocities, energy and status."""
     if groups is None:
-        contact = offsets.applied(law.contact(scene, v))
+        contact = given.applied(law.contact(scene, v))
         happens = contact.happens
         outcome = _resolved(law, contact, happens)
         stored = contact.stored
     else:
-        outcome, happens, stored = _in_groups(law, scene, v, groups, offsets)
+        outcome, happens, stored = _in_groups(law, scene, v, groups, given)
     p, tangential = outcome.normal, outcome.tangential
     jump = velocity_change(scene, p, tangential)
     v_plus = v + jump
@@ -290,7 +300,7 @@ def _impact(
     code = jnp.where(happens, jnp.maximum(code, outcome.status), CODE["ok"])
     finite = jnp.all(jnp.isfinite(v_plus)) & jnp.all(jnp.isfinite(p)) & jnp.isfinite(change)
     size = jnp.where(happens, outcome.size, 1.0)
-    code = traced.status((law, scene, v, offsets), code, size, finite)
+    code = traced.status((law, scene, v, given), code, size, finite)
     return Impact(v_plus, p, tangential, change, total, code, outcome.accuracy)
 
 
@@ -365,7 +375,7 @@ def _impulses_of(law: Law, returned: Any, contact: Contact) -> Impulses:
 
 
 def _in_groups(
-    law: Law, scene: Scene, v: jax.Array, groups: Groups, offsets: _Offsets
+    law: Law, scene: Scene, v: jax.Array, groups: Groups, given: _Given
 ) -> tuple[_Resolved, jax.Array, jax.Array]:
     """All groups solved side by side; whether there is an impact, and the stored energy (m,).
 
@@ -374,7 +384,7 @@ def _in_groups(
     """
     m = scene.contacts
     stored = jnp.where(scene.closed, jnp.broadcast_to(law.stored, (m,)).astype(v.dtype), 0.0)
-    batches = [offsets.applied(c) for c in contacts_of_groups(scene, v, stored, groups)]
+    batches = [given.applied(c) for c in contacts_of_groups(scene, v, stored, groups)]
     active = [jax.vmap(lambda contact: contact.happens)(contacts) for contacts in batches]
     happens = jnp.any(jnp.concatenate(active))
     p = jnp.zeros(m, v.dtype)

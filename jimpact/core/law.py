@@ -503,17 +503,22 @@ def _forwarded(name: str) -> property:
     return property(lambda self: getattr(self.law, name), doc="That of the law within.")
 
 
-def forward_only(law: AnyLaw) -> AnyLaw:
-    """The law, and laws within it, with `adjoint` 'forward' where they have this option."""
+def with_option(law: AnyLaw, name: str, chosen: Any) -> AnyLaw:
+    """The law, and laws within it, with this value of an option where they have it."""
     fields = dataclasses.fields(law)
-    if not any(f.name == "adjoint" or isinstance(getattr(law, f.name), Law) for f in fields):
+    if not any(f.name == name or isinstance(getattr(law, f.name), Law) for f in fields):
         return law
     new = object.__new__(type(law))
     for field in fields:
         value = getattr(law, field.name)
-        value = forward_only(value) if isinstance(value, Law) else value
-        object.__setattr__(new, field.name, "forward" if field.name == "adjoint" else value)
+        value = with_option(value, name, chosen) if isinstance(value, Law) else value
+        object.__setattr__(new, field.name, chosen if field.name == name else value)
     return new
+
+
+def forward_only(law: AnyLaw) -> AnyLaw:
+    """The law, and laws within it, with `adjoint` 'forward' where they have this option."""
+    return with_option(law, "adjoint", "forward")
 
 
 def check_law(law: Law, scene: Scene, dtype: jnp.dtype) -> None:

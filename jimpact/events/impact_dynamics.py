@@ -8,7 +8,7 @@ and omega_j = T / t_ref,j with T the smallest t_ref: the flow of `contact_flow.p
 """
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -235,19 +235,13 @@ class ImpulseProgram:
     with_end_time: bool = False
     finely: bool = False  # at the tolerance of derivatives
     checkpoints: bool = False  # its loops have the reverse mode, in the place of the forward mode
+    queues: ClassVar[bool] = True  # its impacts need not wait for the slowest (`until_over`)
 
     def flow(self, problem: Problem, tighten: float) -> tuple[ContactFlow, jax.Array, jax.Array]:
         """The flow of a problem, its first modes and state."""
         flow, modes, y = flow_of(problem, self.exponent, self.structure, tighten)
-        return (
-            dataclasses.replace(flow, closed_form=flow.closed_form and not self.with_end_time),
-            modes,
-            y,
-        )
-
-    def queues(self, *leaves: Any) -> bool:
-        """Whether a batch of any size is worked through as a queue (`until_over`): in space."""
-        return self.tangents > jax.tree.unflatten(self.tree, leaves).omega.shape[0]
+        closed_form = flow.closed_form and not self.with_end_time
+        return dataclasses.replace(flow, closed_form=closed_form), modes, y
 
     @property
     def takes_duals(self) -> bool:
@@ -287,10 +281,6 @@ class ImpulseProgram:
 @dataclasses.dataclass(frozen=True)
 class ImplicitProgram(ImpulseProgram):
     """As `ImpulseProgram`, by steps without events."""
-
-    def queues(self, *leaves: Any) -> bool:
-        """Always."""
-        return True
 
     def only_first(self, values: Arrays) -> Arrays:
         """The values; a second derivative raises."""

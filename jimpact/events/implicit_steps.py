@@ -39,7 +39,7 @@ from jimpact.events.contact_flow import (
     per_row,
     power,
 )
-from jimpact.numerics.driver import until_over
+from jimpact.numerics.driver import SLOTS_IN_SPACE, until_over
 from jimpact.numerics.step_impulses import StepProblem, descent_lengths, solve
 from jimpact.numerics.tangents import dual_like, is_dual, pushforward, value_of
 from jimpact.tools.loops import cond, scan
@@ -473,7 +473,8 @@ def run(
         seen = run.seen if observe is None else observe(run.seen, run.state, accepted)
         return ImplicitRun(state, length, run.passes + live.astype(jnp.int32), seen)
 
-    return until_over(goes_on, attempt_all, flow, first, checkpoints, queues=observe is None)
+    slots = SLOTS_IN_SPACE if observe is None else None
+    return until_over(goes_on, attempt_all, flow, first, checkpoints, slots)
 
 
 def between(flow: ImplicitSteps, s: ImplicitState, ahead: jax.Array) -> ImplicitState:

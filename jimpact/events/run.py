@@ -15,9 +15,9 @@ import jax.numpy as jnp
 
 from jimpact.events.contact_flow import ContactFlow
 from jimpact.numerics import stepper
-from jimpact.numerics.driver import until_over
+from jimpact.numerics.driver import SLOTS_WITH_TANGENTS, until_over
 from jimpact.numerics.stepper import Mark, any_of
-from jimpact.numerics.tangents import dual_like, pushforward, value_of
+from jimpact.numerics.tangents import dual_like, is_dual, pushforward, value_of
 from jimpact.tools.status import CODE
 
 
@@ -129,9 +129,12 @@ def run(
         return _OnItsWay(carry.marked(paused, settled), rest, now.seen)
 
     start = _OnItsWay(stepper.begin(flow, modes, y), Rest.none(gamma, modes), seen)
+    slots = value_of(flow).slots
+    if is_dual(y):
+        slots = min(slots, SLOTS_WITH_TANGENTS)
     last = until_over(
         lambda _, now: stepper.goes_on(now.carry, most), one_pass, (flow, gamma), start,
-        checkpoints, value_of(flow).queues and observe is None,
+        checkpoints, slots if observe is None else None,
     )  # fmt: skip
     return _finished(flow, gamma, last, inspect)
 

@@ -32,6 +32,7 @@ import numpy as np
 from jimpact.events.contact_flow import ContactStates, Frozen, as_pytree
 from jimpact.events.friction_flow import FrictionFlow
 from jimpact.numerics.dense import product, pseudoinverse, solve, times, unit
+from jimpact.numerics.driver import SLOTS_IN_SPACE
 from jimpact.numerics.friction import distribute
 from jimpact.numerics.stepper import any_of, total
 from jimpact.tools.loops import cond
@@ -163,7 +164,7 @@ class SlipFlow(FrictionFlow):
     # normal_tangent: K_nt (m, 2 m, B); tangent: K_tt (2 m, 2 m, B)
 
     longest = STABLE
-    queues = True
+    slots = SLOTS_IN_SPACE
 
     # ---- the state: x, g, p (m each), slip, its impulse (2 m each), time
 

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jimpact.core.impacts import NO_OFFSETS, Traced, check_constrained
+from jimpact.core.impacts import NOTHING_GIVEN, Traced, check_constrained
 from jimpact.core.law import Law, check_law
 from jimpact.core.scene import Scene, as_velocity, gap_velocity, velocity_change
 from jimpact.events.contact_flow import ContactStates
@@ -136,7 +136,7 @@ def _history(law: Law, scene: Scene, v: jax.Array, samples: int, traced: Traced)
         slip=live(states.slip * (units.velocity * root)[None], slip[None]),
         duration=live(time[-1, 0, 0] * units.time),
         maximum_force=live(maximum * force),
-        status=traced.status((law, scene, v, NO_OFFSETS), live(code[0]), size, finite),
+        status=traced.status((law, scene, v, NOTHING_GIVEN), live(code[0]), size, finite),
     )
 
 

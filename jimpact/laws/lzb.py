@@ -47,10 +47,13 @@ def default_rtol(method: str, dtype: jnp.dtype) -> float:
     return table.get(str(dtype), table["float32"])
 
 
-def solver_of(law: Any, contact: Contact) -> tuple[str, float]:
+def solver_of(law: Any, contact: Contact) -> tuple[str, Any]:
     """The method of a law with impact dynamics at these contacts, and its tolerance there."""
     method = method_for(law.method, contact, law.friction is not None)
-    return method, law.rtol or default_rtol(method, contact.gap_velocity.dtype)
+    if law.rtol is not None:
+        return method, law.rtol
+    default = default_rtol(method, contact.gap_velocity.dtype)
+    return method, default if contact.rtol is None else contact.rtol
 
 
 def check_rtol(rtol: float, dtype: jnp.dtype) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jimpact.core.law import Law
+from jimpact.core.law import Law, with_option
 from jimpact.core.scene import Scene, velocity_unit
 from jimpact.laws.gap_scale import DELTA_C
 from jimpact.montecarlo.samples import Run
@@ -61,6 +61,9 @@ class MonteCarlo(Tabular):
         gap_scale: delta_c (m,) [m], the indentation of a contact (`ji.theory.gap_scale`), or None.
         rate: samples computed a second [1/s], without compiling.
         resumed: samples that were read from the folder.
+        rtol: tolerance of the impacts; None: the law's own, or it needs none.
+        rtol_error: estimated error of the means and deviations by a tolerance above the law's
+            default, in standard errors, the largest; 0: it is the default.
         description: law, scene and distributions, in words.
         run: the requested run; `replay` needs it.
     """
@@ -82,6 +85,8 @@ class MonteCarlo(Tabular):
     gap_scale: np.ndarray | None
     rate: float
     resumed: int
+    rtol: float | None
+    rtol_error: float
     description: str
     run: Run = field(repr=False)
 
@@ -115,12 +120,18 @@ class MonteCarlo(Tabular):
         return velocity_unit(self.run.scene)
 
     def replay(self, index: int) -> tuple[Law, Scene, jax.Array]:
-        """Law, scene and velocity of sample `index`: `ji.impact(*result.replay(index))`."""
+        """Law, scene and velocity of sample `index`: `ji.impact(*result.replay(index))`.
+
+        The law integrates as finely as in the run.
+        """
         if not 0 <= index < self.samples:
             raise ValueError(
                 f"Argument `index` must lie in [0, {self.samples - 1}], but has value {index}."
             )
-        return self.run.sample(index)
+        law, scene, velocity = self.run.sample(index)
+        if self.rtol_error:
+            law = with_option(law, "rtol", self.rtol)
+        return law, scene, velocity
 
     def to_dict(self) -> dict[str, Any]:
         """Everything but samples and run, as a JSON file can hold it."""
@@ -144,7 +155,8 @@ class MonteCarlo(Tabular):
         names = [f"v{i + 1}+" for i in range(len(self.mean))]
         values = self.std, *self.quantile(REPORTED), self.minimum, self.maximum
         rows = [*zip(names, self.mean, self.standard_error, *values)]
-        head = [f"{counted(self.samples, 'sample')} of {self.description}", self._rate(), ""]
+        head = [f"{counted(self.samples, 'sample')} of {self.description}", self._rate()]
+        head += [*self._tolerance_lines(), ""]
         right = f"Quantiles are right to {self.quantile_resolution.max():.2g} {self.unit}"
         notes = [f"{right}; std. error: of the mean, std: of one impact.", ""]
         notes += [*self._gap_lines(), *self._status_lines()]
@@ -156,6 +168,13 @@ class MonteCarlo(Tabular):
             return "all read from the folder"
         text = f"{self.rate:,.0f} samples/s"
         return text + (f", {self.resumed:,} read from the folder" if self.resumed else "")
+
+    def _tolerance_lines(self) -> list[str]:
+        """How finely the impacts were integrated, where that was chosen for the run."""
+        if not self.rtol_error:
+            return []
+        text = f"integrated to rtol = {self.rtol:g}: its error in means and deviations is at most"
+        return [f"{text} {self.rtol_error:.1g} standard errors"]
 
     def _gap_lines(self) -> list[str]:
         """Mean and standard deviation of the random gaps."""
@@ -186,7 +205,7 @@ def result_of(
 ) -> MonteCarlo:
     """The result of a run from the statistics of all its chunks."""
     n, count, bad = len(total["ends"]), int(total["used"]), part(total, "bad")
-    mean = total["mean"]
+    mean, (rtol, error) = total["mean"], total["tolerance"]
     covariance = total["products"] / (count - 1 if count > 1 else np.nan)
     failed = zip(bad["index"], bad["status"], bad["gaps"], bad["velocity_before"])
     return MonteCarlo(
@@ -207,6 +226,8 @@ def result_of(
         gap_scale=gap_scale,
         rate=rate,
         resumed=resumed,
+        rtol=float(rtol) or None,
+        rtol_error=float(error * np.sqrt(count)),
         description=run.description,
         run=run,
     )

@@ -23,7 +23,16 @@ from jimpact.core.distributions import Distribution, GivenRows, as_source
 from jimpact.core.impacts import impact
 from jimpact.core.law import Law, within_domains
 from jimpact.core.scene import Scene, rounded_gaps, with_gaps
-from jimpact.montecarlo.statistics import BAD_GAP, BAD_LAW, BAD_VELOCITY, Chunk, Task, reduced
+from jimpact.montecarlo.statistics import (
+    AS_THE_LAW,
+    BAD_GAP,
+    BAD_LAW,
+    BAD_VELOCITY,
+    Chunk,
+    Task,
+    Tolerance,
+    reduced,
+)
 from jimpact.montecarlo.store import fingerprint
 from jimpact.tools.checks import as_whole, check_kind, in_common_dtype
 from jimpact.tools.compiling import precise_jit
@@ -75,9 +84,12 @@ def draw(
 
 @precise_jit
 def impacts(
-    drawn: Sources, scene: Scene, random: dict[str, bool], size: int
+    drawn: Sources, scene: Scene, random: dict[str, bool], size: int, rtol: np.ndarray | None
 ) -> tuple[jax.Array, jax.Array]:
-    """Velocities (C, n) and statuses (C,) of a chunk; a bad draw has a code of its own."""
+    """Velocities (C, n) and statuses (C,) of a chunk; a bad draw has a code of its own.
+
+    `rtol` () as of `impact`.
+    """
 
     def one(law: Law, velocity: jax.Array, gaps: jax.Array | None) -> tuple[jax.Array, jax.Array]:
         """v+ (n,) and status () of one sample."""
@@ -88,7 +100,8 @@ def impacts(
             fine = jnp.isfinite(gaps) & (rounded_gaps(gaps) >= 0)
             code = jnp.where(jnp.all(fine), code, BAD_GAP)
             place = with_gaps(scene, jnp.where(fine, gaps, 0))
-        out = impact(law, place, jnp.where(code == 0, velocity, 0))  # at rest: over at once
+        velocity = jnp.where(code == 0, velocity, 0)  # at rest: over at once
+        out = impact(law, place, velocity, rtol=rtol)
         return out.velocity, jnp.where(code == 0, out.status, code.astype(jnp.int32))
 
     axes = tuple(eqx.if_array(0) if random[name] else None for name in vars(drawn))
@@ -116,10 +129,20 @@ class Run:
 
     def __call__(self, task: Task, device: jax.Device | None = None) -> Chunk:
         """Compute one chunk on a device (None: the default one)."""
-        random = self.sources.random
-        with self._flags():
+        return self.reduced(task, self.outcomes(task, device))
+
+    def reduced(self, task: Task, outcomes: Chunk) -> Chunk:
+        """The statistics of the outcomes of a task."""
+        return reduced(task, outcomes, self.bins, self.keep_samples)
+
+    def outcomes(self, task: Task, device: jax.Device | None = None) -> Chunk:
+        """All samples of a chunk: what was drawn, velocities and statuses."""
+        random, rtol = self.sources.random, task.tolerance.rtol
+        with self.flags():
             drawn, scene = self._drawn(task, device)
-            velocity, status = impacts(drawn, scene, random, self.size)
+            velocity, status = impacts(
+                drawn, scene, random, self.size, np.asarray(rtol) if rtol else None
+            )
         constant = np.zeros((self.size, 0))
         samples: dict[str, Any] = {
             "velocity": velocity,
@@ -127,8 +150,7 @@ class Run:
             "velocity_before": drawn.velocity if random["velocity"] else constant,
             "gaps": drawn.gaps if random["gaps"] else constant,
         }
-        on_host = {name: np.asarray(x) for name, x in samples.items()}
-        return reduced(task, on_host, self.bins, self.keep_samples)
+        return {name: np.asarray(x) for name, x in samples.items()}
 
     @property
     def chunks(self) -> int:
@@ -139,19 +161,21 @@ class Run:
         """How many samples of a chunk are used."""
         return min(self.size, self.samples - number * self.size)
 
-    def task(self, number: int, ends: np.ndarray | None = None) -> Task:
+    def task(
+        self, number: int, tolerance: Tolerance = AS_THE_LAW, ends: np.ndarray | None = None
+    ) -> Task:
         """The task of a chunk."""
         size = self.size
         rows = {}
         for name, values in self.rows.items():
             own = values[number * size : (number + 1) * size]
             rows[name] = np.pad(own, ((0, size - len(own)), (0, 0)), mode="edge")
-        return Task(number, self.count(number), ends, rows)
+        return Task(number, self.count(number), ends, rows, tolerance)
 
     def sample(self, index: int) -> tuple[Law, Scene, jax.Array]:
         """Law, scene and velocity of sample `index`, the same bits as in the run."""
         number, lane = divmod(index, self.size)
-        with self._flags():
+        with self.flags():
             drawn, _ = self._drawn(self.task(number), None)
         law, velocity, gaps = (
             jax.tree.map(lambda x: x[lane] if eqx.is_array(x) else x, getattr(drawn, name))
@@ -162,7 +186,7 @@ class Run:
         return law, self.scene if gaps is None else with_gaps(self.scene, gaps), velocity
 
     @contextlib.contextmanager
-    def _flags(self) -> Iterator[None]:
+    def flags(self) -> Iterator[None]:
         """What precision and draws depend on, in this thread only: workers have their own."""
         with jax.enable_x64(self.x64), jax.threefry_partitionable(self.threefry_partitionable):
             yield

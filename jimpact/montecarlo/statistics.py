@@ -3,12 +3,13 @@
 A chunk is a mapping of arrays, as its file holds them: `number`, `count` of its samples, `statuses`
 (how many ended with each code), `used` of them that did not fail with their `mean` and `products`
 of deviations over the velocities after (n) and the random gaps (m), `low` and `high` (n,), `ends`
-(n, 2) and `counts` (n, bins + 2) of histograms; `bad.*`: numbers, codes, gaps and velocities of the
-first failed samples; `raw.*`: all samples, or the first few (`IN_MEMORY`) of a run, or none.
+(n, 2) and `counts` (n, bins + 2) of histograms; `tolerance` (2,), see `Tolerance`; `bad.*`:
+numbers, codes, gaps and velocities of the first failed samples; `raw.*`: all samples, or the first
+few (`IN_MEMORY`) of a run, or none.
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -31,6 +32,16 @@ FAILURE = np.array([row.failure for row in OUTCOMES])
 Chunk = dict[str, np.ndarray]
 
 
+class Tolerance(NamedTuple):
+    """How finely a run integrates."""
+
+    rtol: float = 0.0  # of `impact`; 0: the law's own
+    error: float = 0.0  # beside the law's default, in standard deviations: see `tolerance.py`
+
+
+AS_THE_LAW = Tolerance()
+
+
 @dataclass(frozen=True)
 class Task:
     """What a chunk needs besides the plan: its number, how many samples count, bins, given rows."""
@@ -39,6 +50,7 @@ class Task:
     count: int
     ends: np.ndarray | None  # (n, 2) of the histograms; None: from this chunk
     rows: dict[str, np.ndarray]
+    tolerance: Tolerance = AS_THE_LAW
 
 
 def part(chunk: Chunk, prefix: str) -> Chunk:
@@ -156,6 +168,7 @@ def reduced(task: Task, samples: Chunk, bins: int, keep_samples: bool) -> Chunk:
     return {
         "number": np.array(task.number),
         "count": np.array(count),
+        "tolerance": np.array(task.tolerance),
         "statuses": np.bincount(status[:count], minlength=len(FAILURE)),
         **moments(used),
         "low": used[:n].min(axis=1, initial=np.inf),

@@ -22,7 +22,8 @@ import numpy as np
 
 from jimpact.montecarlo.statistics import Chunk, part
 
-FORMAT = {"format": "2"}  # of a manifest: 2 names classes of jimpact without their modules
+# Of a manifest: 2 names classes of jimpact without their modules, 3 has the tolerance of chunks.
+FORMAT = {"format": "3"}
 MANIFEST = "manifest.json"
 
 
@@ -239,3 +240,6 @@ def _write(path: Path, content: bytes) -> None:
             f"'{path}' could not be written, {what}; what was there before is intact, and the same "
             "call continues from it",
         ) from error
+    except BaseException:  # ctrl-C
+        temporary.unlink(missing_ok=True)
+        raise

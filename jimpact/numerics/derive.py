@@ -34,7 +34,11 @@ from jimpact.tools.loops import varying_like
 # Impacts that a CPU solves at a time. A chunk ends with its slowest member, and its stages should
 # stay in a core's cache: 64 are no faster, 1024 take half as long again.
 CHUNK = 256
-CHUNK_WITH_TANGENTS = 128  # of impacts with tangents, which take more room in the cache
+# The same where impacts that are over make room for others: slots idle only at the end of a chunk.
+# Ten times more: ten times the memory for what enters and leaves.
+QUEUE = 4096
+# Both of impacts with tangents, which take more room in the cache and in memory.
+CHUNK_WITH_TANGENTS, QUEUE_WITH_TANGENTS = 128, 512
 # Rows of a Jacobian that one run computes; further ones run it again. Ten times more: chains of
 # fifty balls take ten times the memory, and no less time.
 DIRECTIONS = 64
@@ -71,8 +75,8 @@ def in_lanes(
     Results that are whole numbers have no derivatives; the others have those of `fine`, which is
     the same at a finer tolerance, with loops of `until_over` by `checkpoints` if these are the
     `adjoint`. Functions are hashable and equal where they do the same: each is compiled once. One
-    that `takes_duals` gets `Dual` arguments where it is differentiated. It gets the whole batch if
-    its method `queues` returns True, else chunks of it.
+    that `takes_duals` gets `Dual` arguments where it is differentiated. One that `queues` gets
+    larger chunks of the batch: there impacts that are over make room for others.
     """
     arrays = tuple(varying_like([jnp.asarray(x) for x in arrays], arrays))
     if adjoint == "checkpoints":
@@ -160,10 +164,6 @@ class _WithTangents:
     marked: tuple[bool, ...]
     many: bool = False
 
-    def queues(self, *arrays: jax.Array) -> bool:
-        """Whether its function works through a batch of any size by itself."""
-        return _queues(self.function, arrays[: len(self.marked)])
-
     def results(self, *kinds: Kind) -> Iterator[Kind]:
         """Those of the function, then those of rates."""
         at, directions = kinds[: len(self.marked)], kinds[len(self.marked) :]
@@ -189,10 +189,6 @@ class _WithJacobian:
 
     function: Function
     marked: tuple[bool, ...]
-
-    def queues(self, *arrays: jax.Array) -> bool:
-        """Whether its function works through a batch of any size by itself."""
-        return _queues(self.function, arrays)
 
     def results(self, *kinds: Kind) -> Iterator[Kind]:
         """Those of the function, then those of rates."""
@@ -381,10 +377,14 @@ def _reversible(function: Function, fine: Function) -> Function:
     return value
 
 
-def _queues(function: Any, arrays: Arrays) -> bool:
-    """Whether the function works through a batch of any size by itself."""
-    queues = getattr(function, "queues", None)
-    return queues is not None and queues(*arrays)
+def _chunk_of(function: Any) -> int:
+    """Impacts that a CPU gets at a time."""
+    tangents = isinstance(function, _WithTangents | _WithJacobian)
+    while isinstance(function, _WithTangents | _WithJacobian):
+        function = function.function
+    if getattr(function, "queues", False):
+        return QUEUE_WITH_TANGENTS if tangents else QUEUE
+    return CHUNK_WITH_TANGENTS if tangents else CHUNK
 
 
 @functools.cache
@@ -485,8 +485,7 @@ batching.primitive_batchers[_lanes_p] = _longer
 def _in_chunks(function: Function, *arrays: jax.Array) -> Arrays:
     """On a CPU piece by piece, the last one filled up; on accelerators all at once."""
     size = arrays[0].shape[-1]
-    chunk = CHUNK_WITH_TANGENTS if isinstance(function, _WithTangents | _WithJacobian) else CHUNK
-    count = 1 if _queues(function, arrays) else -(-size // chunk)
+    count = -(-size // _chunk_of(function))
     if count == 1:
         return tuple(function(*arrays))
     width = -(-size // count)

@@ -7,13 +7,16 @@ import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 
-from jimpact.tools.loops import cond, while_loop
+from jimpact.tools.loops import while_loop
 
-# Impacts with friction that a CPU computes side by side, whatever the size of the batch; and slots
-# that are free before they are filled with waiting impacts. Ten times more slots: more of them idle
-# while the last impacts end; ten times fewer: each operation has too few numbers to work on. Ten
-# times more free slots: all wait for the slowest impact again.
-SLOTS, FREE = 64, 4
+# Impacts that a CPU computes side by side: 128 and 512 take a tenth longer. Ten times more: stages
+# leave a core's cache; ten times fewer: each operation has too few numbers to work on.
+SLOTS = 256
+SLOTS_WITH_TANGENTS = 128  # of impacts with tangents, which take more room in the cache
+SLOTS_IN_SPACE = 64  # with friction in space, where some take many times the passes of others
+# Part of the slots that are free before they are filled with waiting impacts. Ten times more: all
+# wait for the slowest impact again; ten times less: copying what enters takes longer than a pass.
+FREE = 1 / 16
 # States that the reverse mode of a loop keeps at a time. Ten times more: ten times its memory; ten
 # times fewer: steps are run again more often.
 CHECKPOINTS = 64
@@ -24,7 +27,7 @@ Carry = TypeVar("Carry")
 class _Slots(NamedTuple):
     """Impacts that are being computed, one in each slot, and those that are over."""
 
-    impact: jax.Array  # (SLOTS,) the impact that is in each slot
+    impact: jax.Array  # (slots,) the impact that is in each slot
     following: jax.Array  # () the first impact that still waits
     flow: Any
     carry: Any
@@ -37,14 +40,14 @@ def until_over(
     flow: Any,
     carry: Carry,
     checkpoints: bool = False,
-    queues: bool = False,
+    slots: int | None = None,
 ) -> Carry:
     """All impacts, or one motion, to their ends.
 
     `goes_on(flow, carry)` says which (1, B) are not over, `advance(flow, carry)` makes one pass;
     the batch B of impacts is the last axis of all arrays. With `checkpoints` the loop has a reverse
-    mode, in the place of a forward mode. If it `queues`, a CPU has at most SLOTS impacts side by
-    side.
+    mode, in the place of a forward mode. A CPU has at most so many `slots` of impacts side by side;
+    None: all.
     """
 
     def at_once(flow: Any, carry: Any) -> Any:
@@ -61,9 +64,10 @@ def until_over(
 
     def in_slots(flow: Any, carry: Any) -> Any:
         """As a queue, in slots."""
-        return _in_slots(goes_on, advance, flow, carry)
+        return _in_slots(goes_on, advance, flow, carry, slots or count)
 
-    if checkpoints or not queues or jax.tree.leaves(carry)[0].shape[-1] <= SLOTS:
+    count = jax.tree.leaves(carry)[0].shape[-1]
+    if checkpoints or count <= (slots or count):
         return at_once(flow, carry)
     return jax.lax.platform_dependent(flow, carry, cpu=in_slots, default=at_once)
 
@@ -73,9 +77,11 @@ def _in_slots(
     advance: Callable[[Any, Any], Any],
     flow: Any,
     carry: Any,
+    size: int,
 ) -> Any:
-    """`until_over` of more impacts than there are slots."""
+    """`until_over` of more impacts than there are slots, `size` of them."""
     count = jax.tree.leaves(carry)[0].shape[-1]
+    most_free = max(1, round(FREE * size))
 
     def picked(tree: Any, impact: jax.Array) -> Any:
         """The arrays (.., B) of these impacts."""
@@ -96,18 +102,22 @@ def _in_slots(
         following = s.following + jnp.sum(enters, dtype=jnp.int32)
         return _Slots(impact, following, new_flow, new, stored(s))
 
-    def one_pass(s: _Slots) -> _Slots:
-        """One pass in each slot; enough of those that are free are filled first."""
-        free = jnp.sum(~goes_on(s.flow, s.carry), dtype=jnp.int32)
-        fills = (free >= FREE) & (s.following < count)
-        s = cond(fills, lambda: refilled(s), lambda: s)
-        return s._replace(carry=advance(s.flow, s.carry))
+    def next_round(s: _Slots) -> _Slots:
+        """Passes until enough slots are free, which are then filled."""
+
+        def continues(carry: Any) -> jax.Array:
+            """Whether () too few slots are free to fill them, or some are busy at the end."""
+            busy = jnp.sum(goes_on(s.flow, carry), dtype=jnp.int32)
+            return busy > jnp.where(s.following < count, size - most_free, 0)
+
+        carry = while_loop(continues, lambda carry: advance(s.flow, carry), s.carry)
+        return refilled(s._replace(carry=carry))
 
     def open_work(s: _Slots) -> jax.Array:
         """Whether () an impact goes on or waits."""
         return jnp.any(goes_on(s.flow, s.carry)) | (s.following < count)
 
-    first = jnp.arange(SLOTS, dtype=jnp.int32)
+    first = jnp.arange(size, dtype=jnp.int32)
     own, here = picked((flow, carry), first)
-    slots = _Slots(first, jnp.asarray(SLOTS, jnp.int32), own, here, carry)
-    return stored(while_loop(open_work, one_pass, slots))
+    slots = _Slots(first, jnp.asarray(size, jnp.int32), own, here, carry)
+    return stored(while_loop(open_work, next_round, slots))

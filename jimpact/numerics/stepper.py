@@ -38,6 +38,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jimpact.numerics.driver import SLOTS
 from jimpact.numerics.tableaux import DOP853
 from jimpact.numerics.tangents import Dual, dual_like, is_dual, pushforward, value_of
 from jimpact.tools.loops import cond, scan
@@ -76,7 +77,6 @@ POLISH = 2
 # half as long.
 COARSE = 0.3
 
-
 STAGES = len(DOP853.c)
 _TABLE = np.array([[*row, *[0.0] * (STAGES - len(row))] for row in (*DOP853.a, DOP853.b)])
 _NODES = np.array([*DOP853.c, 1.0])
@@ -91,8 +91,7 @@ class Flow(abc.ABC):
     longest: Any  # the longest step in the flow's own time that is stable, or inf
 
     near: float = 0.0  # share of a step from which landings start, 0: from anywhere
-    # whether some impacts of a batch take many times the passes of others, and none pauses
-    queues: bool = False
+    slots: int = SLOTS  # impacts that a CPU computes side by side, others wait
 
     @property
     def driving(self) -> tuple[int, ...]:

@@ -14,13 +14,15 @@ from pathlib import Path
 
 TARGETS = {  # times diffrax
     "diffrax": None,
-    "impact": 1.5,
+    "impact": 1.4,
     "another number of balls": 0.1,
     "Jacobian": 2.5,
     "friction": 4.0,
-    "fit": 4.0,
-    "motion": 8.0,
-    "motion with friction": 8.0,
+    "fit": 3.5,
+    "fit of five parameters": None,
+    "motion": 2.0,
+    "motion with friction": 6.0,
+    "two blocks": 10.0,
 }
 
 
@@ -45,12 +47,22 @@ def measure(row):
     more, faster = ji.chain([1.0] * 4), jnp.array([1.0, 0.0, 0.0, 0.0])
     block = ji.Block(1.0, 2.0, corners="base").scene()
     shots = ji.Experiments(pre=[[1.0, 0, 0]], post=[[-0.0605, 0.1049, 0.9978]])
+    five, before = ji.chain([1.0, 1.2, 0.8, 1.1, 0.9], wall="right"), jnp.eye(5)[:4]  # [m/s]
+    after = [  # of LZB([0.9, 0.8, 0.85, 0.95, 0.7])
+        [-0.40955, -0.13153, -0.12876, -0.1089, -0.01543],
+        [-0.47155, -0.1287, -0.11991, -0.08727, -0.01935],
+        [-0.42409, -0.14298, -0.10532, -0.04332, -0.00763],
+        [-0.55423, -0.11257, -0.10354, -0.05199, -0.00377],
+    ]
     if row == "another number of balls":
         ji.impact(ji.LZB(0.9), balls, v)
     ball, rocks = (
         ji.System(ji.Column([1.0]), gravity=True),
         ji.System(ji.Block(0.2, 0.6, corners="base"), gravity=True, friction=5.0),
     )
+    blocks = ji.Bodies([ji.Block(1.0, 0.5), ji.Block(0.5, 0.25)])
+    two = ji.System(blocks, gravity=True, friction=0.5)
+    falling = [0.0, 0.26, 0.0, 0.1, 0.66, 0.05]  # [m], [rad]
     matrix = ji.RestitutionMatrix(ji.theory.rocking_matrix(0.85))
     tilted = [0.0, 0.1 * math.sin(0.15) + 0.3 * math.cos(0.15), 0.15]
     run = diffrax_event.dopri8()
@@ -61,7 +73,16 @@ def measure(row):
         "Jacobian": lambda: jax.jacfwd(lambda e: ji.impact(ji.LZB(e), balls, v).velocity)(e),
         "friction": lambda: ji.impact(ji.LZB(0.9, friction=0.3), block, v).velocity,
         "fit": lambda: ji.fit(ji.LZB(0.9), balls, shots, free=("restitution",)).law.restitution,
+        "fit of five parameters": lambda: (
+            ji.fit(
+                ji.LZB([0.8] * 5),
+                five,
+                ji.Experiments(pre=before, post=after),
+                free=("restitution",),
+            ).value
+        ),
         "motion": lambda: ji.simulate(ball, ji.Newton(0.8), [1.0], [0.0], 5.0).q,
+        "two blocks": lambda: ji.simulate(two, ji.Moreau(0.3), falling, [0.0] * 6, 0.5).q,
         "motion with friction": lambda: ji.simulate(rocks, matrix, tilted, [0.0] * 3, 4.0).q,
     }[row]
     begun = cpu()

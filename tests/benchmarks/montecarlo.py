@@ -1,7 +1,8 @@
 """Samples a second of `ji.monte_carlo`: `python tests/benchmarks/montecarlo.py [ROW]`.
 
-Three balls with uniform gaps on the CPU at hand, computing and statistics together. Each row is a
-process of its own: its largest memory is that of the row.
+Three balls (or five) with uniform gaps on the CPU at hand, computing and statistics together. Each
+row is a process of its own: its largest memory is that of the row. Beside another commit: rows of
+both in turn, `PYTHONPATH=FOLDER_OF_THE_OTHER python tests/benchmarks/montecarlo.py "Compliant, five balls"`.
 """
 
 import json
@@ -13,29 +14,34 @@ from functools import partial
 
 from harness import RESULTS, show, write_csv
 
-BALLS = {"masses": [0.067, 0.067, 0.067]}  # [kg], 1-inch steel balls
-STRIKE = [0.5, 0.0, 0.0]  # [m/s]
-ROWS = ("Binary, 'earliest'", "the same, chunk=16384", "LZB, random stiffness", "Compliant, Hertz")
+MASS = 0.067  # [kg], of 1-inch steel balls
+STRIKE = 0.5  # [m/s], of the first one
+ROWS = (
+    *("Binary, 'earliest'", "the same, chunk=16384", "LZB, random stiffness"),
+    *("Compliant, Hertz", "Compliant, five balls"),
+)
 
 
 def measured(name):
-    """The row: samples a second without compiling, seconds with it, and MB."""
+    """The row: samples a second without compiling, seconds with it, of processors, and MB."""
     import jimpact as ji
 
-    scene = ji.chain(**BALLS)
+    balls = 5 if "five" in name else 3
+    scene, strike = ji.chain([MASS] * balls), [STRIKE] + [0.0] * (balls - 1)
     gaps = None if "LZB" in name else ji.Uniform(0.0, 50e-6)  # [m]
     stiffness = ji.Uniform(0.5e10, 2e10)
     law = {
         "LZB, random stiffness": ji.RandomLaw(ji.LZB(0.9, [1e10, 1e10]), stiffness=stiffness),
-        "Compliant, Hertz": ji.Compliant(ji.Hertz(1e10)),
+        **dict.fromkeys(ROWS[3:], ji.Compliant(ji.Hertz(1e10))),
     }.get(name, ji.Binary(0.9, "earliest"))
-    samples = {"LZB, random stiffness": 200_000, "Compliant, Hertz": 1_000_000}.get(name, 4_000_000)
-    run = partial(ji.monte_carlo, law, scene, STRIKE, gaps=gaps, samples=samples, progress=False)
-    begun = time.perf_counter()
+    samples = dict(zip(ROWS[2:], (200_000, 1_000_000, 150_000))).get(name, 4_000_000)
+    run = partial(ji.monte_carlo, law, scene, strike, gaps=gaps, samples=samples, progress=False)
+    begun, worked = time.perf_counter(), time.process_time()
     result = run(chunk=16384) if "chunk" in name else run()
-    wall = time.perf_counter() - begun
+    wall, cpu = time.perf_counter() - begun, time.process_time() - worked
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
-    return {"law": name, "samples": samples, "rate": result.rate, "s": wall, "memory_MB": memory}
+    row = {"law": name, "samples": samples, "rate": result.rate, "s": wall, "cpu_s": cpu}
+    return row | {"memory_MB": memory}
 
 
 def main():

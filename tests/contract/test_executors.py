@@ -90,6 +90,64 @@ def test_errors_of_a_chunk_come_through():
         run(Broken())
 
 
+@pytest.mark.parametrize("workers", [0, -1, 1.5, True, "all"])
+def test_numbers_of_workers_that_are_none(workers):
+    with pytest.raises(ValueError, match="`workers` must be an int >= 1, but has value"):
+        run("threads", workers=workers)
+
+
+def test_an_error_in_a_thread_comes_through(tmp_path):
+    """A law fails when it is drawn for the fifth time, in a worker: what was finished is kept."""
+    calls = []
+
+    def value():
+        calls.append(threading.current_thread().name)
+        if len(calls) == 5:
+            raise ArithmeticError("this law cannot be drawn")
+        return np.float64(0.9)
+
+    def law(key):
+        return Binary(jax.pure_callback(value, jax.ShapeDtypeStruct((), float)), "earliest")
+
+    with pytest.raises(Exception, match="this law cannot be drawn"):
+        monte_carlo(
+            law, BALLS, [1.0, 0.0, -1.0], Uniform(0.0, 1e-5), 2000, chunk=128, workers=2,
+            folder=tmp_path,
+        )  # fmt: skip
+    assert 1 <= len(list(tmp_path.glob("chunk-*.npz"))) < 5
+
+
+UNTIL_INTERRUPTED = """
+import sys
+import jax
+jax.config.update("jax_enable_x64", True)
+sys.path[:0] = [sys.argv[1], sys.argv[1] + "/.."]
+from test_executors import run
+run("threads", 1_000_000, workers=2, folder=sys.argv[2])
+"""
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_threads_soon_and_keeps_their_chunks(tmp_path, wanted):
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # an ignored one would be inherited
+    command = [sys.executable, "-c", UNTIL_INTERRUPTED, os.path.dirname(__file__), str(tmp_path)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    try:
+        while len(list(tmp_path.glob("chunk-*.npz"))) < 8:
+            assert process.poll() is None
+            time.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        message = process.communicate(timeout=20)[1]  # two chunks take milliseconds
+    finally:
+        process.kill()
+    assert process.returncode not in (0, -signal.SIGKILL)
+    assert "of 1,000,000 samples; they are in" in message
+    assert not list(tmp_path.glob("*.tmp"))
+    again = run("serial", folder=tmp_path)
+    assert again.resumed >= 7 * 128
+    assert same(again, wanted)
+
+
 ON_FOUR_DEVICES = """
 import sys
 import jax

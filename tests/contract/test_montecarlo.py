@@ -294,6 +294,67 @@ def test_a_folder_of_another_run_is_refused(tmp_path):
         sampled(folder=tmp_path)
 
 
+LOSSY = Compliant(ji.Bistiffness(1e4, 1.5, 0.6))
+
+
+SPEEDS = Uniform([0.0, 0.0, -2.0], [0.0, 0.0, -1.0])
+
+
+def struck(law=LOSSY, samples=2100, **options):
+    return monte_carlo(law, BALLS, SPEEDS, None, samples, chunk=256, **options)
+
+
+def test_a_run_is_as_fine_as_its_standard_errors_need(tmp_path):
+    """The error of a coarser tolerance is measured, stated, and a tenth of them at most."""
+    result = struck()
+    assert result.rtol > 1e-7
+    assert 0 < result.rtol_error <= 0.1
+    assert f"integrated to rtol = {result.rtol:g}" in str(result)
+    fine = struck(Compliant(LOSSY.force, rtol=1e-9))  # the law's own holds
+    assert fine.rtol is None
+    assert "integrated" not in str(fine)
+    moved = np.abs(result.mean - fine.mean) / fine.standard_error
+    assert 0 < moved.max() <= result.rtol_error
+    after, before = result.first["velocity"], result.first["velocity_before"][:, 2]
+    parts = after / before[:, None]  # of a scale: v+ is proportional to v-
+    np.testing.assert_allclose(parts, np.broadcast_to(parts[:1], parts.shape), rtol=1e-3)
+    law, *where = result.replay(7)
+    np.testing.assert_allclose(impact(law, *where).velocity, after[7], rtol=1e-13)
+    few = struck(samples=700)  # looking would take longer than it saves
+    assert (few.rtol, few.rtol_error) == (1e-8, 0.0)
+    kept = struck(folder=tmp_path, keep_samples=True)  # here the samples are the result
+    assert kept.rtol_error == 0.0
+    assert struck(Newton(0.5)).rtol is None
+
+
+def test_a_folder_keeps_its_tolerance(tmp_path):
+    whole, parts = struck(workers=3), struck(folder=tmp_path)
+    assert whole.rtol == parts.rtol
+    for path in sorted(tmp_path.glob("chunk-*.npz"))[:2]:
+        path.unlink()  # the first chunk, too, which had found it
+    again = struck(folder=tmp_path, executor="serial")
+    assert again.resumed == 2100 - 2 * 256
+    assert (again.rtol, again.rtol_error) == (whole.rtol, whole.rtol_error)
+    assert again.mean.tobytes() == whole.mean.tobytes()
+    assert again.covariance.tobytes() == whole.covariance.tobytes()
+    more = struck(samples=2400, folder=tmp_path)
+    assert more.resumed == 8 * 256
+    assert more.rtol == whole.rtol
+
+
+def test_an_impact_to_a_given_tolerance():
+    coarse = Compliant(LOSSY.force, rtol=1e-3)
+    before = jnp.array([0.0, 0.0, -1.0])
+    wanted = impact(coarse, BALLS, before).velocity
+    out = jax.jit(lambda rtol: impact(LOSSY, BALLS, before, rtol=rtol))(1e-3)
+    np.testing.assert_allclose(out.velocity, wanted, rtol=1e-14)
+    assert float(out.accuracy) == 1e-3
+    own = impact(coarse, BALLS, before, rtol=1e-8).velocity  # the law's own holds
+    np.testing.assert_allclose(own, wanted, rtol=1e-14)
+    with pytest.raises(ValueError, match=r"`rtol` must lie in \(0, 1\], but has value 0"):
+        impact(LOSSY, BALLS, before, rtol=0.0)
+
+
 @pytest.mark.release
 def test_the_linearization_beside_monte_carlo():
     law = Compliant(Hertz(1.0))  # indentations of about 0.5 m: metre-sized gaps

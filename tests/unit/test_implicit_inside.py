@@ -14,7 +14,7 @@ from jimpact.core.contact import contact_of
 from jimpact.events import implicit_steps
 from jimpact.events.contact_flow import Chain, Dense
 from jimpact.events.impact_dynamics import method_for
-from jimpact.numerics.driver import SLOTS
+from jimpact.numerics.driver import SLOTS_IN_SPACE
 from jimpact.numerics.step_impulses import StepProblem, descent_lengths, solve
 
 pytestmark = pytest.mark.release  # they compile programs of their own
@@ -75,7 +75,7 @@ def test_tangents_of_the_impulses_of_a_step():
 
 def test_slopes_of_a_queue_are_those_alone():
     """More impacts than there are slots, of different lengths: each slope that of one impact."""
-    scene, each = ji.chain([1.0], wall=True), jnp.linspace(0.0, 0.9, 2 * SLOTS)
+    scene, each = ji.chain([1.0], wall=True), jnp.linspace(0.0, 0.9, 2 * SLOTS_IN_SPACE)
 
     def after(e):
         return ji.impact(ji.LZB(e, 1.0, 1.5, method="implicit"), scene, [1.0]).velocity[0]

@@ -1,0 +1,91 @@
+"""How finely a run integrates: its tolerance may cost a small part of its standard errors.
+
+The samples of the first chunk are computed at the law's default tolerance and at a coarser one. The
+differences of each velocity x, and of `(x - mean)^2`, are the errors of mean and variance that the
+coarser one makes. An error is its estimate and two standard errors of this, in standard deviations
+of the quantity: times the root of the number of samples it is in standard errors.
+"""
+
+from dataclasses import replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact.montecarlo.samples import Run
+from jimpact.montecarlo.statistics import AS_THE_LAW, FAILURE, Chunk, Tolerance
+
+# Part of a standard error that the tolerance may cost. Ten times more: as large as what chance
+# does; ten times less: all runs are as fine as one impact.
+SHARE = 0.1
+# Multiples of the default tolerance that are tried. Beyond these steps end at events, and no fewer
+# of them are needed.
+COARSER = (1000.0, 100.0, 10.0)
+# Chunks from which on it is looked for. Ten times more: half a minute at the default tolerance; ten
+# times fewer: looking takes longer than it saves.
+WORTH_LOOKING = 8
+
+
+def first_chunk(run: Run, recorded: Tolerance | None) -> Chunk:
+    """Chunk 0 at the tolerance of the run: the recorded one, or the coarsest that suffices."""
+    if recorded is not None:
+        return run(run.task(0, recorded))
+    default = open_tolerance(run)
+    task = run.task(0, AS_THE_LAW if default is None else Tolerance(default))
+    fine = run.outcomes(task)
+    if default is None or run.chunks < WORTH_LOOKING or run.keep_samples:
+        return run.reduced(task, fine)
+    for times in COARSER:
+        coarser = replace(task, tolerance=Tolerance(times * default))
+        coarse = run.outcomes(coarser)
+        error = added_error(fine, coarse)
+        if error * np.sqrt(run.samples) <= SHARE:
+            found = replace(coarser, tolerance=Tolerance(times * default, error))
+            return run.reduced(found, coarse)
+    return run.reduced(task, fine)
+
+
+def open_tolerance(run: Run) -> float | None:
+    """The default tolerance of a law that would take another one; None: it has its own, or none."""
+    law, scene, velocity = run.sample(0)
+    found: list[Any] = []
+
+    def look(velocity: jax.Array) -> jax.Array:
+        """Note the default, and whether another one is taken."""
+        contact = law.contact(scene, velocity)
+        other = contact.integrated_to(jnp.ones((), velocity.dtype))
+        taken: Any = law.accuracy(other)
+        found[:] = [law.accuracy(contact), taken is other.rtol]
+        return velocity
+
+    with run.flags():
+        jax.eval_shape(look, velocity)
+    default, takes_another = found
+    return None if eqx.is_array(default) or not takes_another else default
+
+
+def added_error(fine: Chunk, coarse: Chunk) -> float:
+    """Of the same samples at two tolerances, for mean or variance of a velocity, the largest.
+
+    In standard deviations of the quantity; infinite where statuses differ.
+
+    >>> import numpy as np
+    >>> from jimpact.montecarlo.tolerance import added_error
+    >>> x = {"status": np.zeros(4, int), "velocity": np.array([[-3.0], [-1.0], [1.0], [3.0]])}
+    >>> round(added_error(x, x | {"velocity": x["velocity"] + 0.1}), 3)  # 0.1 / root(5)
+    0.045
+    """
+    if not np.array_equal(fine["status"], coarse["status"]):
+        return np.inf
+    used = ~FAILURE[fine["status"]]
+    x, y = (chunk["velocity"][used].astype(float) for chunk in (fine, coarse))
+    pairs = [(x, y), ((x - x.mean(axis=0)) ** 2, (y - y.mean(axis=0)) ** 2)]
+    errors = []
+    for exact, other in pairs:
+        difference = other - exact
+        spread = difference.std(axis=0) / np.sqrt(max(len(x), 1))
+        error, size = np.abs(difference.mean(axis=0)) + 2 * spread, exact.std(axis=0)
+        errors.append(np.where(error > 0, error / np.where(size > 0, size, 1e-300), 0.0))
+    return float(np.max(errors))
