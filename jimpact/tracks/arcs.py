@@ -40,12 +40,17 @@ class Arcs:
     members: list[np.ndarray]
     residual: np.ndarray
 
-    def velocities(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """v- (K, n), v+ (K, n) and the covariance (2nK, 2nK) of (v-, v+) of each impact."""
+    def velocities(self) -> tuple[np.ndarray, np.ndarray]:
+        """v- (K, n) and v+ (K, n) of each impact."""
+        h = np.diff(self.instants)
+        mean, bend = np.diff(self.places, axis=0) / h[:, None], self.acceleration / 2
+        return mean[:-1] + bend * h[:-1, None], mean[1:] - bend * h[1:, None]
+
+    def gain(self) -> np.ndarray:
+        """Derivatives (K, 2, n, N) of v- and v+ in the N values of `covariance`."""
         K, n = len(self.instants) - 2, self.places.shape[1]
         h = np.diff(self.instants)
         mean, bend = np.diff(self.places, axis=0) / h[:, None], self.acceleration / 2
-        before, after = mean[:-1] + bend * h[:-1, None], mean[1:] - bend * h[1:, None]
         gain, size = np.zeros((K, 2, n, len(self.covariance))), n + 1
         for k in range(K):
             for side, sign in ((0, 1.0), (1, -1.0)):
@@ -57,8 +62,12 @@ class Arcs:
                     row[i * size + n], row[(i + 1) * size + n] = slope[c], -slope[c]
                     if len(row) > (K + 2) * size:
                         row[(K + 2) * size + c] = sign * h[i] / 2
-        flat = gain.reshape(2 * n * K, len(self.covariance))
-        return before, after, flat @ self.covariance @ flat.T
+        return gain
+
+    def covariance_of_velocities(self) -> np.ndarray:
+        """(2nK, 2nK), of (v-, v+) of each impact in turn."""
+        flat = self.gain().reshape(-1, len(self.covariance))
+        return flat @ self.covariance @ flat.T
 
 
 def fit_arcs(

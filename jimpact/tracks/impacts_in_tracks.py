@@ -1,6 +1,7 @@
 """Impacts in a track: flights and instants at once, by maximum likelihood."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,8 @@ from jimpact.fits.shots_file import ANGULAR, LINEAR
 from jimpact.tools.checks import as_float_array, check_concrete, check_values
 from jimpact.tracks.arcs import Arcs, fit_arcs
 from jimpact.tracks.judging import findings, findings_of_input, findings_of_noise, findings_of_signs
+from jimpact.tracks.poses import with_turns
+from jimpact.tracks.quaternions import as_inertia, as_poses
 from jimpact.tracks.segments import (
     SMALLEST_JUMP,
     common_acceleration,
@@ -30,6 +33,8 @@ def find_impacts(
     shortest: int = 5,
     window: float | None = None,
     units: str | Sequence[str] | None = None,
+    quaternion: str | None = None,
+    inertia: Any = None,
 ) -> Track:
     """The impacts of a track: instants, velocities before and after, and their covariance.
 
@@ -51,14 +56,21 @@ def find_impacts(
         window: of each flight use only so long before and after an impact, > 0 [s], where flights
             are not quite ballistic; None: whole flights.
         units: of each coordinate, 'm' or 'rad', or one for all; None: m.
+        quaternion: 'wxyz' or 'xyzw', the order in which poses hold it; then q is (T, 7), the centre
+            of mass and a unit quaternion of either sign, from the axes of the body to those of
+            space. sigma has (6,), places and turns about the axes of the body [rad], acceleration
+            (3,). Impacts are found by the places.
+        inertia: of a body with poses, (3,) along its axes or (3, 3), about the centre of mass, up
+            to a factor: between impacts it turns freely. None: as a sphere or a cube does.
 
     Returns:
         `Track`, which prints and plots; `warnings` say which flights are not ballistic, and that
-        no impact was found.
+        no impact was found. With `quaternion` velocities are (x', omega), omega in the axes of the
+        body, as of `ji.Box`, and poses hold the quaternion's scalar first.
 
     Raises:
         ValueError: fewer frames than a flight and a half, times that do not rise or are not finite,
-            sigma <= 0, other shapes; no flight at all.
+            sigma <= 0, other shapes; no flight at all; a quaternion whose length is not 1.
 
     >>> import numpy as np
     >>> import jimpact as ji
@@ -69,6 +81,9 @@ def find_impacts(
     >>> [round(float(track.impacts[0].post[0] / -track.impacts[0].pre[0]), 2)]
     [0.8]
     """
+    if quaternion is not None or inertia is not None:
+        options = {"contact": contact, "shortest": shortest, "window": window, "units": units}
+        return _in_poses(t, q, sigma, acceleration, quaternion, inertia, options)
     t, q, names = _checked(t, q, shortest, units)
     n = q.shape[1]
     raw, q = q, _unwrapped(q, names)
@@ -97,6 +112,34 @@ def find_impacts(
     if window is not None and len(arcs.instants) > 2:
         arcs = _windowed(x, q, given, arcs, free, contact, window)
     return _as_track(t, q, given, arcs, names, notes)
+
+
+def _in_poses(
+    t: Any,
+    q: Any,
+    sigma: Any,
+    acceleration: Any,
+    quaternion: str | None,
+    inertia: Any,
+    options: dict[str, Any],
+) -> Track:
+    """The impacts in poses: by their places, then with the turning of each flight."""
+    if quaternion is None:
+        raise ValueError("Argument `inertia` is for poses, whose order `quaternion` must name.")
+    if options["units"] is not None:
+        raise ValueError("Argument `units` is not for poses: places [m] and a quaternion.")
+    for name, value in (("t", t), ("q", q)):
+        check_concrete(name, value)
+        as_float_array(name, value)  # raises for what are no numbers
+    places, e = as_poses(q, quaternion)
+    moments = as_inertia(inertia)
+    of_places, of_turns = None, None
+    if sigma is not None:
+        both = _of_coordinates("sigma", sigma, 6)
+        check_values("sigma", both, low=0.0, open_low=True)
+        of_places, of_turns = both[:3], both[3:]
+    track = find_impacts(t, places, of_places, acceleration=acceleration, **options)
+    return replace(with_turns(track, e, of_turns, moments), order=quaternion, inertia=moments)
 
 
 def _checked(t: Any, q: Any, shortest: int, units: Any) -> tuple[np.ndarray, np.ndarray, Any]:
@@ -195,7 +238,7 @@ def _of_true_impacts(
 
 def _jumps(arcs: Arcs) -> np.ndarray:
     """The largest jump of a velocity of each impact (K,), in standard errors."""
-    pre, post, covariance = arcs.velocities()
+    (pre, post), covariance = arcs.velocities(), arcs.covariance_of_velocities()
     (K, n), signs = pre.shape, np.hstack([-np.eye(pre.shape[1]), np.eye(pre.shape[1])])
     sizes = np.zeros(K)
     for k in range(K):
@@ -250,7 +293,7 @@ def _as_track(
     notes: list[str],
 ) -> Track:
     """The track of these arcs, with what is wrong with it."""
-    pre, post, covariance = arcs.velocities()
+    (pre, post), covariance = arcs.velocities(), arcs.covariance_of_velocities()
     n, size = q.shape[1], q.shape[1] + 1
     impacts = []
     for k, (before, after) in enumerate(zip(pre, post)):

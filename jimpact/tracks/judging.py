@@ -59,6 +59,44 @@ def findings_of_input(q: np.ndarray, sigma: np.ndarray, units: tuple[str, ...]) 
     return found
 
 
+def findings_of_turns(
+    e: np.ndarray, sigma: np.ndarray, residual: np.ndarray, p_values: np.ndarray, taken: float
+) -> list[str]:
+    """What is wrong with the orientations e (T, 4) of poses, a sentence each.
+
+    `residual` (T, 3) in units of sigma; `p_values` (K,) of the meetings at impacts; `taken`: values
+    that were fitted.
+    """
+    found, seen = [], e[np.isfinite(e).all(axis=1)]
+    cosines = np.minimum(np.abs((seen[1:] * seen[:-1]).sum(axis=1)), 1.0)
+    if len(cosines) and np.quantile(2 * np.arccos(cosines), 0.9) > np.pi / 2:
+        found.append(
+            "The body turns by more than a quarter of a turn from frame to frame: do the frames "
+            "miss turns?"
+        )
+    if (sigma > COARSE_ANGLE).any():
+        found.append(
+            f"The orientations have a standard error of {sigma.max():.2g} rad: is `sigma` in "
+            "degrees, or does the body not turn freely between impacts (`inertia`)?"
+        )
+    freedom = max(np.isfinite(residual).sum() - taken, 1.0)
+    square = float(np.nansum(residual**2))
+    if chi2.sf(square, freedom) < FALSE_ALARMS / 4:
+        found.append(
+            f"The body does not turn freely within sigma: residuals are "
+            f"{np.sqrt(square / freedom):.2g} times as large. Perhaps `inertia` is another, an "
+            "impact was not found, or the orientations were smoothed."
+        )
+    apart = np.flatnonzero(p_values < FALSE_ALARMS / 4 / max(len(p_values), 1))
+    if apart.size:
+        numbers = ", ".join(str(k + 1) for k in apart)
+        found.append(
+            f"The turns before and after impact {numbers} do not meet at the instant of the places:"
+            " are there two impacts in one, or were orientations smoothed across it?"
+        )
+    return found
+
+
 def findings_of_signs(
     t: np.ndarray, q: np.ndarray, sigma: np.ndarray, acceleration: np.ndarray, shortest: int
 ) -> list[str]:
@@ -82,11 +120,11 @@ def findings_of_signs(
     return found
 
 
-def findings_of_noise(differences: np.ndarray, residuals: np.ndarray) -> list[str]:
-    """Coordinates whose residuals are far above the noise from frame to frame."""
+def findings_of_noise(differences: np.ndarray, residuals: np.ndarray, first: int = 1) -> list[str]:
+    """Coordinates, from number `first`, with residuals far above the noise from frame to frame."""
     return [
-        f"Coordinate {c + 1} has residuals of {residuals[c]:.2g}, but noise of {differences[c]:.2g}"
-        " from frame to frame: is an impact missing, or do the flights bend?"
+        f"Coordinate {c + first} has residuals of {residuals[c]:.2g}, but noise of "
+        f"{differences[c]:.2g} from frame to frame: is an impact missing, or do the flights bend?"
         for c in np.flatnonzero(residuals > UNEXPLAINED * differences)
     ]
 

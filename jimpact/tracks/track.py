@@ -1,5 +1,6 @@
 """A track with its impacts, and the shots that it holds."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Any
@@ -14,6 +15,7 @@ from jimpact.fits.data import ROUNDING, Experiments
 from jimpact.tools.checks import check_kind, check_values
 from jimpact.tools.records import counted
 from jimpact.tracks.arcs import Arcs
+from jimpact.tracks.quaternions import in_the_other_order, turns_since_first
 
 # A jump of velocities lies in the cone of a scene's impulses up to so many standard errors. Ten
 # times more would pass impacts with something else than the contacts.
@@ -21,6 +23,9 @@ OUT_OF_CONE = 5.0
 # ... or up to this share of the jump, by kinetic energy: bodies and calibrations differ from their
 # model. Ten times more is all of it; ten times less drops most measured impacts of a square.
 SHARE_OUT = 0.2
+# Share of the trace by which moments of inertia may differ from those of the body of a scene. Ten
+# times more is a tenth: flights would turn otherwise by degrees.
+INERTIA_WITHIN = 0.01
 
 
 @dataclass(frozen=True)
@@ -46,7 +51,9 @@ class Track:
     `covariance` (2nK, 2nK) is that of (v-, v+) of all impacts in turn: successive ones share a
     flight. `t` (T,) and `q` (T, n) are the frames, `residual` (T, n) in units of sigma, NaN where a
     frame was not used; `units` are those of the velocities; `acceleration` (n,) that of all
-    flights.
+    flights. Of poses q is (T, 7), the quaternion's scalar first, whatever the `order` of the file;
+    residuals and sigma are those of places and of turns about the axes of the body, and `inertia`
+    is as given, None as of a sphere.
     """
 
     impacts: tuple[TrackImpact, ...]
@@ -58,11 +65,20 @@ class Track:
     t: np.ndarray
     q: np.ndarray
     arcs: Arcs = field(repr=False)
+    order: str | None = None
+    inertia: np.ndarray | None = None
 
     @property
     def residual(self) -> np.ndarray:
         """(T, n) in units of sigma; NaN where a frame was not used."""
         return self.arcs.residual
+
+    @property
+    def coordinates(self) -> np.ndarray:
+        """(T, n), q; of poses places, and turns about axes of the body since the first frame."""
+        if self.order is None:
+            return self.q
+        return np.hstack([self.q[:, :3], turns_since_first(self.q[:, 3:])])
 
     @property
     def acceleration(self) -> np.ndarray:
@@ -112,8 +128,10 @@ class Track:
                 far from 0 [m].
 
         Raises:
-            ValueError: no impact, or none that the contacts can have made; a body in space, whose
-                angular velocity is no rate of coordinates; as `Body.scenes`.
+            ValueError: no impact, or none that the contacts can have made; a body in space without
+                poses (`quaternion`), or of another inertia than `find_impacts` was given, or whose
+                contacts can have made more of the impacts in the other order of quaternions; as
+                `Body.scenes`.
         """
         if not self.impacts:
             raise ValueError("No impact was found in the track: there are no shots.")
@@ -122,15 +140,9 @@ class Track:
             check_kind("scene", scene, Scene | Body)  # type: ignore[arg-type]
             check_values("near", np.asarray(near, float), low=0.0)
             if isinstance(scene, Body) and scene.coordinates is not None:
-                raise ValueError(
-                    "Argument `scene` must not be a body in space: its angular velocity is no rate "
-                    "of coordinates. Fit its places alone (`find_impacts` of x, y, z), take the "
-                    "turning from orientations yourself, and give `ji.Experiments` the scenes of "
-                    "`body.scenes(poses)`."
-                )
-            at = _scenes(scene, np.array([each.q for each in self.impacts]), near)
-            possible = [s is not None and _can_be_of(s, i) for s, i in zip(at, self.impacts)]
-            kept = np.flatnonzero(possible)
+                self._check_in_space(scene, near)
+            at = _scenes_of(scene, self.impacts, near)
+            kept = np.array([k for k, found in enumerate(at) if found is not None], int)
             if not kept.size:
                 raise ValueError(
                     "Argument `scene` must be that of an impact of the track, but of none of "
@@ -138,7 +150,7 @@ class Track:
                     "and can have made the jump."
                 )
             scenes = [at[k] for k in kept]
-        n = self.q.shape[1]
+        n = len(self.units)
         return Experiments(
             [self.impacts[k].pre for k in kept],
             [self.impacts[k].post for k in kept],
@@ -148,16 +160,49 @@ class Track:
             units=self.units,
         )
 
+    def _check_in_space(self, body: Body, near: float) -> None:
+        """Raise unless the poses are of this body: its inertia, and the order of quaternions."""
+        if self.order is None:
+            raise ValueError(
+                "Argument `scene` must not be a body in space, whose angular velocity is no rate "
+                "of coordinates: give `find_impacts` poses, places and quaternions (`quaternion`)."
+            )
+        first = body.scenes([self.impacts[0].q], near)[0]
+        own = dense_mass(first)[3:, 3:]
+        given = np.eye(3) if self.inertia is None else self.inertia
+        apart = own / np.trace(own) - given / np.trace(given)
+        if np.abs(apart).max() > INERTIA_WITHIN:
+            raise ValueError(
+                "Argument `scene` must turn as the track was told, but has the moments of inertia "
+                f"{own.tolist()}, and `inertia` of `find_impacts` was "
+                f"{'None, as of a sphere' if self.inertia is None else given.tolist()}: give it "
+                "inertia=body.inertia."
+            )
+        if all(_scenes_of(body, self.impacts, near)):
+            return
+        turned = [in_the_other_order(each, self.order) for each in self.impacts]
+        here, other = (sum(map(bool, _scenes_of(body, x, near))) for x in (self.impacts, turned))
+        if other > here:
+            raise ValueError(
+                "Argument `quaternion` of `find_impacts` must name the order of the file, but in "
+                f"the order {self.order!r} {here} of {counted(len(turned), 'impact')} can be of "
+                f"this body, in the other one {other}."
+            )
 
-def _scenes(place: Scene | Body, poses: np.ndarray, near: float) -> list[Scene | None]:
-    """The scene of each pose (K, n); None where no gap is closed."""
+
+def _scenes_of(
+    place: Scene | Body, impacts: Sequence[TrackImpact], near: float
+) -> list[Scene | None]:
+    """The scene of each impact; None where no gap is closed, or contacts cannot have made it."""
     if isinstance(place, Scene):
-        return [place] * len(poses)
-    scenes: list[Scene | None] = list(place.scenes(poses, near))
-    for k, pose in enumerate(poses):
-        if abs(float(np.min(np.asarray(place.gap_function(pose))))) > near:
-            scenes[k] = None
-    return scenes
+        scenes: list[Scene | None] = [place] * len(impacts)
+    else:
+        poses = np.array([each.q for each in impacts])
+        scenes = list(place.scenes(poses, near))
+        for k, pose in enumerate(poses):
+            if abs(float(np.min(np.asarray(place.gap_function(pose))))) > near:
+                scenes[k] = None
+    return [s if s is not None and _can_be_of(s, i) else None for s, i in zip(scenes, impacts)]
 
 
 def _can_be_of(scene: Scene, impact: TrackImpact) -> bool:
