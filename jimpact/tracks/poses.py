@@ -33,9 +33,9 @@ def with_turns(
     """
     frames = [some[np.isfinite(e[some, 0])] for some in track.flights]
     for k, some in enumerate(frames, 1):
-        if len(some) < 3:
+        if len(some) < 2:
             raise ValueError(
-                "Argument `q` must have an orientation in 3 frames or more of each flight, but in "
+                "Argument `q` must have an orientation in 2 frames or more of each flight, but in "
                 f"flight {k} it has {len(some)}."
             )
     turns = [Rotation.from_quat(np.roll(e[some], -1, axis=1)) for some in frames]

@@ -45,42 +45,48 @@ class Turning:
         Turns are about the axes that the body has at that time.
         """
         starts = [self, *(self.moved(step) for step in SMALL * np.eye(6))]
-        each = [free_rotation(x.turn, x.omega, times - self.middle, self.inertia) for x in starts]
-        (turn, omega), others = each[0], each[1:]
-        turning = [(turn.inv() * other).as_rotvec() / SMALL for other, _ in others]
+        turns = Rotation.concatenate([x.turn for x in starts])
+        each = np.stack([x.omega for x in starts])
+        turn, omega = free_rotation(turns, each, times - self.middle, self.inertia)
+        turning = [(turn[0].inv() * other).as_rotvec() / SMALL for other in turn[1:]]
         return (
-            turn,
-            omega,
+            turn[0],
+            omega[0],
             np.stack(turning, axis=2),
-            np.stack([(other - omega) / SMALL for _, other in others], axis=2),
+            np.moveaxis((omega[1:] - omega[0]) / SMALL, 0, 2),
         )
 
 
 def free_rotation(
-    turn: Rotation, omega: np.ndarray, since: np.ndarray, inertia: np.ndarray | None
-) -> tuple[Rotation, np.ndarray]:
-    """Orientations and omega (F, 3) at times `since` (F,), rising, of a body without torque.
+    turns: Rotation, omegas: np.ndarray, since: np.ndarray, inertia: np.ndarray | None
+) -> tuple[list[Rotation], np.ndarray]:
+    """Of B starts the F orientations each, and omega (B, F, 3), at rising times `since` (F,).
 
-    Equation: `R' = R [omega]x`, `I omega' = -omega x I omega`, omega in the axes of the body.
+    Equation: `R' = R [omega]x`, `I omega' = -omega x I omega` without torque, omega in the axes of
+    the body.
     """
     if inertia is None:  # omega stays
-        return turn * Rotation.from_rotvec(since[:, None] * omega), np.tile(omega, (len(since), 1))
-    inverse = np.linalg.inv(inertia)
+        paths = [r * Rotation.from_rotvec(since[:, None] * w) for r, w in zip(turns, omegas)]
+        return paths, np.tile(omegas[:, None], (1, len(since), 1))
+    count, inverse = len(omegas), np.linalg.inv(inertia)
 
     def rates(_: float, state: np.ndarray) -> np.ndarray:
-        rows, w = state[:9].reshape(3, 3), state[9:]
-        return np.concatenate([np.cross(rows, w).ravel(), -inverse @ np.cross(w, inertia @ w)])
+        each = state.reshape(count, 4, 3)
+        rows, w = each[:, :3], each[:, 3:]
+        slope = -np.cross(w, w @ inertia) @ inverse  # both are symmetric
+        return np.concatenate([np.cross(rows, w), slope], axis=1).ravel()
 
-    start = np.concatenate([turn.as_matrix().ravel(), omega])
+    start = np.concatenate([turns.as_matrix(), omegas[:, None]], axis=1).ravel()
     states = np.tile(start, (len(since), 1))
     for some in (since < 0, since > 0):
         if some.any():
-            times = since[some] if since[some][0] > 0 else since[some][::-1]
-            path = solve_ivp(
-                rates, (0.0, times[-1]), start, "DOP853", times, rtol=RTOL, atol=RTOL
-            ).y.T
-            states[some] = path if times[0] > 0 else path[::-1]
-    return Rotation.from_matrix(states[:, :9].reshape(-1, 3, 3)), states[:, 9:]
+            # outwards from 0
+            order = np.flatnonzero(some)[:: -1 if since[some][0] < 0 else 1]
+            span = (0.0, since[order[-1]])
+            path = solve_ivp(rates, span, start, "DOP853", since[order], rtol=RTOL, atol=RTOL)
+            states[order] = path.y.T
+    states = states.reshape(len(since), count, 4, 3).swapaxes(0, 1)
+    return [Rotation.from_matrix(x[:, :3]) for x in states], states[:, :, 3]
 
 
 def fit_turning(
@@ -89,7 +95,7 @@ def fit_turning(
     """A flight by the orientations of its frames, and the turns (F, 3) [rad] that are left.
 
     Args:
-        t: (F,), F >= 3.
+        t: (F,), F >= 2.
         measured: F orientations.
         sigma: of turns about the axes of the body (3,).
         inertia: (3, 3), or None.

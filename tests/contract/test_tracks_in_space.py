@@ -174,7 +174,7 @@ def test_what_poses_must_be():
         ({"q": angles}, "frame 1 has length"),
         ({"q": zeros}, "frame 8 has length 0.* NaN"),
         ({"q": q[:, :6]}, r"shape \(T, 7\)"),
-        ({"q": turned}, "orientation in 3 frames"),
+        ({"q": turned}, "orientation in 2 frames"),
         ({"order": "wyxz"}, "`quaternion`"),
         ({"sigma": [1e-4] * 7}, r"\(6,\)"),
         ({"sigma": [1e-4] * 5 + [0.0]}, "`sigma`"),
