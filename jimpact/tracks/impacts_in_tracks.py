@@ -9,7 +9,14 @@ import numpy as np
 from jimpact.fits.shots_file import ANGULAR, LINEAR
 from jimpact.tools.checks import as_float_array, check_concrete, check_values
 from jimpact.tracks.arcs import Arcs, fit_arcs
-from jimpact.tracks.judging import findings, findings_of_input, findings_of_noise, findings_of_signs
+from jimpact.tracks.judging import (
+    findings,
+    findings_of_held,
+    findings_of_input,
+    findings_of_noise,
+    findings_of_signs,
+    free_flights,
+)
 from jimpact.tracks.poses import with_turns
 from jimpact.tracks.quaternions import as_inertia, as_poses
 from jimpact.tracks.segments import (
@@ -105,13 +112,20 @@ def find_impacts(
         )
     free = known is None
     arcs, flights = _of_true_impacts(x, q, given, flights, a, free, contact)
+    first, last = free_flights(x, q, given, arcs)
+    if last - first < len(flights):
+        flights = flights[first:last] if last > first else flights[:1]
+        notes += findings_of_held(t, flights)
+        q[: flights[0][0]], q[flights[-1][-1] + 1 :] = np.nan, np.nan
+        arcs, flights = _of_true_impacts(x, q, given, flights, a, free, contact)
     if sigma is None:  # what the residuals show; jumps are judged anew by it
         rough, given = given, _of_residuals(given, arcs, free)
         arcs, flights = _of_true_impacts(x, q, given, flights, a, free, contact)
         notes += findings_of_noise(rough, given)
     if window is not None and len(arcs.instants) > 2:
         arcs = _windowed(x, q, given, arcs, free, contact, window)
-    return _as_track(t, q, given, arcs, names, notes)
+    lines = (*notes, *findings(t, q, given, arcs))
+    return _as_track(t, _unwrapped(raw, names), given, arcs, names, lines)
 
 
 def _in_poses(
@@ -290,7 +304,7 @@ def _as_track(
     sigma: np.ndarray,
     arcs: Arcs,
     units: tuple[str, ...],
-    notes: list[str],
+    lines: tuple[str, ...],
 ) -> Track:
     """The track of these arcs, with what is wrong with it."""
     (pre, post), covariance = arcs.velocities(), arcs.covariance_of_velocities()
@@ -301,7 +315,6 @@ def _as_track(
         error = float(np.sqrt(arcs.covariance[(k + 1) * size + n, (k + 1) * size + n]))
         time, place = float(arcs.instants[k + 1] + t.mean()), arcs.places[k + 1]
         impacts.append(TrackImpact(time, error, place, before, after, covariance[own, own]))
-    lines = (*notes, *findings(t, q, sigma, arcs))
     velocity_units = tuple(VELOCITY_OF[unit] for unit in units)
     return Track(
         tuple(impacts), tuple(arcs.members), sigma, covariance, lines, velocity_units, t, q, arcs

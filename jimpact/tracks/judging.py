@@ -1,12 +1,19 @@
 """Whether a track is one of ballistic flights: what its residuals and its frames show."""
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
 from scipy.stats import chi2, norm
 
 from jimpact.tracks.arcs import Arcs
-from jimpact.tracks.segments import LOOK_BACK, cost_of_flights, curvature
+from jimpact.tracks.segments import (
+    LOOK_BACK,
+    SMALLEST_JUMP,
+    cost_of_flights,
+    curvature,
+    price,
+)
 
 # Chance that a good track has a warning: half by curvatures, half by sizes of residuals. Ten times
 # more would warn of one good track in ten.
@@ -29,6 +36,9 @@ UNEXPLAINED = 3.0
 # impact in a thousand gains less. Ten times more would doubt soft impacts; ten times less, and
 # drag or a wrong acceleration would pass as impacts.
 LEAST_GAIN = 10.8
+# Logarithm of the likelihood of "held" over "free" from which on flights at an end are left out:
+# half of the square of SMALLEST_JUMP. Ten times more would keep 10 false impacts.
+HELD = SMALLEST_JUMP**2 / 2
 
 
 def findings_of_input(q: np.ndarray, sigma: np.ndarray, units: tuple[str, ...]) -> list[str]:
@@ -138,18 +148,78 @@ def findings(t: np.ndarray, q: np.ndarray, sigma: np.ndarray, arcs: Arcs) -> lis
     return found
 
 
+def free_flights(t: np.ndarray, q: np.ndarray, sigma: np.ndarray, arcs: Arcs) -> tuple[int, int]:
+    """The first flight and the one after the last of those that are free: not held at the ends.
+
+    A body at rest, or on a table, has no acceleration where a flight has a known one; frames of it
+    are taken for short flights with impacts between. A run of flights at an end is held where one
+    parabola explains it as well, or where each is nearer to no acceleration than to that of the
+    fit: with the excess x and its error s by `(x^2 - (x + a)^2) / (2 s^2)`, the logarithm of the
+    likelihoods, summed over coordinates and flights.
+    """
+    excess, error = _excess(t, sigma, arcs)
+    held = ((excess**2 - (excess + arcs.acceleration) ** 2) / (2 * error**2)).sum(axis=1)
+
+    def run(held: np.ndarray, flights: list[np.ndarray]) -> int:
+        """How many of the last flights are held."""
+        sums = np.cumsum(held[::-1])
+        curved = int(np.argmax(sums)) + 1 if sums.size and sums.max() > HELD else 0
+        few, many = 1, len(flights)  # by bisection how many one parabola explains
+        while few < many:
+            middle = (few + many + 1) // 2
+            if _held(t, q, sigma, arcs, flights[-middle:]) < price(*q.shape) * (middle - 1):
+                few = middle
+            else:
+                many = middle - 1
+        while few > 1 and _held(t, q, sigma, arcs, flights[-few:]) - _held(
+            t, q, sigma, arcs, flights[1 - few :]
+        ) > price(*q.shape):
+            few -= 1  # the first one costs more than it would alone
+        return max(curved, few if few > 1 else 0)
+
+    last = len(held) - run(held, arcs.members)
+    return run(held[:last][::-1], arcs.members[:last][::-1]), last
+
+
+def _held(
+    t: np.ndarray, q: np.ndarray, sigma: np.ndarray, arcs: Arcs, flights: list[np.ndarray]
+) -> float:
+    """chi^2 by which one parabola explains flights less well than they do.
+
+    inf where it is nearer to a known acceleration than to none.
+    """
+    frames, known = np.sort(np.concatenate(flights)), arcs.acceleration
+    x = t[frames] - t[frames].mean()
+    more = -sum(float(np.nansum(arcs.residual[some] ** 2)) for some in flights)
+    for c, scale in enumerate(sigma):
+        ok = np.isfinite(q[frames, c])
+        if ok.sum() < 3:
+            continue
+        curve = np.vander(x[ok], 3)
+        best = np.linalg.lstsq(curve, q[frames[ok], c], rcond=None)[0]
+        more += float(np.sum((q[frames[ok], c] - curve @ best) ** 2)) / scale**2
+        if len(flights) > 1 and 2 * best[0] * known[c] > known[c] ** 2 / 2:
+            return np.inf
+    return more if known.any() else np.inf
+
+
+def findings_of_held(t: np.ndarray, flights: Sequence[np.ndarray]) -> list[str]:
+    """What a track says of the frames before the first and after the last of its free flights."""
+    why = (
+        "there are no flights of this acceleration. Perhaps the body rests, slides, rolls or is "
+        "held, it bounces faster than frames show, or the acceleration is wrong."
+    )
+    found, start, end = [], flights[0][0], flights[-1][-1]
+    if start > 0:
+        found.append(f"Up to {t[start]:.4g} s nothing is used: {why}")
+    if end < len(t) - 1:
+        found.append(f"From {t[end + 1]:.4g} s on nothing is used: {why}")
+    return found
+
+
 def _of_curvatures(t: np.ndarray, sigma: np.ndarray, arcs: Arcs) -> list[str]:
     """Flights whose acceleration is not that of the fit."""
-    excess, error = np.zeros((2, len(arcs.members), len(sigma)))
-    for i, frames in enumerate(arcs.members):
-        for c, scale in enumerate(sigma):
-            ok = frames[np.isfinite(arcs.residual[frames, c])]
-            x = t[ok] - t[ok].mean()
-            line = np.linalg.qr(np.vander(x, 2))[0]
-            curve = x**2 / 2 - line @ (line.T @ (x**2 / 2))
-            size = float(np.linalg.norm(curve))
-            error[i, c] = scale / size if size > 0 else np.inf
-            excess[i, c] = scale * float(curve @ arcs.residual[ok, c]) / size**2 if size else 0.0
+    excess, error = _excess(t, sigma, arcs)
     limit = norm.isf(FALSE_ALARMS / 4 / excess.size)
     far = np.abs(excess) > limit * error
     found = []
@@ -165,6 +235,21 @@ def _of_curvatures(t: np.ndarray, sigma: np.ndarray, arcs: Arcs) -> list[str]:
             f"{excess[i, c]:.3g} ± {error[i, c]:.2g} beyond that of the fit. Perhaps {why}."
         )
     return found
+
+
+def _excess(t: np.ndarray, sigma: np.ndarray, arcs: Arcs) -> tuple[np.ndarray, np.ndarray]:
+    """Acceleration (F, n) of each flight beyond that of the fit, and its error."""
+    excess, error = np.zeros((2, len(arcs.members), len(sigma)))
+    for i, frames in enumerate(arcs.members):
+        for c, scale in enumerate(sigma):
+            ok = frames[np.isfinite(arcs.residual[frames, c])]
+            x = t[ok] - t[ok].mean()
+            line = np.linalg.qr(np.vander(x, 2))[0]
+            curve = x**2 / 2 - line @ (line.T @ (x**2 / 2))
+            size = float(np.linalg.norm(curve))
+            error[i, c] = scale / size if size > 0 else np.inf
+            excess[i, c] = scale * float(curve @ arcs.residual[ok, c]) / size**2 if size else 0.0
+    return excess, error
 
 
 def _of_bends(t: np.ndarray, q: np.ndarray, sigma: np.ndarray, arcs: Arcs) -> list[str]:

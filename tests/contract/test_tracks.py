@@ -156,6 +156,47 @@ def test_a_window_uses_frames_near_the_impact():
     assert restitution(near.impacts[0])[1] > restitution(whole.impacts[0])[1]
 
 
+def bounces(t, e, height=0.5):
+    """Heights of a ball that is let go at 0 s, bounces and comes to rest, and when it bounces."""
+    first = np.sqrt(2 * height / G)
+    at, speed, times = first, G * first, []
+    y = np.where(t < 0, height, np.where(t < first, height - G * t**2 / 2, 0.0))
+    while speed > 1e-6:
+        times.append(at)
+        speed, since = e * speed, t - at
+        here = (since >= 0) & (since < 2 * speed / G)
+        y[here] = speed * since[here] - G * since[here] ** 2 / 2
+        at += 2 * speed / G
+    return y, np.array(times)
+
+
+@pytest.mark.parametrize(("fps", "noise"), [(60, 1e-3), (120, 1e-4), (240, 1e-3), (500, 1e-3)])
+def test_a_ball_that_comes_to_rest_has_no_impacts_there(fps, noise):
+    """Nor in the hand that holds it, half a second before."""
+    for e, seed, sigma in ((0.3, 0, None), (0.8, 1, noise)):
+        rng = np.random.default_rng(seed)
+        t = np.arange(0, 4.0, 1 / fps) + rng.random() / fps - 0.5 * (seed == 1)
+        y, times = bounces(t, e)
+        track = ji.tracks.find_impacts(
+            t, y + noise * rng.normal(size=t.size), sigma, acceleration=-G
+        )
+        found = np.array([each.time for each in track.impacts])
+        late = np.abs(found - times[: len(found)]) * fps
+        # the last one may lie between the bounces that its flight cannot tell
+        assert late[:-1].max(initial=0.0) < 1
+        heights = G * np.diff(times) ** 2 / 8
+        assert len(found) >= np.argmax((heights < 10 * noise) | (np.diff(times) * fps < 10))
+        es = np.array([restitution(each) for each in track.impacts[:-1]])
+        assert (np.abs(es[:, 0] - e) < 5 * es[:, 1]).all() if len(es) else True
+        told = [line for line in track.warnings if "nothing is used" in line]
+        assert all("rests" in line for line in told)
+        if seed and noise == 1e-3:
+            assert told[0].startswith("Up to ")
+        if noise == 1e-3:
+            time = float(told[-1].split()[1])
+            assert times[0] < time < times[-1] + 0.2
+
+
 def test_time_is_linear_and_impacts_many():
     rng = np.random.default_rng(1)
     fps, starts, t = 120, [0.0], np.arange(3000) / 120

@@ -32,7 +32,9 @@ def poses(stored: dict[str, np.ndarray], toss: int) -> tuple[np.ndarray, np.ndar
     own = stored["toss"] == toss
     turns = Rotation.from_quat(np.roll(stored["quaternion"][own], -1, axis=1))
     places = stored["position"][own].astype(float) + turns.apply(CENTRE)
-    return stored["time"][own].astype(float), np.hstack([places, np.roll(turns.as_quat(), 1, axis=1)])
+    return stored["time"][own].astype(float), np.hstack(
+        [places, np.roll(turns.as_quat(), 1, axis=1)]
+    )
 
 
 def track_of(t: np.ndarray, q: np.ndarray) -> ji.tracks.Track:
@@ -90,8 +92,12 @@ def main(path: str, count: int) -> None:
                     errors = np.concatenate([published.sigma_pre[k], published.sigma[k]])
                     apart.append([*(ours - theirs), *((ours - theirs) / errors)])
     differences, in_errors = np.split(np.abs(apart), 2, axis=1)
-    print(f"{len(tosses)} tosses, {time.perf_counter() - begun:.0f} s: {impacts} impacts, {shots} shots")
-    print(f"of {asked} published ones {len(apart)} found, {kept} as shots; {refused} tosses refused")
+    print(
+        f"{len(tosses)} tosses, {time.perf_counter() - begun:.0f} s: {impacts} impacts, {shots} shots"
+    )
+    print(
+        f"of {asked} published ones {len(apart)} found, {kept} as shots; {refused} tosses refused"
+    )
     print("medians of differences [m/s, rad/s]", np.median(differences, axis=0).round(4))
     print("in published errors", np.median(in_errors, axis=0).round(2))
     print(f"{100 * np.mean(in_errors < 2):.0f} % within two")
