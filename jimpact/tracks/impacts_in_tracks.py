@@ -9,6 +9,7 @@ import numpy as np
 from jimpact.fits.shots_file import ANGULAR, LINEAR
 from jimpact.tools.checks import as_float_array, check_concrete, check_values
 from jimpact.tracks.arcs import Arcs, fit_arcs
+from jimpact.tracks.drag import straightened
 from jimpact.tracks.judging import (
     findings,
     findings_of_held,
@@ -36,6 +37,7 @@ def find_impacts(
     sigma: Any = None,
     *,
     acceleration: Any = 0.0,
+    drag: float | None = 0.0,
     contact: float = 0.0,
     shortest: int = 5,
     window: float | None = None,
@@ -58,6 +60,8 @@ def find_impacts(
         sigma: standard errors of q, a number or (n,), > 0; None: estimated from the residuals.
         acceleration: between impacts, a number or (n,) [m/s^2]; -9.80665 of a height; None: one
             unknown in each coordinate, common to all flights.
+        drag: k >= 0 of the air's `-k |v| v`, |v| that of the places [1/m]; .12 of a table-tennis
+            ball; None: one unknown for all flights. Between impacts the arcs bend accordingly.
         contact: the longest duration of a contact, whose frames are left out, >= 0 [s].
         shortest: frames of a flight, >= 3.
         window: of each flight use only so long before and after an impact, > 0 [s], where flights
@@ -89,7 +93,13 @@ def find_impacts(
     [0.8]
     """
     if quaternion is not None or inertia is not None:
-        options = {"contact": contact, "shortest": shortest, "window": window, "units": units}
+        options = {
+            "drag": drag,
+            "contact": contact,
+            "shortest": shortest,
+            "window": window,
+            "units": units,
+        }
         return _in_poses(t, q, sigma, acceleration, quaternion, inertia, options)
     t, q, names = _checked(t, q, shortest, units)
     n = q.shape[1]
@@ -100,32 +110,83 @@ def find_impacts(
     known = None if acceleration is None else _of_coordinates("acceleration", acceleration, n)
     for name, value in (("contact", contact), ("window", 1.0 if window is None else window)):
         check_values(name, np.asarray(value, float), low=0.0, open_low=name == "window")
-    x = t - t.mean()
-    if known is not None:
-        notes += findings_of_signs(x, q, given, known, shortest)
-    flights, a = flights_and_acceleration(x, q, given, known, shortest)
+    if drag is not None:
+        check_values("drag", np.asarray(drag, float), low=0.0)
+    if drag != 0 and "rad" in names:
+        raise ValueError(
+            "Argument `drag` must be 0 where q holds angles, as it is of places, but has value "
+            f"{drag}."
+        )
+    arcs, given, more = _arcs_of(t, q, given, sigma is None, known, drag, contact, shortest, window)
+    return _as_track(t, _unwrapped(raw, names), given, arcs, names, (*notes, *more))
+
+
+def _arcs_of(
+    t: np.ndarray,
+    q: np.ndarray,
+    given: np.ndarray,
+    estimated: bool,
+    known: np.ndarray | None,
+    drag: float | None,
+    contact: float,
+    shortest: int,
+    window: float | None,
+) -> tuple[Arcs, np.ndarray, list[str]]:
+    """The arcs of all flights, standard errors (n,), `estimated` or as given, and findings."""
+    x, free, q = t - t.mean(), known is None, q.copy()
+    flights, a, k = flights_and_acceleration(x, q, given, known, shortest, drag)
+    straight = straightened(x, q, k) if k else q
+    notes = [] if known is None else findings_of_signs(x, straight, given, known, shortest)
     flights = [f for f in flights if x[f[-1]] - x[f[0]] > contact]
     if not flights:
         raise ValueError(
             "Argument `q` must hold a flight, but no frames in a row lie on an arc within sigma = "
             f"{given.tolist()} at an acceleration of {a.tolist()}: are these the units of q?"
         )
-    free = known is None
-    arcs, flights = _of_true_impacts(x, q, given, flights, a, free, contact)
-    first, last = free_flights(x, q, given, arcs)
+    arcs, flights = _of_true_impacts(x, straight, given, flights, a, free, contact)
+    first, last = free_flights(x, straight, given, arcs)
     if last - first < len(flights):
         flights = flights[first:last] if last > first else flights[:1]
         notes += findings_of_held(t, flights)
-        q[: flights[0][0]], q[flights[-1][-1] + 1 :] = np.nan, np.nan
-        arcs, flights = _of_true_impacts(x, q, given, flights, a, free, contact)
-    if sigma is None:  # what the residuals show; jumps are judged anew by it
-        rough, given = given, _of_residuals(given, arcs, free)
-        arcs, flights = _of_true_impacts(x, q, given, flights, a, free, contact)
-        notes += findings_of_noise(rough, given)
+        for places in (q, straight):
+            places[: flights[0][0]], places[flights[-1][-1] + 1 :] = np.nan, np.nan
+        arcs, flights = _of_true_impacts(x, straight, given, flights, a, free, contact)
+    rough = given
+    if estimated:  # what the residuals show; jumps are judged anew by it
+        given = _of_residuals(given, arcs)
+        arcs, flights = _of_true_impacts(x, straight, given, flights, a, free, contact)
+    unknown = (free, drag is None)
+    if drag is None:  # flights once more, by what is found
+        start = (arcs.acceleration, k, arcs.instants[1:-1])
+        arcs = _with_drag(x, q, given, flights, start, unknown, contact)
+        a, k = arcs.acceleration, arcs.drag
+        flights, *_ = flights_and_acceleration(x, q, given, a, shortest, k)
+        straight = straightened(x, q, k)
+        arcs, flights = _of_true_impacts(x, straight, given, flights, a, False, contact)
+    if drag != 0:
+        start = (arcs.acceleration, k, arcs.instants[1:-1])
+        arcs = _with_drag(x, q, given, flights, start, unknown, contact)
+        if estimated:
+            given = _of_residuals(given, arcs)
+            arcs = _with_drag(x, q, given, flights, start, unknown, contact)
+    notes += findings_of_noise(rough, given) if estimated else []
     if window is not None and len(arcs.instants) > 2:
-        arcs = _windowed(x, q, given, arcs, free, contact, window)
-    lines = (*notes, *findings(t, q, given, arcs))
-    return _as_track(t, _unwrapped(raw, names), given, arcs, names, lines)
+        arcs = _windowed(x, q, given, arcs, contact, window)
+    return arcs, given, [*notes, *findings(t, q, given, arcs)]
+
+
+def _with_drag(
+    x: np.ndarray,
+    q: np.ndarray,
+    sigma: np.ndarray,
+    flights: list[np.ndarray],
+    start: tuple[np.ndarray, float, np.ndarray],
+    free: tuple[bool, bool],
+    contact: float,
+) -> Arcs:
+    """The arcs that drag bends, from first values of acceleration, drag and instants."""
+    a, k, instants = start
+    return fit_arcs(x, q, sigma, flights, a, free[0], contact, instants, drag=k, free_drag=free[1])
 
 
 def _in_poses(
@@ -267,7 +328,6 @@ def _windowed(
     q: np.ndarray,
     sigma: np.ndarray,
     whole: Arcs,
-    free: bool,
     contact: float,
     window: float,
 ) -> Arcs:
@@ -285,15 +345,15 @@ def _windowed(
             f"Argument `window` must leave 3 frames or more of each flight, but {window:g} s leave "
             f"{min(map(len, near))}."
         )
-    start = whole.instants[1:-1]
-    return fit_arcs(x, q, sigma, near, whole.acceleration, free, contact, start)
+    start = (whole.acceleration, whole.drag, whole.instants[1:-1])
+    return _with_drag(x, q, sigma, near, start, whole.free, contact)
 
 
-def _of_residuals(sigma: np.ndarray, arcs: Arcs, free: bool) -> np.ndarray:
+def _of_residuals(sigma: np.ndarray, arcs: Arcs) -> np.ndarray:
     """Standard errors (n,) by the residuals; each coordinate bears its part of the instants."""
     n, ends = len(sigma), len(arcs.instants)
     seen = np.isfinite(arcs.residual).sum(axis=0)
-    freedom = np.maximum(seen - ends - (ends - 2) / n - free, 1.0)
+    freedom = np.maximum(seen - ends - (ends - 2) / n - arcs.free[0], 1.0)
     scale = np.sqrt(np.nansum(arcs.residual**2, axis=0) / freedom)
     return np.maximum(sigma * scale, np.finfo(float).tiny ** 0.25)
 

@@ -115,10 +115,15 @@ def _apart(
 def _changed(arcs: Arcs, change: np.ndarray) -> Arcs:
     """Arcs with other places, instants and acceleration."""
     ends = 4 * len(arcs.instants)
-    each, a = change[:ends].reshape(-1, 4), change[ends:]
-    acceleration = arcs.acceleration + (a if a.size else 0.0)
-    places, instants = arcs.places + each[:, :3], arcs.instants + each[:, 3]
-    return replace(arcs, places=places, instants=instants, acceleration=acceleration)
+    each, a, k = np.split(change, [ends, ends + 3 * arcs.free[0]])
+    each = each.reshape(-1, 4)
+    return replace(
+        arcs,
+        places=arcs.places + each[:, :3],
+        instants=arcs.instants + each[:, 3],
+        acceleration=arcs.acceleration + (a if a.size else 0.0),
+        drag=arcs.drag + float(k.sum()),
+    )
 
 
 def _with_velocities(

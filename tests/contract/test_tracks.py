@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 from commands_cases import call
+from scipy.integrate import solve_ivp
 
 import jimpact as ji
 
@@ -154,6 +155,76 @@ def test_a_window_uses_frames_near_the_impact():
     near = ji.tracks.find_impacts(t, y, 1e-3, acceleration=-G, window=0.1)
     assert sum(map(len, near.flights)) < sum(map(len, whole.flights))
     assert restitution(near.impacts[0])[1] > restitution(whole.impacts[0])[1]
+
+
+def dragged(rng, drag=0.12, sideways=0.0):
+    """A ball that the air slows, by integration of its motion; bounces with e = 0.8."""
+    t = (np.arange(90) + rng.random()) / 120
+
+    def motion(_, x):
+        v = x[3:]
+        return np.append(v, np.array([0, 0, -G]) - drag * np.linalg.norm(v) * v)
+
+    fall = solve_ivp(
+        motion, (0, 2), [0, 0, 0.5, sideways, 0, 0], rtol=1e-10, atol=1e-12, dense_output=True,
+        events=lambda _, x: x[2],
+    )  # fmt: skip
+    first, before = fall.t_events[0][0], fall.y_events[0][0]
+    after = before * [1, 1, 1, 0.7, 1, -0.8]
+    rise = solve_ivp(motion, (first, 2), after, rtol=1e-10, atol=1e-12, dense_output=True)
+    q = np.where(t < first, fall.sol(t), rise.sol(t))[:3].T
+    return t, q + 1e-3 * rng.normal(size=q.shape), before[3:], after[3:]
+
+
+@pytest.mark.parametrize("drag", [0.12, None])
+def test_drag_of_the_air_is_part_of_the_flights(drag):
+    rng, errors, warned, drags = np.random.default_rng(5), [], 0, []
+    for _ in range(40):
+        t, q, *_ = dragged(rng)
+        track = ji.tracks.find_impacts(t, q[:, 2], 1e-3, acceleration=-G, drag=drag)
+        (impact,) = track.impacts
+        value, error = restitution(impact)
+        errors.append((value - 0.8) / error)
+        warned += bool(track.warnings)
+        drags.append(track.drag)
+    assert warned <= 3
+    assert abs(np.mean(errors)) < 4 / np.sqrt(40)
+    assert 0.7 < np.std(errors) < 1.4
+    assert error < (0.0006 if drag else 0.006)
+    assert abs(np.mean(drags) - 0.12) < 0.01
+    if drag is None:
+        assert "drag 0." in str(track)
+    t, q, *_ = dragged(rng)  # and what is wrong without it
+    track = ji.tracks.find_impacts(t, q[:, 2], 1e-3, acceleration=-G)
+    near = min(track.impacts, key=lambda each: abs(each.time - 0.322))
+    assert abs(restitution(near)[0] - 0.8) > 0.015
+    assert track.warnings
+
+
+def test_drag_in_space_with_lost_frames_and_a_window():
+    rng = np.random.default_rng(6)
+    t, q, before, after = dragged(rng, 0.2, sideways=2.0)
+    q[rng.random(90) < 0.1] = np.nan
+    for options in ({}, {"window": 0.15}, {"sigma": None}):
+        choice = {"sigma": 1e-3, "acceleration": [0, 0, -G], "drag": 0.2} | options
+        (impact,) = ji.tracks.find_impacts(t, q, **choice).impacts
+        error = np.concatenate([impact.pre - before, impact.post - after])
+        assert error @ np.linalg.solve(impact.covariance, error) < 25  # chi^2 of 6: once in 3000
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"drag": -0.1}, "`drag`"),
+        ({"drag": np.nan}, "`drag`"),
+        ({"drag": 0.1, "units": "rad"}, "angles"),
+        ({"drag": 50.0}, "`drag`.*too much"),
+    ],
+)
+def test_a_drag_that_cannot_be_is_refused(options, words):
+    t, q, *_ = dragged(np.random.default_rng(6))
+    with pytest.raises(ValueError, match=words):
+        ji.tracks.find_impacts(t, q[:, 2], 1e-3, acceleration=-G, **options)
 
 
 def bounces(t, e, height=0.5):
