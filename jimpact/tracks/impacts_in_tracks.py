@@ -143,14 +143,13 @@ def _arcs_of(
             "Argument `q` must hold a flight, but no frames in a row lie on an arc within sigma = "
             f"{given.tolist()} at an acceleration of {a.tolist()}: are these the units of q?"
         )
-    arcs, flights = _of_true_impacts(x, straight, given, flights, a, free, contact)
-    first, last = free_flights(x, straight, given, arcs)
-    if last - first < len(flights):
-        flights = flights[first:last] if last > first else flights[:1]
+    kept = free_flights(x, straight, given, a, flights)
+    if len(kept) < len(flights):
+        flights = kept
         notes += findings_of_held(t, flights)
         for places in (q, straight):
             places[: flights[0][0]], places[flights[-1][-1] + 1 :] = np.nan, np.nan
-        arcs, flights = _of_true_impacts(x, straight, given, flights, a, free, contact)
+    arcs, flights = _of_true_impacts(x, straight, given, flights, a, free, contact)
     rough = given
     if estimated:  # what the residuals show; jumps are judged anew by it
         given = _of_residuals(given, arcs)

@@ -10,6 +10,7 @@ from jimpact.tracks.arcs import Arcs
 from jimpact.tracks.segments import (
     LOOK_BACK,
     SMALLEST_JUMP,
+    chi_squared,
     cost_of_flights,
     curvature,
     price,
@@ -148,59 +149,68 @@ def findings(t: np.ndarray, q: np.ndarray, sigma: np.ndarray, arcs: Arcs) -> lis
     return found
 
 
-def free_flights(t: np.ndarray, q: np.ndarray, sigma: np.ndarray, arcs: Arcs) -> tuple[int, int]:
-    """The first flight and the one after the last of those that are free: not held at the ends.
+def free_flights(
+    t: np.ndarray,
+    q: np.ndarray,
+    sigma: np.ndarray,
+    acceleration: np.ndarray,
+    flights: list[np.ndarray],
+) -> list[np.ndarray]:
+    """The flights without those at both ends in which the body is held; one at least.
 
     A body at rest, or on a table, has no acceleration where a flight has a known one; frames of it
     are taken for short flights with impacts between. A run of flights at an end is held where one
-    parabola explains it as well, or where each is nearer to no acceleration than to that of the
-    fit: with the excess x and its error s by `(x^2 - (x + a)^2) / (2 s^2)`, the logarithm of the
+    parabola explains it as well, or where each is nearer to no acceleration than to the known one:
+    with the excess x and its error s by `(x^2 - (x + a)^2) / (2 s^2)`, the logarithm of the
     likelihoods, summed over coordinates and flights.
     """
-    excess, error = _excess(t, sigma, arcs)
-    held = ((excess**2 - (excess + arcs.acceleration) ** 2) / (2 * error**2)).sum(axis=1)
+    if not acceleration.any():
+        return flights
+    excess, error = _excess(t, (q - acceleration * t[:, None] ** 2 / 2) / sigma, sigma, flights)
+    held = ((excess**2 - (excess + acceleration) ** 2) / (2 * error**2)).sum(axis=1)
+    alone = np.array([chi_squared(t, q, sigma, acceleration, some) for some in flights])
+    start = price(*q.shape)
 
-    def run(held: np.ndarray, flights: list[np.ndarray]) -> int:
-        """How many of the last flights are held."""
-        sums = np.cumsum(held[::-1])
+    def more(run: np.ndarray) -> float:
+        """chi^2 by which one parabola explains a run of flights less well than they do."""
+        frames = np.sort(np.concatenate([flights[k] for k in run]))
+        return _of_one_parabola(t, q, sigma, acceleration, frames) - float(alone[run].sum())
+
+    def count(order: np.ndarray) -> int:
+        """How many of the first flights in this order are held."""
+        sums = np.cumsum(held[order])
         curved = int(np.argmax(sums)) + 1 if sums.size and sums.max() > HELD else 0
-        few, many = 1, len(flights)  # by bisection how many one parabola explains
+        few, many = 1, len(order)  # by bisection how many one parabola explains
         while few < many:
             middle = (few + many + 1) // 2
-            if _held(t, q, sigma, arcs, flights[-middle:]) < price(*q.shape) * (middle - 1):
+            if more(order[:middle]) < start * (middle - 1):
                 few = middle
             else:
                 many = middle - 1
-        while few > 1 and _held(t, q, sigma, arcs, flights[-few:]) - _held(
-            t, q, sigma, arcs, flights[1 - few :]
-        ) > price(*q.shape):
-            few -= 1  # the first one costs more than it would alone
+        while few > 1 and more(order[:few]) - more(order[: few - 1]) > start:
+            few -= 1  # the last one costs more than it would alone
         return max(curved, few if few > 1 else 0)
 
-    last = len(held) - run(held, arcs.members)
-    return run(held[:last][::-1], arcs.members[:last][::-1]), last
+    last = len(flights) - count(np.arange(len(flights))[::-1])
+    first = count(np.arange(last))
+    return flights[first:last] if last > first else flights[:1]
 
 
-def _held(
-    t: np.ndarray, q: np.ndarray, sigma: np.ndarray, arcs: Arcs, flights: list[np.ndarray]
+def _of_one_parabola(
+    t: np.ndarray, q: np.ndarray, sigma: np.ndarray, acceleration: np.ndarray, frames: np.ndarray
 ) -> float:
-    """chi^2 by which one parabola explains flights less well than they do.
-
-    inf where it is nearer to a known acceleration than to none.
-    """
-    frames, known = np.sort(np.concatenate(flights)), arcs.acceleration
-    x = t[frames] - t[frames].mean()
-    more = -sum(float(np.nansum(arcs.residual[some] ** 2)) for some in flights)
-    for c, scale in enumerate(sigma):
+    """chi^2 of frames on one parabola; inf where it is nearer to a known acceleration than to 0."""
+    x, total = t[frames] - t[frames].mean(), 0.0
+    for c, known in enumerate(acceleration):
         ok = np.isfinite(q[frames, c])
         if ok.sum() < 3:
             continue
         curve = np.vander(x[ok], 3)
         best = np.linalg.lstsq(curve, q[frames[ok], c], rcond=None)[0]
-        more += float(np.sum((q[frames[ok], c] - curve @ best) ** 2)) / scale**2
-        if len(flights) > 1 and 2 * best[0] * known[c] > known[c] ** 2 / 2:
+        if 2 * best[0] * known > known**2 / 2:
             return np.inf
-    return more if known.any() else np.inf
+        total += float(np.sum((q[frames[ok], c] - curve @ best) ** 2)) / sigma[c] ** 2
+    return total
 
 
 def findings_of_held(t: np.ndarray, flights: Sequence[np.ndarray]) -> list[str]:
@@ -219,7 +229,7 @@ def findings_of_held(t: np.ndarray, flights: Sequence[np.ndarray]) -> list[str]:
 
 def _of_curvatures(t: np.ndarray, sigma: np.ndarray, arcs: Arcs) -> list[str]:
     """Flights whose acceleration is not that of the fit."""
-    excess, error = _excess(t, sigma, arcs)
+    excess, error = _excess(t, arcs.residual, sigma, arcs.members)
     limit = norm.isf(FALSE_ALARMS / 4 / excess.size)
     far = np.abs(excess) > limit * error
     found = []
@@ -237,18 +247,20 @@ def _of_curvatures(t: np.ndarray, sigma: np.ndarray, arcs: Arcs) -> list[str]:
     return found
 
 
-def _excess(t: np.ndarray, sigma: np.ndarray, arcs: Arcs) -> tuple[np.ndarray, np.ndarray]:
-    """Acceleration (F, n) of each flight beyond that of the fit, and its error."""
-    excess, error = np.zeros((2, len(arcs.members), len(sigma)))
-    for i, frames in enumerate(arcs.members):
+def _excess(
+    t: np.ndarray, rest: np.ndarray, sigma: np.ndarray, flights: Sequence[np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Acceleration (F, n) of what is left (T, n) in each flight, in sigma, and its error."""
+    excess, error = np.zeros((2, len(flights), len(sigma)))
+    for i, frames in enumerate(flights):
         for c, scale in enumerate(sigma):
-            ok = frames[np.isfinite(arcs.residual[frames, c])]
+            ok = frames[np.isfinite(rest[frames, c])]
             x = t[ok] - t[ok].mean()
             line = np.linalg.qr(np.vander(x, 2))[0]
             curve = x**2 / 2 - line @ (line.T @ (x**2 / 2))
             size = float(np.linalg.norm(curve))
             error[i, c] = scale / size if size > 0 else np.inf
-            excess[i, c] = scale * float(curve @ arcs.residual[ok, c]) / size**2 if size else 0.0
+            excess[i, c] = scale * float(curve @ rest[ok, c]) / size**2 if size else 0.0
     return excess, error
 
 

@@ -268,6 +268,13 @@ def test_a_ball_that_comes_to_rest_has_no_impacts_there(fps, noise):
             assert times[0] < time < times[-1] + 0.2
 
 
+def test_a_window_that_leaves_too_few_frames_is_refused():
+    t, y, _ = ball(np.random.default_rng(2))
+    for window in (1e-6, 0.012):
+        with pytest.raises(ValueError, match="`window` must leave 3 frames or more"):
+            ji.tracks.find_impacts(t, y, 1e-3, acceleration=-G, window=window)
+
+
 def test_time_is_linear_and_impacts_many():
     rng = np.random.default_rng(1)
     fps, starts, t = 120, [0.0], np.arange(3000) / 120
@@ -346,6 +353,11 @@ def test_bounce_times_reach_the_bound():
         ({"q": np.zeros((5, 1))}, "shapes"),
         ({"units": "deg"}, "'rad'"),
         ({"contact": -1.0}, "contact"),
+        ({"contact": np.inf}, "contact"),
+        ({"acceleration": [1.0, 2.0]}, "acceleration"),
+        ({"t": np.arange(6.0)[:, None]}, "shapes"),
+        ({"q": np.full(6, np.inf)}, "q"),
+        ({"inertia": [1.0, 1.0, 2.0]}, "`quaternion` must name"),
         ({"window": 0.0}, "window"),
         ({"shortest": 2}, "shortest"),
     ],
