@@ -197,3 +197,46 @@ def test_turns_that_do_not_meet_are_told():
     t, q = seen(landed(CUBE)[0], np.random.default_rng(6))
     late = np.hstack([q[1:, :3], q[:-1, 3:]])
     assert any("do not meet" in line for line in found(t[1:], late).warnings)
+
+
+def test_a_study_of_poses(tmp_path):
+    t, q = seen(landed(CUBE)[0], np.random.default_rng(7))
+    names = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
+    rows = np.column_stack([t, q[:, TO_XYZW]])
+    lines = [",".join(names), *(",".join(f"{x:.7f}" for x in row) for row in rows)]
+    (tmp_path / "cube.csv").write_text("\n".join(lines))
+    study = """
+    [scene]
+    kind = "Box"
+    sizes_m = [0.1, 0.1, 0.1]
+    mass_kg = 0.3
+    q = [0.0, 0.0, 0.05, 1.0, 0.0, 0.0, 0.0]
+    [law]
+    name = "Newton"
+    restitution = 0.5
+    friction = 0.1
+    [track]
+    file = "cube.csv"
+    time = "t"
+    columns = ["x", "y", "z", "qx", "qy", "qz", "qw"]
+    unit = ["m", "m", "m", "1", "1", "1", "1"]
+    quaternion = "xyzw"
+    acceleration = [0.0, 0.0, -9.80665]
+    """
+    path = tmp_path / "study.toml"
+    path.write_text(study)
+    data = ji.read_study(path).experiments
+    assert data.contacts.tolist() == [1]
+    np.testing.assert_allclose(data.pre[0], BEFORE, atol=0.02)
+    for old, new, words in (
+        ('"xyzw"', '"zyxw"', "`quaternion`"),
+        ('"xyzw"', "4", "`quaternion` in .* must be a text"),
+        ('quaternion = "xyzw"', "", "7"),
+        ('"xyzw"', '"xyzw"\n    inertia = [1.0, 1.0, 2.0]', "moments of inertia"),
+        ('"xyzw"', '"xyzw"\n    drag = "much"', "`drag` in .* must be a number"),
+    ):
+        path.write_text(study.replace(old, new))
+        with pytest.raises(ValueError, match=words):
+            ji.read_study(path)
+    path.write_text(study.replace('"xyzw"', '"xyzw"\n    drag = "unknown"'))
+    assert abs(ji.read_study(path).track.drag) < 1.0
