@@ -1,15 +1,11 @@
 """Poses as a tracker writes them: the order of the quaternion, its length, moments of inertia."""
 
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jimpact.tools.checks import check_choice
-
-if TYPE_CHECKING:
-    from jimpact.tracks.track import TrackImpact
 
 ORDERS = {"wxyz": (1, 2, 3, 0), "xyzw": (0, 1, 2, 3)}  # where x, y, z, w stand
 # How far a measured quaternion may be from length 1; with three digits it is off by less. Ten times
@@ -63,25 +59,15 @@ def turns_since_first(e: np.ndarray) -> np.ndarray:
     return sums
 
 
-def in_the_other_order(impact: "TrackImpact", order: str) -> "TrackImpact":
-    """The impact as it were if the quaternions stood in the other order than `order`.
+def in_the_other_order(e: np.ndarray, order: str) -> tuple[np.ndarray, np.ndarray]:
+    """The quaternion (4,) if the file stood in the other order than `order`, and A (3, 3).
 
     Poses turn evenly in either order, as it turns the unit sphere of quaternions only: frames
     alone cannot tell. omega = 2 e* e' becomes A omega.
     """
-    e, shift = impact.q[3:], 1 if order == "wxyz" else -1
+    shift = 1 if order == "wxyz" else -1
     other = np.roll(e, shift)
-    A = (_left(other).T @ np.roll(_left(e), shift, axis=0))[1:, 1:]
-    gain = np.eye(12)
-    gain[3:6, 3:6] = gain[9:, 9:] = A
-    pre, post = np.split(gain @ np.concatenate([impact.pre, impact.post]), 2)
-    return replace(
-        impact,
-        q=np.append(impact.q[:3], other),
-        pre=pre,
-        post=post,
-        covariance=gain @ impact.covariance @ gain.T,
-    )
+    return other, (_left(other).T @ np.roll(_left(e), shift, axis=0))[1:, 1:]
 
 
 def _left(e: np.ndarray) -> np.ndarray:

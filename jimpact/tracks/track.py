@@ -1,7 +1,7 @@
 """A track with its impacts, and the shots that it holds."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 from typing import Any
 
@@ -42,6 +42,15 @@ class TrackImpact:
     pre: np.ndarray
     post: np.ndarray
     covariance: np.ndarray
+
+    def not_in(self, order: str) -> "TrackImpact":
+        """The impact of a pose as if the file stood in the other order than `order`."""
+        other, A = in_the_other_order(self.q[3:], order)
+        gain = np.eye(12)
+        gain[3:6, 3:6] = gain[9:, 9:] = A
+        pre, post = np.split(gain @ np.concatenate([self.pre, self.post]), 2)
+        q, covariance = np.append(self.q[:3], other), gain @ self.covariance @ gain.T
+        return replace(self, q=q, pre=pre, post=post, covariance=covariance)
 
 
 @dataclass(frozen=True)
@@ -187,7 +196,7 @@ class Track:
             )
         if all(_scenes_of(body, self.impacts, near)):
             return
-        turned = [in_the_other_order(each, self.order) for each in self.impacts]
+        turned = [each.not_in(self.order) for each in self.impacts]
         here, other = (sum(map(bool, _scenes_of(body, x, near))) for x in (self.impacts, turned))
         # a few close a gap by chance, as a cube looks the same from many sides
         if other > 2 * here + 1 or other > here == 0:
