@@ -37,6 +37,9 @@ UNEXPLAINED = 3.0
 # impact in a thousand gains less. Ten times more would doubt soft impacts; ten times less, and
 # drag or a wrong acceleration would pass as impacts.
 LEAST_GAIN = 10.8
+# Logarithm of the odds, 20 to 1, from which on a body is held in one flight. Ten times more would
+# keep most false flights of a body that slides, of a few frames each.
+HELD_ODDS = 3.0
 # Logarithm of the likelihood of "held" over "free" from which on flights at an end are left out:
 # half of the square of SMALLEST_JUMP. Ten times more would keep 10 false impacts.
 HELD = SMALLEST_JUMP**2 / 2
@@ -160,14 +163,12 @@ def free_flights(
 
     A body at rest, or on a table, has no acceleration where a flight has a known one; frames of it
     are taken for short flights with impacts between. A run of flights at an end is held where one
-    parabola explains it as well, or where each is nearer to no acceleration than to the known one:
-    with the excess x and its error s by `(x^2 - (x + a)^2) / (2 s^2)`, the logarithm of the
-    likelihoods, summed over coordinates and flights.
+    parabola explains it as well, or by the sum of `held_rather` over it.
     """
     if not acceleration.any():
         return flights
-    excess, error = _excess(t, (q - acceleration * t[:, None] ** 2 / 2) / sigma, sigma, flights)
-    held = ((excess**2 - (excess + acceleration) ** 2) / (2 * error**2)).sum(axis=1)
+    rest = (q - acceleration * t[:, None] ** 2 / 2) / sigma
+    held = held_rather(t, rest, sigma, acceleration, flights)
     alone = np.array([chi_squared(t, q, sigma, acceleration, some) for some in flights])
     start = price(*q.shape)
 
@@ -194,6 +195,49 @@ def free_flights(
     last = len(flights) - count(np.arange(len(flights))[::-1])
     first = count(np.arange(last))
     return flights[first:last] if last > first else flights[:1]
+
+
+def held_flights(
+    t: np.ndarray,
+    q: np.ndarray,
+    sigma: np.ndarray,
+    acceleration: np.ndarray,
+    flights: Sequence[np.ndarray],
+) -> np.ndarray:
+    """Whether the body is held in each flight (F,): by itself, or in a run on one parabola."""
+    if not acceleration.any():
+        return np.zeros(len(flights), bool)
+    rest = (q - acceleration * t[:, None] ** 2 / 2) / sigma
+    held = held_rather(t, rest, sigma, acceleration, flights) > HELD_ODDS
+    alone = [chi_squared(t, q, sigma, acceleration, frames) for frames in flights]
+    start, first = price(*q.shape), 0
+    while first < len(flights):
+        last, run, sum_of_run = first, flights[first], alone[first]
+        while last + 1 < len(flights):
+            longer = np.concatenate([run, flights[last + 1]])
+            sum_of_longer = _of_one_parabola(t, q, sigma, acceleration, longer)
+            if not sum_of_longer < sum_of_run + alone[last + 1] + start:
+                break
+            last, run, sum_of_run = last + 1, longer, sum_of_longer
+        held[first : last + 1] |= last > first
+        first = last + 1
+    return held
+
+
+def held_rather(
+    t: np.ndarray,
+    rest: np.ndarray,
+    sigma: np.ndarray,
+    acceleration: np.ndarray,
+    flights: Sequence[np.ndarray],
+) -> np.ndarray:
+    """Logarithm (F,) of the likelihood that a body is held in a flight over that it is free.
+
+    Equation: with the excess x of its acceleration over the known a, and the error s of x, the sum
+    of `(x^2 - (x + a)^2) / (2 s^2)` over coordinates. `rest` (T, n) is what a fit leaves, in sigma.
+    """
+    excess, error = _excess(t, rest, sigma, flights)
+    return np.asarray(((excess**2 - (excess + acceleration) ** 2) / (2 * error**2)).sum(axis=1))
 
 
 def _of_one_parabola(

@@ -15,6 +15,7 @@ from jimpact.fits.data import ROUNDING, Experiments
 from jimpact.tools.checks import check_kind, check_values
 from jimpact.tools.records import counted
 from jimpact.tracks.arcs import Arcs
+from jimpact.tracks.judging import held_flights
 from jimpact.tracks.quaternions import in_the_other_order, turns_since_first
 
 # A jump of velocities lies in the cone of a scene's impulses up to so many standard errors. Ten
@@ -133,7 +134,8 @@ class Track:
 
         With a scene or a body only those stay that its contacts can have made: one approaches, the
         lowest gap of the body is closed at the pose of the impact, and the change of momentum is
-        one of contacts that push (with any friction), within 5 standard errors or a fifth of it. A
+        one of contacts that push (with any friction), within 5 standard errors or a fifth of it;
+        and in both flights the body is free, not nearer to no acceleration than to a known one. A
         chain counts coordinates and velocities towards its right end: of bodies that move the other
         way round, mirror the track (-q, and the bodies in reverse).
 
@@ -158,12 +160,13 @@ class Track:
             if isinstance(scene, Body) and scene.coordinates is not None:
                 self._check_in_space(scene, near)
             at = _scenes_of(scene, self.impacts, near)
-            kept = np.array([k for k, found in enumerate(at) if found is not None], int)
+            free = self._between_free_flights()
+            kept = np.array([k for k, s in enumerate(at) if s is not None and free[k]], int)
             if not kept.size:
                 raise ValueError(
                     "Argument `scene` must be that of an impact of the track, but of none of "
                     f"{len(self.impacts)} a contact is closed within near = {near:g} m, approaches "
-                    "and can have made the jump."
+                    "and can have made the jump, between flights in which the body is free."
                 )
             scenes = [at[k] for k in kept]
         n = len(self.units)
@@ -175,6 +178,13 @@ class Track:
             shots=[str(k + 1) for k in kept],
             units=self.units,
         )
+
+    def _between_free_flights(self) -> np.ndarray:
+        """Whether the body is held neither before nor after each impact (K,)."""
+        n = len(self.acceleration)
+        places, sigma = self.q[:, :n], self.sigma[:n]
+        held = held_flights(self.t, places, sigma, self.acceleration, self.flights)
+        return ~(held[:-1] | held[1:])
 
     def _check_in_space(self, body: Body, near: float) -> None:
         """Raise unless the poses are of this body: its inertia, and the order of quaternions."""

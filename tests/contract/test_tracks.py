@@ -268,6 +268,34 @@ def test_a_ball_that_comes_to_rest_has_no_impacts_there(fps, noise):
             assert times[0] < time < times[-1] + 0.2
 
 
+def test_a_body_that_is_held_in_the_middle_of_a_track_has_no_shots_there():
+    """A disc bounces once, sticks to the table for half a second, and is thrown up again."""
+    rng, t = np.random.default_rng(3), np.arange(300) / 240
+    heights = [
+        (0.0, 0.2, 0.0),  # from when on, height above the table, velocity upwards
+        (np.sqrt(0.4 / G), 0.0, 1.0),
+        (np.sqrt(0.4 / G) + 2 / G, None, 0.0),
+        (np.sqrt(0.4 / G) + 2 / G + 0.5, 0.0, 2.0),
+    ]
+    y = np.zeros(300)
+    for begins, height, speed in heights:
+        since = t - begins
+        flight = 0.0 if height is None else height + speed * since - G * since**2 / 2
+        y = np.where(since >= 0, flight, y)
+    q = np.column_stack([0.3 * t, 0.05 + y, 2.0 * t]) + [3e-4, 3e-4, 3e-3] * rng.normal(
+        size=(300, 3)
+    )
+    track = ji.tracks.find_impacts(
+        t, q, [3e-4, 3e-4, 3e-3], acceleration=[0, -G, 0], units=["m", "m", "rad"]
+    )
+    assert len(track.impacts) > 4
+    shots = track.experiments(ji.Disc(0.05))
+    assert shots.shots == ("1",)
+    np.testing.assert_allclose(
+        [shots.pre[0, 1], shots.post[0, 1]], [-np.sqrt(0.4 * G), 1.0], atol=0.02
+    )
+
+
 def test_a_window_that_leaves_too_few_frames_is_refused():
     t, y, _ = ball(np.random.default_rng(2))
     for window in (1e-6, 0.012):

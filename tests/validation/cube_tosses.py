@@ -24,6 +24,7 @@ ERRORS = [1e-4] * 3 + [1e-3] * 3
 GRAVITY = 9.604  # [m/s^2] in the lengths of the file, which are 2 % short
 CONTACT = 2e-3  # [s] a contact lasts 1.7 ms
 NEAR = 3e-3  # [m] the corners are round by 3.6 mm, the board is flat to 1.4 mm
+RATE = 148  # frames a second
 APART = 1.5  # frames by which a published impact may be earlier or later
 
 
@@ -51,56 +52,55 @@ def track_of(t: np.ndarray, q: np.ndarray) -> ji.tracks.Track:
     )
 
 
+def compared(stored: dict[str, np.ndarray], tosses: np.ndarray) -> tuple[list[int], np.ndarray]:
+    """Counts, and differences from published velocities (K, 12) in their errors beside those.
+
+    Counts are impacts, shots, published impacts, those found as impacts and as shots.
+    """
+    published, counts, apart = ji.data.cube_impacts(nearly_clean=True), [0] * 5, []
+    known: dict[int, list[tuple[int, int]]] = {}
+    for k, label in enumerate(published.shots):
+        toss, frame = map(int, label.split(":"))
+        known.setdefault(toss, []).append((frame, k))
+    for toss in tosses:
+        track = track_of(*poses(stored, toss))
+        try:
+            shots = set(track.experiments(CUBE, NEAR).shots)
+        except ValueError as error:  # of one impact, or none, that is no shot
+            print(f"toss {toss}: {error}")
+            shots = set()
+        counts[0] += len(track.impacts)
+        counts[1] += len(shots)
+        frames = np.array([each.time for each in track.impacts]) * RATE - 0.5
+        for frame, k in known.get(int(toss), []):
+            counts[2] += 1
+            if not frames.size or abs(frames - frame).min() > APART:
+                continue
+            i = int(np.argmin(np.abs(frames - frame)))
+            counts[3] += 1
+            if str(i + 1) in shots:
+                counts[4] += 1
+                ours = np.concatenate([track.impacts[i].pre, track.impacts[i].post])
+                theirs = np.concatenate([published.pre[k], published.post[k]])
+                errors = np.concatenate([published.sigma_pre[k], published.sigma[k]])
+                apart.append([ours - theirs, (ours - theirs) / errors])
+    return counts, np.array(apart)
+
+
 def main(path: str, count: int) -> None:
     """Print how many published impacts are found, and how far they are apart."""
     jax.config.update("jax_enable_x64", True)
     with np.load(path) as file:
         stored = {name: file[name] for name in file.files}
-    published = ji.data.cube_impacts(nearly_clean=True)
-    known: dict[int, list[tuple[int, int]]] = {}
-    for k, label in enumerate(published.shots):
-        toss, frame = map(int, label.split(":"))
-        known.setdefault(toss, []).append((frame, k))
     tosses, begun = np.unique(stored["toss"])[:count], time.perf_counter()
-    impacts, shots, asked, apart, kept, refused = 0, 0, 0, [], 0, 0
-    for toss in tosses:
-        t, q = poses(stored, toss)
-        try:
-            track = track_of(t, q)
-        except ValueError as error:
-            print(toss, error)
-            refused += 1
-            asked += len(known.get(int(toss), []))
-            continue
-        impacts += len(track.impacts)
-        try:
-            possible = set(track.experiments(CUBE, NEAR).shots)
-        except ValueError as error:
-            print(toss, error)
-            possible = set()
-        shots += len(possible)
-        times = np.array([each.time for each in track.impacts]) * 148
-        for frame, k in known.get(int(toss), []):
-            asked += 1
-            i = int(np.argmin(np.abs(times - frame - 0.5)))
-            if abs(times[i] - frame - 0.5) < APART:
-                kept += str(i + 1) in possible
-                if str(i + 1) in possible:
-                    each = track.impacts[i]
-                    ours = np.concatenate([each.pre, each.post])
-                    theirs = np.concatenate([published.pre[k], published.post[k]])
-                    errors = np.concatenate([published.sigma_pre[k], published.sigma[k]])
-                    apart.append([*(ours - theirs), *((ours - theirs) / errors)])
-    differences, in_errors = np.split(np.abs(apart), 2, axis=1)
-    print(
-        f"{len(tosses)} tosses, {time.perf_counter() - begun:.0f} s: {impacts} impacts, {shots} shots"
-    )
-    print(
-        f"of {asked} published ones {len(apart)} found, {kept} as shots; {refused} tosses refused"
-    )
-    print("medians of differences [m/s, rad/s]", np.median(differences, axis=0).round(4))
-    print("in published errors", np.median(in_errors, axis=0).round(2))
-    print(f"{100 * np.mean(in_errors < 2):.0f} % within two")
+    (impacts, shots, asked, found, kept), apart = compared(stored, tosses)
+    took = time.perf_counter() - begun
+    print(f"{len(tosses)} tosses, {took:.0f} s: {impacts} impacts, {shots} of them shots")
+    print(f"of {asked} published impacts {found} are found, {kept} as shots")
+    sizes = np.median(np.abs(apart), axis=0)
+    print("medians of differences before and after [m/s, rad/s]:", sizes[0].round(4))
+    print("in published errors:", sizes[1].round(2))
+    print(f"{100 * np.mean(np.abs(apart[:, 1]) < 2):.0f} % lie within two")
 
 
 if __name__ == "__main__":

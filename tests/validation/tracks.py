@@ -299,6 +299,14 @@ def cube() -> str:
     )
 
 
+def shots_of(track: ji.tracks.Track, body: ji.Body, near: float) -> set[str]:
+    """The numbers of the impacts that are shots of the body."""
+    try:
+        return set(track.experiments(body, near).shots)
+    except ValueError:  # none is
+        return set()
+
+
 def square() -> str:
     """Impacts of `ji.data.square_drops` beside those of `ji.data.square_impacts`."""
     drops, t, poses = ji.data.square_drops()
@@ -308,13 +316,14 @@ def square() -> str:
     for k, label in enumerate(published.shots):
         drop, frame = label.split(":")
         known.setdefault(int(drop), []).append((float(frame), k))
-    found, asked, possible, apart = 0, 0, 0, []
+    found, asked, possible, shots, apart = 0, 0, 0, 0, []
     for drop, q in zip(drops, poses):
         track = ji.tracks.find_impacts(
             t, q, SQUARE_ERRORS, acceleration=[0, -9.81, 0], units=["m", "m", "rad"]
         )
         found += len(track.impacts)
-        kept = set(track.experiments(body, ROUNDED).shots)
+        kept = shots_of(track, body, ROUNDED)
+        shots += len(kept)
         times = 250 * np.array([each.time for each in track.impacts])
         for frame, k in known.get(int(drop), []):
             asked, i = asked + 1, int(np.argmin(np.abs(times - frame)))
@@ -326,7 +335,7 @@ def square() -> str:
     middle = ", ".join(f"{x:.1f}" for x in np.median(np.abs(apart), axis=0))
     within = 100 * np.mean(np.abs(apart) < 2)
     return (
-        f"square: {found} impacts in {len(drops)} drops, sliding and rest included; of {asked} "
+        f"square: {found} impacts in {len(drops)} drops, {shots} of them shots; of {asked} "
         f"published ones {len(apart)} are found, {possible} of them as shots; differences in "
         f"published errors, medians of vx, vy, angle before and after: {middle}; {within:.0f} % "
         "within two"
