@@ -170,7 +170,9 @@ def _arcs_of(
             arcs = _with_drag(x, q, given, flights, start, unknown, contact)
     notes += findings_of_noise(rough, given) if estimated else []
     if window is not None and len(arcs.instants) > 2:
+        whole = np.concatenate(arcs.members)
         arcs = _windowed(x, q, given, arcs, contact, window)
+        q[np.setdiff1d(whole, np.concatenate(arcs.members))] = np.nan  # no frames that do not fit
     return arcs, given, [*notes, *findings(t, q, given, arcs)]
 
 

@@ -154,6 +154,7 @@ def test_a_window_uses_frames_near_the_impact():
     whole = ji.tracks.find_impacts(t, y, 1e-3, acceleration=-G)
     near = ji.tracks.find_impacts(t, y, 1e-3, acceleration=-G, window=0.1)
     assert sum(map(len, near.flights)) < sum(map(len, whole.flights))
+    assert near.warnings == whole.warnings == ()
     assert restitution(near.impacts[0])[1] > restitution(whole.impacts[0])[1]
 
 
