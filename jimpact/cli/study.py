@@ -127,8 +127,9 @@ def read_study(path: str | Path, law: str | None = None) -> Study | MotionStudy:
       can be compared, not fitted.
     - `[track]`, in the place of `[data]`: file (relative to the study), and the arguments of
       `ji.tracks.read` and `ji.tracks.find_impacts` by their names (columns, unit, time or rate,
-      decimal; sigma, acceleration, contact, shortest, window); acceleration = "unknown" is None;
-      of a body near_m. The study's `track` holds the impacts.
+      decimal; sigma, acceleration, drag, contact, shortest, window; of poses quaternion, inertia);
+      "unknown" of acceleration or drag is None; of a body near_m. The study's `track` holds the
+      impacts.
     - `[bounces]`, in the place of `[data]`: times, sigma, gravity, see `ji.tracks.bounce_times`.
     - `[monte_carlo]`: velocity_m_per_s, gaps_m, law, samples, seed, chunk, bins; see
       `monte_carlo`.

@@ -16,16 +16,16 @@ if TYPE_CHECKING:
 # Keys of [track]: the arguments of `ji.tracks.read` and of `find_impacts`, by their names, and that
 # of `Track.experiments`; of [bounces]: the arguments of `ji.tracks.bounce_times`.
 READ = ("columns", "time", "rate", "unit", "decimal")
-FOUND = ("sigma", "acceleration", "contact", "shortest", "window")
+FOUND = ("sigma", "acceleration", "drag", "contact", "shortest", "window", "quaternion", "inertia")
 TRACK = ("file", *READ, *FOUND, "near_m")
 BOUNCES = ("times", "sigma", "gravity")
-UNKNOWN = "unknown"  # what a study writes where an acceleration is None
+UNKNOWN = "unknown"  # what a study writes where an acceleration or a drag is None
 _NUMBER, _NUMBERS = (int | float, "a number"), (int | float | list, "a number or a list of numbers")
 _KINDS = {
-    **dict.fromkeys(("file", "time", "decimal"), (str, "a text")),
+    **dict.fromkeys(("file", "time", "decimal", "quaternion"), (str, "a text")),
     **dict.fromkeys(("columns", "unit"), (str | list, "a text or a list of texts")),
-    **dict.fromkeys(("rate", "contact", "window", "near_m", "gravity"), _NUMBER),
-    **dict.fromkeys(("sigma", "acceleration"), _NUMBERS),
+    **dict.fromkeys(("rate", "drag", "contact", "window", "near_m", "gravity"), _NUMBER),
+    **dict.fromkeys(("sigma", "acceleration", "inertia"), _NUMBERS),
     **{"shortest": (int, "a whole number"), "times": (list, "a list of numbers")},
 }
 
@@ -34,15 +34,16 @@ def track_of(table: Mapping[str, Any], study: Path) -> "Track":
     """The track that the table [track] describes, with its impacts."""
     check_keys("[track]", table, TRACK, ("file", "columns", "unit"))
     choice = dict(table)
-    if choice.get("acceleration") == UNKNOWN:
-        choice["acceleration"] = None
+    choice |= {key: None for key in ("acceleration", "drag") if choice.get(key) == UNKNOWN}
     _check_kinds("[track]", {key: x for key, x in choice.items() if x is not None})
     try:
         t, q = ji.tracks.read(study.parent / choice["file"], **_only(choice, READ))
         unit = choice["unit"]
         stated = [unit] * q.shape[1] if isinstance(unit, str) else unit
         units = ["rad" if each in ("rad", "deg") else "m" for each in stated]
-        return ji.tracks.find_impacts(t, q, units=units, **_only(choice, FOUND))
+        of_poses = "quaternion" in choice
+        options = _only(choice, FOUND)
+        return ji.tracks.find_impacts(t, q, units=None if of_poses else units, **options)
     except (ValueError, TypeError) as error:
         raise ValueError(f"[track]: {error}") from None
 
@@ -52,10 +53,10 @@ def shots_of_track(track: "Track", table: Mapping[str, Any], place: Scene | Body
     if isinstance(place, Scene):
         if "near_m" in table:
             raise ValueError("`near_m` in [track] is for bodies, which have poses.")
-        if track.q.shape[1] != place.size:
+        if len(track.units) != place.size:
             raise ValueError(
                 f"`columns` in [track] must be those of {place.size} coordinates, one of "
-                f"each body of the scene, but are {track.q.shape[1]}."
+                f"each body of the scene, but are {len(track.units)}."
             )
     near = {"near": table["near_m"]} if "near_m" in table else {}
     try:

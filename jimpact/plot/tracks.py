@@ -18,7 +18,7 @@ class Track(Protocol):
     """What a picture shows of `ji.tracks.Track`."""
 
     t: np.ndarray
-    q: np.ndarray
+    coordinates: np.ndarray
     sigma: np.ndarray
     residual: np.ndarray
     flights: Sequence[Any]
@@ -47,14 +47,15 @@ def track(track: Track, title: str = "") -> Figure:
     >>> len(figure.axes)
     2
     """
-    n = track.q.shape[1]
+    measured = track.coordinates
+    n = measured.shape[1]
     count = len(track.impacts)
     heading = title or counted(count, "impact")
     figure, panels = new_figure(_HEIGHT * n, heading, n, 2, squeeze=False)
     for c, (places, rest) in enumerate(panels):
         colour, unit = COLOURS[c % len(COLOURS)], track.units[c].split("/")[0]
-        fitted = track.q[:, c] - track.residual[:, c] * track.sigma[c]
-        places.plot(track.t, track.q[:, c], ".", color=GREY)
+        fitted = measured[:, c] - track.residual[:, c] * track.sigma[c]
+        places.plot(track.t, measured[:, c], ".", color=GREY)
         for frames in track.flights:
             places.plot(track.t[frames], fitted[frames], color=colour)
             rest.plot(track.t[frames], track.residual[frames, c], ".", color=colour)

@@ -13,6 +13,8 @@ from itertools import pairwise
 import numpy as np
 from scipy.linalg import solveh_banded
 
+from jimpact.tracks.drag import bent, bent_slopes, between
+
 STEPS = 60  # of Gauss-Newton; 5 are common. More are not, as frames change flights by turns.
 SETTLING = 20  # steps after which frames stay in their flights
 # Frames that an instant may lie within the flights that were found, as a frame near an impact may
@@ -28,37 +30,66 @@ SETTLED = 1e-7
 class Arcs:
     """Arcs between K + 2 ends, of which the first and the last are no impacts.
 
-    Fields: instants (K + 2,), places (K + 2, n), acceleration (n,); covariance of (places, instant)
-    of each end in turn, then of the acceleration if it is free; members: frames of each flight;
-    residual (T, n) in units of sigma, NaN where no frame was used.
+    Fields: instants (K + 2,), places (K + 2, n), acceleration (n,), drag [1/m]; free: whether the
+    acceleration is, and the drag; covariance of (places, instant) of each end in turn, then of
+    those that are; members: frames of each flight; residual (T, n) in units of sigma, NaN where no
+    frame was used.
     """
 
     instants: np.ndarray
     places: np.ndarray
     acceleration: np.ndarray
+    drag: float
+    free: tuple[bool, bool]
     covariance: np.ndarray
     members: list[np.ndarray]
     residual: np.ndarray
 
-    def velocities(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """v- (K, n), v+ (K, n) and the covariance (2nK, 2nK) of (v-, v+) of each impact."""
-        K, n = len(self.instants) - 2, self.places.shape[1]
+    def velocities(self) -> tuple[np.ndarray, np.ndarray]:
+        """v- (K, n) and v+ (K, n) of each impact."""
         h = np.diff(self.instants)
         mean, bend = np.diff(self.places, axis=0) / h[:, None], self.acceleration / 2
-        before, after = mean[:-1] + bend * h[:-1, None], mean[1:] - bend * h[1:, None]
+        first, last = mean - bend * h[:, None], mean + bend * h[:, None]
+        if self.drag:
+            ends, both = _pairs(self.instants), _pairs(self.places)
+            a, k = np.tile(self.acceleration, (len(h), 1)), np.full(len(h), self.drag)
+            _, rates = bent(np.zeros(1), ends, both, a, k)
+            first, last = first + rates[:, 0], last + rates[:, 1]
+        return last[:-1], first[1:]
+
+    def gain(self) -> np.ndarray:
+        """Derivatives (K, 2, n, N) of v- and v+ in the N values of `covariance`."""
+        K, n = len(self.instants) - 2, self.places.shape[1]
+        h, columns = np.diff(self.instants), _columns(n, self.free)
+        mean, bend = np.diff(self.places, axis=0) / h[:, None], self.acceleration / 2
         gain, size = np.zeros((K, 2, n, len(self.covariance))), n + 1
-        for k in range(K):
-            for side, sign in ((0, 1.0), (1, -1.0)):
-                i = k + side  # the flight
+        for i in range(K + 1):  # of flight i v+ of the impact before it, v- of the one after it
+            slopes, each = np.zeros((2, n, 3 * n + 3)), np.arange(n)
+            for end, sign in ((0, -1.0), (1, 1.0)):
                 slope = mean[i] / h[i] - sign * bend  # of the velocity in -h
-                for c in range(n):
-                    row = gain[k, side, c]
-                    row[i * size + c], row[(i + 1) * size + c] = -1 / h[i], 1 / h[i]
-                    row[i * size + n], row[(i + 1) * size + n] = slope[c], -slope[c]
-                    if len(row) > (K + 2) * size:
-                        row[(K + 2) * size + c] = sign * h[i] / 2
-        flat = gain.reshape(2 * n * K, len(self.covariance))
-        return before, after, flat @ self.covariance @ flat.T
+                slopes[end, each, each] = -1 / h[i]
+                slopes[end, each, size + each] = 1 / h[i]
+                slopes[end, :, n], slopes[end, :, size + n] = slope, -slope
+                slopes[end, each, 2 * size + each] = sign * h[i] / 2
+            if self.drag or self.free[1]:
+                pair = slice(i, i + 2)
+                where = (self.instants[pair], self.places[pair], self.acceleration, self.drag)
+                slopes += bent_slopes(np.zeros(1), *where)[3]
+            for k, side, end in ((i - 1, 1, 0), (i, 0, 1)):
+                if 0 <= k < K:
+                    gain[k, side, :, i * size : (i + 2) * size] = slopes[end, :, : 2 * size]
+                    gain[k, side, :, (K + 2) * size :] = slopes[end][:, 2 * size + columns]
+        return gain
+
+    @property
+    def drag_error(self) -> float:
+        """Standard error of an unknown drag, 0 of a known one [1/m]."""
+        return float(np.sqrt(self.covariance[-1, -1])) if self.free[1] else 0.0
+
+    def covariance_of_velocities(self) -> np.ndarray:
+        """(2nK, 2nK), of (v-, v+) of each impact in turn."""
+        flat = self.gain().reshape(-1, len(self.covariance))
+        return flat @ self.covariance @ flat.T
 
 
 def fit_arcs(
@@ -71,6 +102,8 @@ def fit_arcs(
     contact: float,
     instants: np.ndarray | None = None,
     frozen: bool = False,
+    drag: float = 0.0,
+    free_drag: bool = False,
 ) -> Arcs:
     """The arcs of these flights by maximum likelihood.
 
@@ -81,37 +114,51 @@ def fit_arcs(
         flights: frames of each.
         acceleration: known, or a first value.
         free: whether it is unknown.
+        drag: known, or a first value.
+        free_drag: whether it is unknown.
         contact: duration of a contact, whose frames are left out.
         instants: first values for the impacts (K,).
         frozen: whether these stay, so that places alone are found.
     """
-    pool, n = np.concatenate(flights), q.shape[1]
+    pool = np.concatenate(flights)
     if instants is None:
         instants = np.array([(t[f[-1]] + t[g[0]]) / 2 for f, g in pairwise(flights)])
     tau = np.concatenate([[t[pool[0]]], instants, [t[pool[-1]]]])
     last = np.array([t[f[-1]] for f in flights[:-1]])
     first = np.array([t[f[0]] for f in flights[1:]])
-    places, a, step = np.zeros((len(tau), n)), acceleration.copy(), float(np.median(np.diff(t)))
+    a, step, unknown = acceleration.copy(), float(np.median(np.diff(t))), (free, free_drag)
+    places = between(tau, t, q)
     members, moving = _members(t, pool, tau, contact, flights), False
     for k in range(1 if frozen else STEPS):
-        normal, change = _step(t, q, sigma, members, (tau, places, a), free, moving)
+        _, change = _step(t, q, sigma, members, (tau, places, a, drag), unknown, moving)
         new = tau + change[0]
         room = LARGEST_MOVE * np.diff(tau)
         new[1:-1] = np.clip(new[1:-1], tau[1:-1] - room[:-1], tau[1:-1] + room[1:])
         new[1:-1] = np.clip(new[1:-1], last - BEYOND * step, first + BEYOND * step)
         moved, moving = np.abs(new - tau).max(initial=0.0), True
-        tau, places, a = new, places + change[1], a + change[2]
+        tau, places, a, drag = new, places + change[1], a + change[2], drag + change[3]
         if k < SETTLING and not frozen:
             members = _members(t, pool, tau, contact, flights)
         if k > 0 and moved <= SETTLED * step:
             break
-    normal, _ = _step(t, q, sigma, members, (tau, places, a), free, not frozen)
+    at = (tau, places, a, drag)
+    normal, _ = _step(t, q, sigma, members, at, unknown, not frozen)
     residual = np.full(q.shape, np.nan)
     for i, frames in enumerate(members):
-        residual[frames] = (q[frames] - _arc(t[frames], i, tau, places, a)) / sigma
+        residual[frames] = (q[frames] - _arc(t[frames], i, *at)) / sigma
     ends = np.arange(len(tau))
-    covariance = _inverse(*normal, free, ends if frozen else ends[[0, -1]])
-    return Arcs(tau, places, a, covariance, members, residual)
+    covariance = _inverse(*normal, ends if frozen else ends[[0, -1]])
+    return Arcs(*at, unknown, covariance, members, residual)
+
+
+def _pairs(x: np.ndarray) -> np.ndarray:
+    """Neighbours (K - 1, 2, ..) of x (K, ..)."""
+    return np.stack([x[:-1], x[1:]], axis=1)
+
+
+def _columns(n: int, free: tuple[bool, bool]) -> np.ndarray:
+    """Which of acceleration and drag, n + 1 values, are unknown."""
+    return np.flatnonzero([free[0]] * n + [free[1]])
 
 
 def _members(
@@ -125,14 +172,38 @@ def _members(
     return inside if min(map(len, inside)) >= 3 else flights
 
 
-def _arc(x: np.ndarray, i: int, tau: np.ndarray, places: np.ndarray, a: np.ndarray) -> np.ndarray:
+At = tuple[np.ndarray, np.ndarray, np.ndarray, float]  # instants, places, acceleration, drag
+
+
+def _arc(
+    x: np.ndarray, i: int, tau: np.ndarray, places: np.ndarray, a: np.ndarray, drag: float
+) -> np.ndarray:
     """Places (F, n) in flight i."""
     s = ((x - tau[i]) / (tau[i + 1] - tau[i]))[:, None]
     bend = ((x - tau[i]) * (tau[i + 1] - x) / 2)[:, None]
-    return places[i] * (1 - s) + places[i + 1] * s - a * bend
+    arc = places[i] * (1 - s) + places[i + 1] * s - a * bend
+    if drag:
+        pair = slice(i, i + 2)
+        arc += bent(x, tau[None, pair], places[None, pair], a[None], np.array([drag]))[0][0]
+    return arc
 
 
-Normal = tuple[np.ndarray, np.ndarray, np.ndarray]  # banded (upper), border (N, n), corner (n, n)
+def _slopes(x: np.ndarray, i: int, at: At, with_drag: bool) -> np.ndarray:
+    """Slopes (F, n, 3 n + 3) of the places in flight i, in the values of `bent_slopes`."""
+    (tau, places, a, drag), n = at, at[1].shape[1]
+    h, each, size = tau[i + 1] - tau[i], np.arange(n), n + 1
+    s, slopes = (x - tau[i]) / h, np.zeros((len(x), n, 3 * n + 3))
+    rise = (places[i + 1] - places[i]) / h
+    slopes[:, each, each], slopes[:, each, size + each] = (1 - s)[:, None], s[:, None]
+    slopes[:, :, n] = -rise * (1 - s)[:, None] + a * (tau[i + 1] - x)[:, None] / 2
+    slopes[:, :, size + n] = -rise * s[:, None] - a * (x - tau[i])[:, None] / 2
+    slopes[:, each, 2 * size + each] = -((x - tau[i]) * (tau[i + 1] - x) / 2)[:, None]
+    if with_drag:
+        slopes += bent_slopes(x, tau[i : i + 2], places[i : i + 2], a, drag)[2]
+    return slopes
+
+
+Normal = tuple[np.ndarray, np.ndarray, np.ndarray]  # banded (upper), border (N, b), corner (b, b)
 
 
 def _step(
@@ -140,43 +211,40 @@ def _step(
     q: np.ndarray,
     sigma: np.ndarray,
     members: list[np.ndarray],
-    at: tuple[np.ndarray, np.ndarray, np.ndarray],
-    free: bool,
+    at: At,
+    free: tuple[bool, bool],
     moving: bool,
-) -> tuple[Normal, tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """The normal matrix, and a step of Gauss-Newton of instants, places and acceleration.
+) -> tuple[Normal, tuple[np.ndarray, np.ndarray, np.ndarray, float]]:
+    """The normal matrix, and a step of Gauss-Newton of instants, places, acceleration and drag.
 
     `moving`: whether instants are; places alone are a linear problem.
     """
-    (tau, places, a), n = at, q.shape[1]
-    size = n + 1
+    (tau, *_, drag), n = at, q.shape[1]
+    size, columns = n + 1, _columns(n, free)
     whole = np.zeros((len(tau), 2 * size, 2 * size))  # of each flight
-    border, corner = np.zeros((len(tau) * size, n)), np.zeros((n, n))
-    right, right_a = np.zeros(len(tau) * size), np.zeros(n)
+    border = np.zeros((len(tau) * size, len(columns)))
+    corner, right_b = np.zeros((len(columns), len(columns))), np.zeros(len(columns))
+    right = np.zeros(len(tau) * size)
+    used = np.concatenate([np.arange(2 * size), 2 * size + columns])
     for i, frames in enumerate(members):
-        x, h = t[frames], tau[i + 1] - tau[i]
-        s, bend = (x - tau[i]) / h, (x - tau[i]) * (tau[i + 1] - x) / 2
-        rest = q[frames] - _arc(x, i, tau, places, a)
-        for c in range(n):
-            ok = np.isfinite(rest[:, c])
-            u, rise = s[ok], (places[i + 1, c] - places[i, c]) / h
-            first = -rise * (1 - u) + a[c] * (tau[i + 1] - x[ok]) / 2
-            last = -rise * u - a[c] * (x[ok] - tau[i]) / 2
-            J = np.stack([1 - u, first, u, last, -bend[ok]], axis=1) / sigma[c]
-            square, gradient = J.T @ J, J.T @ (rest[ok, c] / sigma[c])
-            local = np.array([c, n, size + c, size + n])
-            rows = i * size + local
-            whole[i][np.ix_(local, local)] += square[:4, :4]
-            right[rows] += gradient[:4]
-            border[rows, c] += square[:4, 4]
-            corner[c, c], right_a[c] = corner[c, c] + square[4, 4], right_a[c] + gradient[4]
+        x = t[frames]
+        rest = (q[frames] - _arc(x, i, *at)) / sigma
+        slopes = _slopes(x, i, at, bool(drag) or free[1])[:, :, used] / sigma[:, None]
+        ok = np.isfinite(rest)
+        J, rows = slopes[ok], slice(i * size, (i + 2) * size)
+        square, gradient = J.T @ J, J.T @ rest[ok]
+        whole[i] = square[: 2 * size, : 2 * size]
+        right[rows] += gradient[: 2 * size]
+        border[rows] += square[: 2 * size, 2 * size :]
+        corner, right_b = corner + square[2 * size :, 2 * size :], right_b + gradient[2 * size :]
     instants = np.arange(len(tau)) * size + n
     fixed = instants[[0, -1]] if moving else instants
     normal = _banded(whole, len(tau), size, fixed), border, corner
     border[fixed], right[fixed] = 0.0, 0.0
-    solved = _solve(normal, right, right_a, free)
-    values = solved[0].reshape(len(tau), size)
-    return normal, (values[:, n], values[:, :n], solved[1])
+    solved, common = _solve(normal, right, right_b)
+    values, shared = solved.reshape(len(tau), size), np.zeros(n + 1)
+    shared[columns] = common
+    return normal, (values[:, n], values[:, :n], shared[:n], float(shared[n]))
 
 
 def _banded(whole: np.ndarray, ends: int, size: int, fixed: np.ndarray) -> np.ndarray:
@@ -196,21 +264,16 @@ def _banded(whole: np.ndarray, ends: int, size: int, fixed: np.ndarray) -> np.nd
     return bands
 
 
-def _solve(
-    normal: Normal, right: np.ndarray, right_a: np.ndarray, free: bool
-) -> tuple[np.ndarray, np.ndarray]:
+def _solve(normal: Normal, right: np.ndarray, right_b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Both parts of the step, by elimination of the banded one."""
     bands, border, corner = normal
     scale = 1 / np.sqrt(np.maximum(bands[-1], 1e-300))
-    scaled = _scaled(bands, scale)
-    if not free:
-        return scale * solveh_banded(scaled, scale * right), np.zeros(len(right_a))
     both = np.column_stack([right, border])
-    solved = scale[:, None] * solveh_banded(scaled, scale[:, None] * both)
-    a = np.linalg.pinv(corner - border.T @ solved[:, 1:], hermitian=True) @ (
-        right_a - border.T @ solved[:, 0]
+    solved = scale[:, None] * solveh_banded(_scaled(bands, scale), scale[:, None] * both)
+    common = np.linalg.pinv(corner - border.T @ solved[:, 1:], hermitian=True) @ (
+        right_b - border.T @ solved[:, 0]
     )
-    return solved[:, 0] - solved[:, 1:] @ a, a
+    return solved[:, 0] - solved[:, 1:] @ common, common
 
 
 def _scaled(bands: np.ndarray, scale: np.ndarray) -> np.ndarray:
@@ -223,15 +286,15 @@ def _scaled(bands: np.ndarray, scale: np.ndarray) -> np.ndarray:
 
 
 def _inverse(
-    bands: np.ndarray, border: np.ndarray, corner: np.ndarray, free: bool, fixed: np.ndarray
+    bands: np.ndarray, border: np.ndarray, corner: np.ndarray, fixed: np.ndarray
 ) -> np.ndarray:
-    """The covariance; `fixed` instants have none."""
+    """The covariance; `fixed` ends have instants without any."""
     scale = 1 / np.sqrt(np.maximum(bands[-1], 1e-300))
     inverse = scale[:, None] * solveh_banded(_scaled(bands, scale), np.diag(scale))
-    n = corner.shape[0]
-    alone = fixed * (n + 1) + n
+    size = len(bands) // 2
+    alone = fixed * size + size - 1
     inverse[alone, alone] = 0.0
-    if not free:
+    if not corner.size:
         return (inverse + inverse.T) / 2
     own = np.linalg.pinv(corner - border.T @ inverse @ border, hermitian=True)
     cross = -inverse @ border @ own

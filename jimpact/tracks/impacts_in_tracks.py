@@ -1,6 +1,7 @@
 """Impacts in a track: flights and instants at once, by maximum likelihood."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -8,7 +9,17 @@ import numpy as np
 from jimpact.fits.shots_file import ANGULAR, LINEAR
 from jimpact.tools.checks import as_float_array, check_concrete, check_values
 from jimpact.tracks.arcs import Arcs, fit_arcs
-from jimpact.tracks.judging import findings, findings_of_input, findings_of_noise, findings_of_signs
+from jimpact.tracks.drag import straightened
+from jimpact.tracks.judging import (
+    findings,
+    findings_of_held,
+    findings_of_input,
+    findings_of_noise,
+    findings_of_signs,
+    free_flights,
+)
+from jimpact.tracks.poses import with_turns
+from jimpact.tracks.quaternions import as_inertia, as_poses
 from jimpact.tracks.segments import (
     SMALLEST_JUMP,
     common_acceleration,
@@ -26,10 +37,13 @@ def find_impacts(
     sigma: Any = None,
     *,
     acceleration: Any = 0.0,
+    drag: float | None = 0.0,
     contact: float = 0.0,
     shortest: int = 5,
     window: float | None = None,
     units: str | Sequence[str] | None = None,
+    quaternion: str | None = None,
+    inertia: Any = None,
 ) -> Track:
     """The impacts of a track: instants, velocities before and after, and their covariance.
 
@@ -46,19 +60,28 @@ def find_impacts(
         sigma: standard errors of q, a number or (n,), > 0; None: estimated from the residuals.
         acceleration: between impacts, a number or (n,) [m/s^2]; -9.80665 of a height; None: one
             unknown in each coordinate, common to all flights.
+        drag: k >= 0 of the air's `-k |v| v`, |v| that of the places [1/m]; .12 of a table-tennis
+            ball; None: one unknown for all flights. Between impacts the arcs bend accordingly.
         contact: the longest duration of a contact, whose frames are left out, >= 0 [s].
         shortest: frames of a flight, >= 3.
         window: of each flight use only so long before and after an impact, > 0 [s], where flights
             are not quite ballistic; None: whole flights.
         units: of each coordinate, 'm' or 'rad', or one for all; None: m.
+        quaternion: 'wxyz' or 'xyzw', the order in which poses hold it; then q is (T, 7), the centre
+            of mass and a unit quaternion of either sign, from the axes of the body to those of
+            space. sigma has (6,), places and turns about the axes of the body [rad], acceleration
+            (3,). Impacts are found by the places.
+        inertia: of a body with poses, (3,) along its axes or (3, 3), about the centre of mass, up
+            to a factor: between impacts it turns freely. None: as a sphere or a cube does.
 
     Returns:
         `Track`, which prints and plots; `warnings` say which flights are not ballistic, and that
-        no impact was found.
+        no impact was found. With `quaternion` velocities are (x', omega), omega in the axes of the
+        body, as of `ji.Box`, and poses hold the quaternion's scalar first.
 
     Raises:
         ValueError: fewer frames than a flight and a half, times that do not rise or are not finite,
-            sigma <= 0, other shapes; no flight at all.
+            sigma <= 0, other shapes; no flight at all; a quaternion whose length is not 1.
 
     >>> import numpy as np
     >>> import jimpact as ji
@@ -69,6 +92,15 @@ def find_impacts(
     >>> [round(float(track.impacts[0].post[0] / -track.impacts[0].pre[0]), 2)]
     [0.8]
     """
+    if quaternion is not None or inertia is not None:
+        options = {
+            "drag": drag,
+            "contact": contact,
+            "shortest": shortest,
+            "window": window,
+            "units": units,
+        }
+        return _in_poses(t, q, sigma, acceleration, quaternion, inertia, options)
     t, q, names = _checked(t, q, shortest, units)
     n = q.shape[1]
     raw, q = q, _unwrapped(q, names)
@@ -78,25 +110,112 @@ def find_impacts(
     known = None if acceleration is None else _of_coordinates("acceleration", acceleration, n)
     for name, value in (("contact", contact), ("window", 1.0 if window is None else window)):
         check_values(name, np.asarray(value, float), low=0.0, open_low=name == "window")
-    x = t - t.mean()
-    if known is not None:
-        notes += findings_of_signs(x, q, given, known, shortest)
-    flights, a = flights_and_acceleration(x, q, given, known, shortest)
+    if drag is not None:
+        check_values("drag", np.asarray(drag, float), low=0.0)
+    if drag != 0 and "rad" in names:
+        raise ValueError(
+            "Argument `drag` must be 0 where q holds angles, as it is of places, but has value "
+            f"{drag}."
+        )
+    arcs, given, more = _arcs_of(t, q, given, sigma is None, known, drag, contact, shortest, window)
+    return _as_track(t, _unwrapped(raw, names), given, arcs, names, (*notes, *more))
+
+
+def _arcs_of(
+    t: np.ndarray,
+    q: np.ndarray,
+    given: np.ndarray,
+    estimated: bool,
+    known: np.ndarray | None,
+    drag: float | None,
+    contact: float,
+    shortest: int,
+    window: float | None,
+) -> tuple[Arcs, np.ndarray, list[str]]:
+    """The arcs of all flights, standard errors (n,), `estimated` or as given, and findings."""
+    x, free, q = t - t.mean(), known is None, q.copy()
+    flights, a, k = flights_and_acceleration(x, q, given, known, shortest, drag)
+    straight = straightened(x, q, k) if k else q
+    notes = [] if known is None else findings_of_signs(x, straight, given, known, shortest)
     flights = [f for f in flights if x[f[-1]] - x[f[0]] > contact]
     if not flights:
         raise ValueError(
             "Argument `q` must hold a flight, but no frames in a row lie on an arc within sigma = "
             f"{given.tolist()} at an acceleration of {a.tolist()}: are these the units of q?"
         )
-    free = known is None
-    arcs, flights = _of_true_impacts(x, q, given, flights, a, free, contact)
-    if sigma is None:  # what the residuals show; jumps are judged anew by it
-        rough, given = given, _of_residuals(given, arcs, free)
-        arcs, flights = _of_true_impacts(x, q, given, flights, a, free, contact)
-        notes += findings_of_noise(rough, given)
+    kept = free_flights(x, straight, given, a, flights)
+    if len(kept) < len(flights):
+        flights = kept
+        notes += findings_of_held(t, flights)
+        for places in (q, straight):
+            places[: flights[0][0]], places[flights[-1][-1] + 1 :] = np.nan, np.nan
+    arcs, flights = _of_true_impacts(x, straight, given, flights, a, free, contact)
+    rough = given
+    if estimated:  # what the residuals show; jumps are judged anew by it
+        given = _of_residuals(given, arcs)
+        arcs, flights = _of_true_impacts(x, straight, given, flights, a, free, contact)
+    unknown = (free, drag is None)
+    if drag is None:  # flights once more, by what is found
+        start = (arcs.acceleration, k, arcs.instants[1:-1])
+        arcs = _with_drag(x, q, given, flights, start, unknown, contact)
+        a, k = arcs.acceleration, arcs.drag
+        flights, *_ = flights_and_acceleration(x, q, given, a, shortest, k)
+        straight = straightened(x, q, k)
+        arcs, flights = _of_true_impacts(x, straight, given, flights, a, False, contact)
+    if drag != 0:
+        start = (arcs.acceleration, k, arcs.instants[1:-1])
+        arcs = _with_drag(x, q, given, flights, start, unknown, contact)
+        if estimated:
+            given = _of_residuals(given, arcs)
+            arcs = _with_drag(x, q, given, flights, start, unknown, contact)
+    notes += findings_of_noise(rough, given) if estimated else []
     if window is not None and len(arcs.instants) > 2:
-        arcs = _windowed(x, q, given, arcs, free, contact, window)
-    return _as_track(t, q, given, arcs, names, notes)
+        whole = np.concatenate(arcs.members)
+        arcs = _windowed(x, q, given, arcs, contact, window)
+        q[np.setdiff1d(whole, np.concatenate(arcs.members))] = np.nan  # no frames that do not fit
+    return arcs, given, [*notes, *findings(t, q, given, arcs)]
+
+
+def _with_drag(
+    x: np.ndarray,
+    q: np.ndarray,
+    sigma: np.ndarray,
+    flights: list[np.ndarray],
+    start: tuple[np.ndarray, float, np.ndarray],
+    free: tuple[bool, bool],
+    contact: float,
+) -> Arcs:
+    """The arcs that drag bends, from first values of acceleration, drag and instants."""
+    a, k, instants = start
+    return fit_arcs(x, q, sigma, flights, a, free[0], contact, instants, drag=k, free_drag=free[1])
+
+
+def _in_poses(
+    t: Any,
+    q: Any,
+    sigma: Any,
+    acceleration: Any,
+    quaternion: str | None,
+    inertia: Any,
+    options: dict[str, Any],
+) -> Track:
+    """The impacts in poses: by their places, then with the turning of each flight."""
+    if quaternion is None:
+        raise ValueError("Argument `inertia` is for poses, whose order `quaternion` must name.")
+    if options["units"] is not None:
+        raise ValueError("Argument `units` is not for poses: places [m] and a quaternion.")
+    for name, value in (("t", t), ("q", q)):
+        check_concrete(name, value)
+        as_float_array(name, value)  # raises for what are no numbers
+    places, e = as_poses(q, quaternion)
+    moments = as_inertia(inertia)
+    of_places, of_turns = None, None
+    if sigma is not None:
+        both = _of_coordinates("sigma", sigma, 6)
+        check_values("sigma", both, low=0.0, open_low=True)
+        of_places, of_turns = both[:3], both[3:]
+    track = find_impacts(t, places, of_places, acceleration=acceleration, **options)
+    return replace(with_turns(track, e, of_turns, moments), order=quaternion, inertia=moments)
 
 
 def _checked(t: Any, q: Any, shortest: int, units: Any) -> tuple[np.ndarray, np.ndarray, Any]:
@@ -195,7 +314,7 @@ def _of_true_impacts(
 
 def _jumps(arcs: Arcs) -> np.ndarray:
     """The largest jump of a velocity of each impact (K,), in standard errors."""
-    pre, post, covariance = arcs.velocities()
+    (pre, post), covariance = arcs.velocities(), arcs.covariance_of_velocities()
     (K, n), signs = pre.shape, np.hstack([-np.eye(pre.shape[1]), np.eye(pre.shape[1])])
     sizes = np.zeros(K)
     for k in range(K):
@@ -210,7 +329,6 @@ def _windowed(
     q: np.ndarray,
     sigma: np.ndarray,
     whole: Arcs,
-    free: bool,
     contact: float,
     window: float,
 ) -> Arcs:
@@ -228,15 +346,15 @@ def _windowed(
             f"Argument `window` must leave 3 frames or more of each flight, but {window:g} s leave "
             f"{min(map(len, near))}."
         )
-    start = whole.instants[1:-1]
-    return fit_arcs(x, q, sigma, near, whole.acceleration, free, contact, start)
+    start = (whole.acceleration, whole.drag, whole.instants[1:-1])
+    return _with_drag(x, q, sigma, near, start, whole.free, contact)
 
 
-def _of_residuals(sigma: np.ndarray, arcs: Arcs, free: bool) -> np.ndarray:
+def _of_residuals(sigma: np.ndarray, arcs: Arcs) -> np.ndarray:
     """Standard errors (n,) by the residuals; each coordinate bears its part of the instants."""
     n, ends = len(sigma), len(arcs.instants)
     seen = np.isfinite(arcs.residual).sum(axis=0)
-    freedom = np.maximum(seen - ends - (ends - 2) / n - free, 1.0)
+    freedom = np.maximum(seen - ends - (ends - 2) / n - arcs.free[0], 1.0)
     scale = np.sqrt(np.nansum(arcs.residual**2, axis=0) / freedom)
     return np.maximum(sigma * scale, np.finfo(float).tiny ** 0.25)
 
@@ -247,10 +365,10 @@ def _as_track(
     sigma: np.ndarray,
     arcs: Arcs,
     units: tuple[str, ...],
-    notes: list[str],
+    lines: tuple[str, ...],
 ) -> Track:
     """The track of these arcs, with what is wrong with it."""
-    pre, post, covariance = arcs.velocities()
+    (pre, post), covariance = arcs.velocities(), arcs.covariance_of_velocities()
     n, size = q.shape[1], q.shape[1] + 1
     impacts = []
     for k, (before, after) in enumerate(zip(pre, post)):
@@ -258,7 +376,6 @@ def _as_track(
         error = float(np.sqrt(arcs.covariance[(k + 1) * size + n, (k + 1) * size + n]))
         time, place = float(arcs.instants[k + 1] + t.mean()), arcs.places[k + 1]
         impacts.append(TrackImpact(time, error, place, before, after, covariance[own, own]))
-    lines = (*notes, *findings(t, q, sigma, arcs))
     velocity_units = tuple(VELOCITY_OF[unit] for unit in units)
     return Track(
         tuple(impacts), tuple(arcs.members), sigma, covariance, lines, velocity_units, t, q, arcs

@@ -1,12 +1,20 @@
 """Whether a track is one of ballistic flights: what its residuals and its frames show."""
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
 from scipy.stats import chi2, norm
 
 from jimpact.tracks.arcs import Arcs
-from jimpact.tracks.segments import LOOK_BACK, cost_of_flights, curvature
+from jimpact.tracks.segments import (
+    LOOK_BACK,
+    SMALLEST_JUMP,
+    chi_squared,
+    cost_of_flights,
+    curvature,
+    price,
+)
 
 # Chance that a good track has a warning: half by curvatures, half by sizes of residuals. Ten times
 # more would warn of one good track in ten.
@@ -29,6 +37,12 @@ UNEXPLAINED = 3.0
 # impact in a thousand gains less. Ten times more would doubt soft impacts; ten times less, and
 # drag or a wrong acceleration would pass as impacts.
 LEAST_GAIN = 10.8
+# Logarithm of the odds, 20 to 1, from which on a body is held in one flight. Ten times more would
+# keep most false flights of a body that slides, of a few frames each.
+HELD_ODDS = 3.0
+# Logarithm of the likelihood of "held" over "free" from which on flights at an end are left out:
+# half of the square of SMALLEST_JUMP. Ten times more would keep 10 false impacts.
+HELD = SMALLEST_JUMP**2 / 2
 
 
 def findings_of_input(q: np.ndarray, sigma: np.ndarray, units: tuple[str, ...]) -> list[str]:
@@ -59,6 +73,44 @@ def findings_of_input(q: np.ndarray, sigma: np.ndarray, units: tuple[str, ...]) 
     return found
 
 
+def findings_of_turns(
+    e: np.ndarray, sigma: np.ndarray, residual: np.ndarray, p_values: np.ndarray, taken: float
+) -> list[str]:
+    """What is wrong with the orientations e (T, 4) of poses, a sentence each.
+
+    `residual` (T, 3) in units of sigma; `p_values` (K,) of the meetings at impacts; `taken`: values
+    that were fitted.
+    """
+    found, seen = [], e[np.isfinite(e).all(axis=1)]
+    cosines = np.minimum(np.abs((seen[1:] * seen[:-1]).sum(axis=1)), 1.0)
+    if len(cosines) and np.quantile(2 * np.arccos(cosines), 0.9) > np.pi / 2:
+        found.append(
+            "The body turns by more than a quarter of a turn from frame to frame: do the frames "
+            "miss turns?"
+        )
+    if (sigma > COARSE_ANGLE).any():
+        found.append(
+            f"The orientations have a standard error of {sigma.max():.2g} rad: is `sigma` in "
+            "degrees, or does the body not turn freely between impacts (`inertia`)?"
+        )
+    freedom = max(np.isfinite(residual).sum() - taken, 1.0)
+    square = float(np.nansum(residual**2))
+    if chi2.sf(square, freedom) < FALSE_ALARMS / 4:
+        found.append(
+            f"The body does not turn freely within sigma: residuals are "
+            f"{np.sqrt(square / freedom):.2g} times as large. Perhaps `inertia` is another, an "
+            "impact was not found, or the orientations were smoothed."
+        )
+    apart = np.flatnonzero(p_values < FALSE_ALARMS / 4 / max(len(p_values), 1))
+    if apart.size:
+        numbers = ", ".join(str(k + 1) for k in apart)
+        found.append(
+            f"The turns before and after impact {numbers} do not meet at the instant of the places:"
+            " are there two impacts in one, or were orientations smoothed across it?"
+        )
+    return found
+
+
 def findings_of_signs(
     t: np.ndarray, q: np.ndarray, sigma: np.ndarray, acceleration: np.ndarray, shortest: int
 ) -> list[str]:
@@ -82,11 +134,11 @@ def findings_of_signs(
     return found
 
 
-def findings_of_noise(differences: np.ndarray, residuals: np.ndarray) -> list[str]:
-    """Coordinates whose residuals are far above the noise from frame to frame."""
+def findings_of_noise(differences: np.ndarray, residuals: np.ndarray, first: int = 1) -> list[str]:
+    """Coordinates, from number `first`, with residuals far above the noise from frame to frame."""
     return [
-        f"Coordinate {c + 1} has residuals of {residuals[c]:.2g}, but noise of {differences[c]:.2g}"
-        " from frame to frame: is an impact missing, or do the flights bend?"
+        f"Coordinate {c + first} has residuals of {residuals[c]:.2g}, but noise of "
+        f"{differences[c]:.2g} from frame to frame: is an impact missing, or do the flights bend?"
         for c in np.flatnonzero(residuals > UNEXPLAINED * differences)
     ]
 
@@ -100,18 +152,128 @@ def findings(t: np.ndarray, q: np.ndarray, sigma: np.ndarray, arcs: Arcs) -> lis
     return found
 
 
+def free_flights(
+    t: np.ndarray,
+    q: np.ndarray,
+    sigma: np.ndarray,
+    acceleration: np.ndarray,
+    flights: list[np.ndarray],
+) -> list[np.ndarray]:
+    """The flights without those at both ends in which the body is held; one at least.
+
+    A body at rest, or on a table, has no acceleration where a flight has a known one; frames of it
+    are taken for short flights with impacts between. A run of flights at an end is held where one
+    parabola explains it as well, or by the sum of `held_rather` over it.
+    """
+    if not acceleration.any():
+        return flights
+    rest = (q - acceleration * t[:, None] ** 2 / 2) / sigma
+    held = held_rather(t, rest, sigma, acceleration, flights)
+    alone = np.array([chi_squared(t, q, sigma, acceleration, some) for some in flights])
+    start = price(*q.shape)
+
+    def more(run: np.ndarray) -> float:
+        """chi^2 by which one parabola explains a run of flights less well than they do."""
+        frames = np.sort(np.concatenate([flights[k] for k in run]))
+        return _of_one_parabola(t, q, sigma, acceleration, frames) - float(alone[run].sum())
+
+    def count(order: np.ndarray) -> int:
+        """How many of the first flights in this order are held."""
+        sums = np.cumsum(held[order])
+        curved = int(np.argmax(sums)) + 1 if sums.size and sums.max() > HELD else 0
+        few, many = 1, len(order)  # by bisection how many one parabola explains
+        while few < many:
+            middle = (few + many + 1) // 2
+            if more(order[:middle]) < start * (middle - 1):
+                few = middle
+            else:
+                many = middle - 1
+        while few > 1 and more(order[:few]) - more(order[: few - 1]) > start:
+            few -= 1  # the last one costs more than it would alone
+        return max(curved, few if few > 1 else 0)
+
+    last = len(flights) - count(np.arange(len(flights))[::-1])
+    first = count(np.arange(last))
+    return flights[first:last] if last > first else flights[:1]
+
+
+def held_flights(
+    t: np.ndarray,
+    q: np.ndarray,
+    sigma: np.ndarray,
+    acceleration: np.ndarray,
+    flights: Sequence[np.ndarray],
+) -> np.ndarray:
+    """Whether the body is held in each flight (F,): by itself, or in a run on one parabola."""
+    if not acceleration.any():
+        return np.zeros(len(flights), bool)
+    rest = (q - acceleration * t[:, None] ** 2 / 2) / sigma
+    held = held_rather(t, rest, sigma, acceleration, flights) > HELD_ODDS
+    alone = [chi_squared(t, q, sigma, acceleration, frames) for frames in flights]
+    start, first = price(*q.shape), 0
+    while first < len(flights):
+        last, run, sum_of_run = first, flights[first], alone[first]
+        while last + 1 < len(flights):
+            longer = np.concatenate([run, flights[last + 1]])
+            sum_of_longer = _of_one_parabola(t, q, sigma, acceleration, longer)
+            if not sum_of_longer < sum_of_run + alone[last + 1] + start:
+                break
+            last, run, sum_of_run = last + 1, longer, sum_of_longer
+        held[first : last + 1] |= last > first
+        first = last + 1
+    return held
+
+
+def held_rather(
+    t: np.ndarray,
+    rest: np.ndarray,
+    sigma: np.ndarray,
+    acceleration: np.ndarray,
+    flights: Sequence[np.ndarray],
+) -> np.ndarray:
+    """Logarithm (F,) of the likelihood that a body is held in a flight over that it is free.
+
+    Equation: with the excess x of its acceleration over the known a, and the error s of x, the sum
+    of `(x^2 - (x + a)^2) / (2 s^2)` over coordinates. `rest` (T, n) is what a fit leaves, in sigma.
+    """
+    excess, error = _excess(t, rest, sigma, flights)
+    return np.asarray(((excess**2 - (excess + acceleration) ** 2) / (2 * error**2)).sum(axis=1))
+
+
+def _of_one_parabola(
+    t: np.ndarray, q: np.ndarray, sigma: np.ndarray, acceleration: np.ndarray, frames: np.ndarray
+) -> float:
+    """chi^2 of frames on one parabola; inf where it is nearer to a known acceleration than to 0."""
+    x, total = t[frames] - t[frames].mean(), 0.0
+    for c, known in enumerate(acceleration):
+        ok = np.isfinite(q[frames, c])
+        if ok.sum() < 3:
+            continue
+        curve = np.vander(x[ok], 3)
+        best = np.linalg.lstsq(curve, q[frames[ok], c], rcond=None)[0]
+        if 2 * best[0] * known > known**2 / 2:
+            return np.inf
+        total += float(np.sum((q[frames[ok], c] - curve @ best) ** 2)) / sigma[c] ** 2
+    return total
+
+
+def findings_of_held(t: np.ndarray, flights: Sequence[np.ndarray]) -> list[str]:
+    """What a track says of the frames before the first and after the last of its free flights."""
+    why = (
+        "there are no flights of this acceleration. Perhaps the body rests, slides, rolls or is "
+        "held, it bounces faster than frames show, or the acceleration is wrong."
+    )
+    found, start, end = [], flights[0][0], flights[-1][-1]
+    if start > 0:
+        found.append(f"Up to {t[start]:.4g} s nothing is used: {why}")
+    if end < len(t) - 1:
+        found.append(f"From {t[end + 1]:.4g} s on nothing is used: {why}")
+    return found
+
+
 def _of_curvatures(t: np.ndarray, sigma: np.ndarray, arcs: Arcs) -> list[str]:
     """Flights whose acceleration is not that of the fit."""
-    excess, error = np.zeros((2, len(arcs.members), len(sigma)))
-    for i, frames in enumerate(arcs.members):
-        for c, scale in enumerate(sigma):
-            ok = frames[np.isfinite(arcs.residual[frames, c])]
-            x = t[ok] - t[ok].mean()
-            line = np.linalg.qr(np.vander(x, 2))[0]
-            curve = x**2 / 2 - line @ (line.T @ (x**2 / 2))
-            size = float(np.linalg.norm(curve))
-            error[i, c] = scale / size if size > 0 else np.inf
-            excess[i, c] = scale * float(curve @ arcs.residual[ok, c]) / size**2 if size else 0.0
+    excess, error = _excess(t, arcs.residual, sigma, arcs.members)
     limit = norm.isf(FALSE_ALARMS / 4 / excess.size)
     far = np.abs(excess) > limit * error
     found = []
@@ -127,6 +289,23 @@ def _of_curvatures(t: np.ndarray, sigma: np.ndarray, arcs: Arcs) -> list[str]:
             f"{excess[i, c]:.3g} ± {error[i, c]:.2g} beyond that of the fit. Perhaps {why}."
         )
     return found
+
+
+def _excess(
+    t: np.ndarray, rest: np.ndarray, sigma: np.ndarray, flights: Sequence[np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Acceleration (F, n) of what is left (T, n) in each flight, in sigma, and its error."""
+    excess, error = np.zeros((2, len(flights), len(sigma)))
+    for i, frames in enumerate(flights):
+        for c, scale in enumerate(sigma):
+            ok = frames[np.isfinite(rest[frames, c])]
+            x = t[ok] - t[ok].mean()
+            line = np.linalg.qr(np.vander(x, 2))[0]
+            curve = x**2 / 2 - line @ (line.T @ (x**2 / 2))
+            size = float(np.linalg.norm(curve))
+            error[i, c] = scale / size if size > 0 else np.inf
+            excess[i, c] = scale * float(curve @ rest[ok, c]) / size**2 if size else 0.0
+    return excess, error
 
 
 def _of_bends(t: np.ndarray, q: np.ndarray, sigma: np.ndarray, arcs: Arcs) -> list[str]:

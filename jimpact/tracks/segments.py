@@ -10,6 +10,8 @@ from itertools import pairwise
 import numpy as np
 from scipy.stats import chi2
 
+from jimpact.tracks.drag import straightened
+
 # A frame that fits no flight costs what one good frame in so many exceeds. Ten times more would
 # keep more false points in flights, ten times less would lose more good frames.
 LOST_SHARE = 1e-3
@@ -159,19 +161,52 @@ def chi_squared(
 
 
 def flights_and_acceleration(
-    t: np.ndarray, q: np.ndarray, sigma: np.ndarray, known: np.ndarray | None, shortest: int
-) -> tuple[list[np.ndarray], np.ndarray]:
-    """Flights, and the acceleration (n,): known, or the one that all have in common."""
-    if known is not None:
-        return flights_of(t, q, sigma, known, shortest), known
-    acceleration = curvature(t, q, shortest)
+    t: np.ndarray,
+    q: np.ndarray,
+    sigma: np.ndarray,
+    known: np.ndarray | None,
+    shortest: int,
+    drag: float | None = 0.0,
+) -> tuple[list[np.ndarray], np.ndarray, float]:
+    """Flights, the acceleration (n,) and the drag: known, or those that all have in common."""
+    acceleration = curvature(t, q, shortest) if known is None else known
+    slowed = q - straightened(t, q, 1.0) if drag != 0 else np.zeros_like(q)  # by a drag of 1/m
     flights: list[np.ndarray] = []
-    for _ in range(ROUNDS):
-        flights = flights_of(t, q, sigma, acceleration, shortest)
-        if flights:
-            flights = _joined_at_any(t, q, sigma, acceleration, flights)
-            acceleration = common_acceleration(t, q, flights)
-    return flights, acceleration
+    k = 0.0 if drag is None else drag
+    for _ in range(ROUNDS if known is None or drag is None else 1):
+        straight = q - k * slowed
+        flights = flights_of(t, straight, sigma, acceleration, shortest)
+        if flights and known is None:
+            flights = _joined_at_any(t, straight, sigma, acceleration, flights)
+            acceleration = common_acceleration(t, straight, flights)
+        if flights and drag is None:
+            k = _common_drag(t, q, slowed, sigma, None if known is None else acceleration, flights)
+    return flights, acceleration, k
+
+
+def _common_drag(
+    t: np.ndarray,
+    q: np.ndarray,
+    slowed: np.ndarray,
+    sigma: np.ndarray,
+    acceleration: np.ndarray | None,
+    flights: list[np.ndarray],
+) -> float:
+    """By least squares, each flight with a line of its own, or a parabola of its own acceleration.
+
+    slowed: places (T, n) that a drag of 1/m adds.
+    """
+    above, below = 0.0, 0.0
+    for frames in flights:
+        for c, scale in enumerate(sigma):
+            ok = frames[np.isfinite(q[frames, c])]
+            x, y = t[ok] - t[ok].mean(), q[ok, c]
+            if acceleration is not None:
+                y = y - acceleration[c] * x**2 / 2
+            line = np.linalg.qr(np.vander(x, 2 if acceleration is not None else 3))[0]
+            drag = slowed[ok, c] - line @ (line.T @ slowed[ok, c])
+            above, below = above + float(drag @ y) / scale**2, below + float(drag @ drag) / scale**2
+    return above / below if below > 0 else 0.0
 
 
 def _joined_at_any(

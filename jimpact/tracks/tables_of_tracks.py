@@ -10,7 +10,7 @@ from jimpact.tools.checks import check_values, short_repr, suggestion
 
 # In m or rad
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
-UNITS |= {"rad": 1.0, "deg": np.pi / 180}
+UNITS |= {"rad": 1.0, "deg": np.pi / 180, "1": 1.0}
 _OTHER = r"(?:cm|mm|um|µm|km|in|ft|px|pixels?|deg|°|rad|m)"
 _MISSING = {"", "nan", "na", "n/a", "null", "none", "-", "--", "#n/a"}
 SEPARATORS = ("\t", ";", ",", None)  # None: any white space
@@ -37,8 +37,8 @@ def read(
         columns: names of those to read, as in the file.
         time: name of the column of times [s]; None: there is none, but a `rate`.
         rate: frames a second, > 0, where each line is a frame.
-        unit: of the columns, one for all or one each: m, cm, mm, um, in, ft, rad, deg. It is never
-            guessed; a unit that a name states ('x [mm]') must be this.
+        unit: of the columns, one for all or one each: m, cm, mm, um, in, ft, rad, deg, or 1
+            of a quaternion. It is never guessed; a unit that a name states ('x [mm]') must be this.
         decimal: '.' or ','.
 
     Returns:

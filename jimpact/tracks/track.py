@@ -1,6 +1,7 @@
 """A track with its impacts, and the shots that it holds."""
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 from typing import Any
 
@@ -14,6 +15,8 @@ from jimpact.fits.data import ROUNDING, Experiments
 from jimpact.tools.checks import check_kind, check_values
 from jimpact.tools.records import counted
 from jimpact.tracks.arcs import Arcs
+from jimpact.tracks.judging import held_flights
+from jimpact.tracks.quaternions import in_the_other_order, turns_since_first
 
 # A jump of velocities lies in the cone of a scene's impulses up to so many standard errors. Ten
 # times more would pass impacts with something else than the contacts.
@@ -21,6 +24,9 @@ OUT_OF_CONE = 5.0
 # ... or up to this share of the jump, by kinetic energy: bodies and calibrations differ from their
 # model. Ten times more is all of it; ten times less drops most measured impacts of a square.
 SHARE_OUT = 0.2
+# Share of the trace by which moments of inertia may differ from those of the body of a scene. Ten
+# times more is a tenth: flights would turn otherwise by degrees.
+INERTIA_WITHIN = 0.01
 
 
 @dataclass(frozen=True)
@@ -38,6 +44,15 @@ class TrackImpact:
     post: np.ndarray
     covariance: np.ndarray
 
+    def not_in(self, order: str) -> "TrackImpact":
+        """The impact of a pose as if the file stood in the other order than `order`."""
+        other, A = in_the_other_order(self.q[3:], order)
+        gain = np.eye(12)
+        gain[3:6, 3:6] = gain[9:, 9:] = A
+        pre, post = np.split(gain @ np.concatenate([self.pre, self.post]), 2)
+        q, covariance = np.append(self.q[:3], other), gain @ self.covariance @ gain.T
+        return replace(self, q=q, pre=pre, post=post, covariance=covariance)
+
 
 @dataclass(frozen=True)
 class Track:
@@ -46,7 +61,9 @@ class Track:
     `covariance` (2nK, 2nK) is that of (v-, v+) of all impacts in turn: successive ones share a
     flight. `t` (T,) and `q` (T, n) are the frames, `residual` (T, n) in units of sigma, NaN where a
     frame was not used; `units` are those of the velocities; `acceleration` (n,) that of all
-    flights.
+    flights. Of poses q is (T, 7), the quaternion's scalar first, whatever the `order` of the file;
+    residuals and sigma are those of places and of turns about the axes of the body, and `inertia`
+    is as given, None as of a sphere.
     """
 
     impacts: tuple[TrackImpact, ...]
@@ -58,6 +75,8 @@ class Track:
     t: np.ndarray
     q: np.ndarray
     arcs: Arcs = field(repr=False)
+    order: str | None = None
+    inertia: np.ndarray | None = None
 
     @property
     def residual(self) -> np.ndarray:
@@ -65,9 +84,21 @@ class Track:
         return self.arcs.residual
 
     @property
+    def coordinates(self) -> np.ndarray:
+        """(T, n), q; of poses places, and turns about axes of the body since the first frame."""
+        if self.order is None:
+            return self.q
+        return np.hstack([self.q[:, :3], turns_since_first(self.q[:, 3:])])
+
+    @property
     def acceleration(self) -> np.ndarray:
         """(n,) of all flights: as given, or as found."""
         return self.arcs.acceleration
+
+    @property
+    def drag(self) -> float:
+        """Of all flights [1/m]: as given, or as found."""
+        return self.arcs.drag
 
     def __str__(self) -> str:
         """The impacts, a line each, and the warnings."""
@@ -77,6 +108,8 @@ class Track:
             f"{counted(count, 'impact')} in {frames} frames, {len(self.flights)} flights",
             f"sigma {noise}",
         ]
+        if self.arcs.free[1]:
+            lines.append(f"drag {self.drag:.4g} ± {self.arcs.drag_error:.2g} 1/m")
         for k, each in enumerate(self.impacts, 1):
             errors = np.sqrt(np.diag(each.covariance))
             values = [
@@ -101,7 +134,8 @@ class Track:
 
         With a scene or a body only those stay that its contacts can have made: one approaches, the
         lowest gap of the body is closed at the pose of the impact, and the change of momentum is
-        one of contacts that push (with any friction), within 5 standard errors or a fifth of it. A
+        one of contacts that push (with any friction), within 5 standard errors or a fifth of it;
+        and in both flights the body is free, not nearer to no acceleration than to a known one. A
         chain counts coordinates and velocities towards its right end: of bodies that move the other
         way round, mirror the track (-q, and the bodies in reverse).
 
@@ -112,8 +146,10 @@ class Track:
                 far from 0 [m].
 
         Raises:
-            ValueError: no impact, or none that the contacts can have made; a body in space, whose
-                angular velocity is no rate of coordinates; as `Body.scenes`.
+            ValueError: no impact, or none that the contacts can have made; a body in space without
+                poses (`quaternion`), or of another inertia than `find_impacts` was given, or whose
+                contacts can have made more of the impacts in the other order of quaternions; as
+                `Body.scenes`.
         """
         if not self.impacts:
             raise ValueError("No impact was found in the track: there are no shots.")
@@ -122,23 +158,18 @@ class Track:
             check_kind("scene", scene, Scene | Body)  # type: ignore[arg-type]
             check_values("near", np.asarray(near, float), low=0.0)
             if isinstance(scene, Body) and scene.coordinates is not None:
-                raise ValueError(
-                    "Argument `scene` must not be a body in space: its angular velocity is no rate "
-                    "of coordinates. Fit its places alone (`find_impacts` of x, y, z), take the "
-                    "turning from orientations yourself, and give `ji.Experiments` the scenes of "
-                    "`body.scenes(poses)`."
-                )
-            at = _scenes(scene, np.array([each.q for each in self.impacts]), near)
-            possible = [s is not None and _can_be_of(s, i) for s, i in zip(at, self.impacts)]
-            kept = np.flatnonzero(possible)
+                self._check_in_space(scene, near)
+            at = _scenes_of(scene, self.impacts, near)
+            free = self._between_free_flights()
+            kept = np.array([k for k, s in enumerate(at) if s is not None and free[k]], int)
             if not kept.size:
                 raise ValueError(
                     "Argument `scene` must be that of an impact of the track, but of none of "
                     f"{len(self.impacts)} a contact is closed within near = {near:g} m, approaches "
-                    "and can have made the jump."
+                    "and can have made the jump, between flights in which the body is free."
                 )
             scenes = [at[k] for k in kept]
-        n = self.q.shape[1]
+        n = len(self.units)
         return Experiments(
             [self.impacts[k].pre for k in kept],
             [self.impacts[k].post for k in kept],
@@ -148,16 +179,57 @@ class Track:
             units=self.units,
         )
 
+    def _between_free_flights(self) -> np.ndarray:
+        """Whether the body is held neither before nor after each impact (K,)."""
+        n = len(self.acceleration)
+        places, sigma = self.q[:, :n], self.sigma[:n]
+        held = held_flights(self.t, places, sigma, self.acceleration, self.flights)
+        return ~(held[:-1] | held[1:])
 
-def _scenes(place: Scene | Body, poses: np.ndarray, near: float) -> list[Scene | None]:
-    """The scene of each pose (K, n); None where no gap is closed."""
+    def _check_in_space(self, body: Body, near: float) -> None:
+        """Raise unless the poses are of this body: its inertia, and the order of quaternions."""
+        if self.order is None:
+            raise ValueError(
+                "Argument `scene` must not be a body in space, whose angular velocity is no rate "
+                "of coordinates: give `find_impacts` poses, places and quaternions (`quaternion`)."
+            )
+        first = body.scenes([self.impacts[0].q], near)[0]
+        own = dense_mass(first)[3:, 3:]
+        given = np.eye(3) if self.inertia is None else self.inertia
+        apart = own / np.trace(own) - given / np.trace(given)
+        if np.abs(apart).max() > INERTIA_WITHIN:
+            raise ValueError(
+                "Argument `scene` must turn as the track was told, but has the moments of inertia "
+                f"{own.tolist()}, and `inertia` of `find_impacts` was "
+                f"{'None, as of a sphere' if self.inertia is None else given.tolist()}: give it "
+                "inertia=body.inertia."
+            )
+        if all(_scenes_of(body, self.impacts, near)):
+            return
+        turned = [each.not_in(self.order) for each in self.impacts]
+        here, other = (sum(map(bool, _scenes_of(body, x, near))) for x in (self.impacts, turned))
+        # a few close a gap by chance, as a cube looks the same from many sides
+        if other > 2 * here + 1 or other > here == 0:
+            raise ValueError(
+                "Argument `quaternion` of `find_impacts` must name the order of the file, but in "
+                f"the order {self.order!r} {here} of {counted(len(turned), 'impact')} can be of "
+                f"this body, in the other one {other}."
+            )
+
+
+def _scenes_of(
+    place: Scene | Body, impacts: Sequence[TrackImpact], near: float
+) -> list[Scene | None]:
+    """The scene of each impact; None where no gap is closed, or contacts cannot have made it."""
     if isinstance(place, Scene):
-        return [place] * len(poses)
-    scenes: list[Scene | None] = list(place.scenes(poses, near))
-    for k, pose in enumerate(poses):
-        if abs(float(np.min(np.asarray(place.gap_function(pose))))) > near:
-            scenes[k] = None
-    return scenes
+        scenes: list[Scene | None] = [place] * len(impacts)
+    else:
+        poses = np.array([each.q for each in impacts])
+        scenes = list(place.scenes(poses, near))
+        for k, pose in enumerate(poses):
+            if abs(float(np.min(np.asarray(place.gap_function(pose))))) > near:
+                scenes[k] = None
+    return [s if s is not None and _can_be_of(s, i) else None for s, i in zip(scenes, impacts)]
 
 
 def _can_be_of(scene: Scene, impact: TrackImpact) -> bool:

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 from commands_cases import call
+from scipy.integrate import solve_ivp
 
 import jimpact as ji
 
@@ -153,7 +154,154 @@ def test_a_window_uses_frames_near_the_impact():
     whole = ji.tracks.find_impacts(t, y, 1e-3, acceleration=-G)
     near = ji.tracks.find_impacts(t, y, 1e-3, acceleration=-G, window=0.1)
     assert sum(map(len, near.flights)) < sum(map(len, whole.flights))
+    assert near.warnings == whole.warnings == ()
     assert restitution(near.impacts[0])[1] > restitution(whole.impacts[0])[1]
+
+
+def dragged(rng, drag=0.12, sideways=0.0):
+    """A ball that the air slows, by integration of its motion; bounces with e = 0.8."""
+    t = (np.arange(90) + rng.random()) / 120
+
+    def motion(_, x):
+        v = x[3:]
+        return np.append(v, np.array([0, 0, -G]) - drag * np.linalg.norm(v) * v)
+
+    fall = solve_ivp(
+        motion, (0, 2), [0, 0, 0.5, sideways, 0, 0], rtol=1e-10, atol=1e-12, dense_output=True,
+        events=lambda _, x: x[2],
+    )  # fmt: skip
+    first, before = fall.t_events[0][0], fall.y_events[0][0]
+    after = before * [1, 1, 1, 0.7, 1, -0.8]
+    rise = solve_ivp(motion, (first, 2), after, rtol=1e-10, atol=1e-12, dense_output=True)
+    q = np.where(t < first, fall.sol(t), rise.sol(t))[:3].T
+    return t, q + 1e-3 * rng.normal(size=q.shape), before[3:], after[3:]
+
+
+@pytest.mark.parametrize("drag", [0.12, None])
+def test_drag_of_the_air_is_part_of_the_flights(drag):
+    rng, errors, warned, drags = np.random.default_rng(5), [], 0, []
+    for _ in range(40):
+        t, q, *_ = dragged(rng)
+        track = ji.tracks.find_impacts(t, q[:, 2], 1e-3, acceleration=-G, drag=drag)
+        (impact,) = track.impacts
+        value, error = restitution(impact)
+        errors.append((value - 0.8) / error)
+        warned += bool(track.warnings)
+        drags.append(track.drag)
+    assert warned <= 3
+    assert abs(np.mean(errors)) < 4 / np.sqrt(40)
+    assert 0.7 < np.std(errors) < 1.4
+    assert error < (0.0006 if drag else 0.006)
+    assert abs(np.mean(drags) - 0.12) < 0.01
+    if drag is None:
+        assert "drag 0." in str(track)
+    t, q, *_ = dragged(rng)  # and what is wrong without it
+    track = ji.tracks.find_impacts(t, q[:, 2], 1e-3, acceleration=-G)
+    near = min(track.impacts, key=lambda each: abs(each.time - 0.322))
+    assert abs(restitution(near)[0] - 0.8) > 0.015
+    assert track.warnings
+
+
+def test_drag_in_space_with_lost_frames_and_a_window():
+    rng = np.random.default_rng(6)
+    t, q, before, after = dragged(rng, 0.2, sideways=2.0)
+    q[rng.random(90) < 0.1] = np.nan
+    for options in ({}, {"window": 0.15}, {"sigma": None}):
+        choice = {"sigma": 1e-3, "acceleration": [0, 0, -G], "drag": 0.2} | options
+        (impact,) = ji.tracks.find_impacts(t, q, **choice).impacts
+        error = np.concatenate([impact.pre - before, impact.post - after])
+        assert error @ np.linalg.solve(impact.covariance, error) < 25  # chi^2 of 6: once in 3000
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"drag": -0.1}, "`drag`"),
+        ({"drag": np.nan}, "`drag`"),
+        ({"drag": 0.1, "units": "rad"}, "angles"),
+        ({"drag": 50.0}, "`drag`.*too much"),
+    ],
+)
+def test_a_drag_that_cannot_be_is_refused(options, words):
+    t, q, *_ = dragged(np.random.default_rng(6))
+    with pytest.raises(ValueError, match=words):
+        ji.tracks.find_impacts(t, q[:, 2], 1e-3, acceleration=-G, **options)
+
+
+def bounces(t, e, height=0.5):
+    """Heights of a ball that is let go at 0 s, bounces and comes to rest, and when it bounces."""
+    first = np.sqrt(2 * height / G)
+    at, speed, times = first, G * first, []
+    y = np.where(t < 0, height, np.where(t < first, height - G * t**2 / 2, 0.0))
+    while speed > 1e-6:
+        times.append(at)
+        speed, since = e * speed, t - at
+        here = (since >= 0) & (since < 2 * speed / G)
+        y[here] = speed * since[here] - G * since[here] ** 2 / 2
+        at += 2 * speed / G
+    return y, np.array(times)
+
+
+@pytest.mark.parametrize(("fps", "noise"), [(60, 1e-3), (120, 1e-4), (240, 1e-3), (500, 1e-3)])
+def test_a_ball_that_comes_to_rest_has_no_impacts_there(fps, noise):
+    """Nor in the hand that holds it, half a second before."""
+    for e, seed, sigma in ((0.3, 0, None), (0.8, 1, noise)):
+        rng = np.random.default_rng(seed)
+        t = np.arange(0, 4.0, 1 / fps) + rng.random() / fps - 0.5 * (seed == 1)
+        y, times = bounces(t, e)
+        track = ji.tracks.find_impacts(
+            t, y + noise * rng.normal(size=t.size), sigma, acceleration=-G
+        )
+        found = np.array([each.time for each in track.impacts])
+        late = np.abs(found - times[: len(found)]) * fps
+        # the last one may lie between the bounces that its flight cannot tell
+        assert late[:-1].max(initial=0.0) < 1
+        heights = G * np.diff(times) ** 2 / 8
+        assert len(found) >= np.argmax((heights < 10 * noise) | (np.diff(times) * fps < 10))
+        es = np.array([restitution(each) for each in track.impacts[:-1]])
+        assert (np.abs(es[:, 0] - e) < 5 * es[:, 1]).all() if len(es) else True
+        told = [line for line in track.warnings if "nothing is used" in line]
+        assert all("rests" in line for line in told)
+        if seed and noise == 1e-3:
+            assert told[0].startswith("Up to ")
+        if noise == 1e-3:
+            time = float(told[-1].split()[1])
+            assert times[0] < time < times[-1] + 0.2
+
+
+def test_a_body_that_is_held_in_the_middle_of_a_track_has_no_shots_there():
+    """A disc bounces once, sticks to the table for half a second, and is thrown up again."""
+    rng, t = np.random.default_rng(3), np.arange(300) / 240
+    heights = [
+        (0.0, 0.2, 0.0),  # from when on, height above the table, velocity upwards
+        (np.sqrt(0.4 / G), 0.0, 1.0),
+        (np.sqrt(0.4 / G) + 2 / G, None, 0.0),
+        (np.sqrt(0.4 / G) + 2 / G + 0.5, 0.0, 2.0),
+    ]
+    y = np.zeros(300)
+    for begins, height, speed in heights:
+        since = t - begins
+        flight = 0.0 if height is None else height + speed * since - G * since**2 / 2
+        y = np.where(since >= 0, flight, y)
+    q = np.column_stack([0.3 * t, 0.05 + y, 2.0 * t]) + [3e-4, 3e-4, 3e-3] * rng.normal(
+        size=(300, 3)
+    )
+    track = ji.tracks.find_impacts(
+        t, q, [3e-4, 3e-4, 3e-3], acceleration=[0, -G, 0], units=["m", "m", "rad"]
+    )
+    assert len(track.impacts) > 4
+    shots = track.experiments(ji.Disc(0.05))
+    assert shots.shots == ("1",)
+    np.testing.assert_allclose(
+        [shots.pre[0, 1], shots.post[0, 1]], [-np.sqrt(0.4 * G), 1.0], atol=0.02
+    )
+
+
+def test_a_window_that_leaves_too_few_frames_is_refused():
+    t, y, _ = ball(np.random.default_rng(2))
+    for window in (1e-6, 0.012):
+        with pytest.raises(ValueError, match="`window` must leave 3 frames or more"):
+            ji.tracks.find_impacts(t, y, 1e-3, acceleration=-G, window=window)
 
 
 def test_time_is_linear_and_impacts_many():
@@ -234,6 +382,11 @@ def test_bounce_times_reach_the_bound():
         ({"q": np.zeros((5, 1))}, "shapes"),
         ({"units": "deg"}, "'rad'"),
         ({"contact": -1.0}, "contact"),
+        ({"contact": np.inf}, "contact"),
+        ({"acceleration": [1.0, 2.0]}, "acceleration"),
+        ({"t": np.arange(6.0)[:, None]}, "shapes"),
+        ({"q": np.full(6, np.inf)}, "q"),
+        ({"inertia": [1.0, 1.0, 2.0]}, "`quaternion` must name"),
         ({"window": 0.0}, "window"),
         ({"shortest": 2}, "shortest"),
     ],
@@ -296,7 +449,7 @@ def test_impacts_of_unknown_gravity_are_all_found():
 def test_a_body_in_space_is_refused_with_advice():
     t, q, _ = ball(np.random.default_rng(1), coordinates=3)
     track = ji.tracks.find_impacts(t, q, 1e-3, acceleration=[0, 0, -G])
-    with pytest.raises(ValueError, match=r"body in space.*body\.scenes"):
+    with pytest.raises(ValueError, match=r"body in space.*`quaternion`"):
         track.experiments(ji.Box([0.1, 0.1, 0.1]))
 
 

@@ -1,0 +1,119 @@
+"""What the drag of the air adds to a ballistic arc between the same ends.
+
+With `a = g - k |v| v` a flight is the arc of g plus D, `D'' = -k |v| v`, D = 0 at both ends. D''
+is a polynomial through Chebyshev points, found by Picard's iteration.
+"""
+
+import numpy as np
+from numpy.polynomial import chebyshev
+from scipy.integrate import cumulative_trapezoid
+
+# Chebyshev points of a flight. |v| v has a bend where a ball turns: with 24 D is within 1e-4 of its
+# size. Ten times more is not seen beside noise.
+NODES = 24
+ROUNDS = 60  # of Picard; each gains a factor of about 2 / (k |v| h), h the duration
+SETTLED = 1e-12  # of the length of a flight; ten times more is still far below noise
+DIVERGED = 1e6  # lengths of a flight; ten times more would still be far from overflow
+# Share of a length, a duration, an acceleration, by which difference quotients move. Ten times more
+# makes errors of D of 1e-3 in slopes, which are small beside those of the arc.
+STEP = 1e-4
+
+_POINTS = chebyshev.chebpts1(NODES)
+_FIT = np.linalg.inv(chebyshev.chebvander(_POINTS, NODES - 1))
+
+
+def _twice_integrated() -> np.ndarray:
+    """(NODES + 2, NODES): from coefficients of D'' to those of D on [-1, 1], 0 at both ends."""
+    whole = chebyshev.chebint(np.eye(NODES), 2)
+    left, right = (chebyshev.chebval(end, whole) for end in (-1.0, 1.0))
+    whole[0] -= (left + right) / 2
+    whole[1] -= (right - left) / 2
+    return whole
+
+
+_TWICE = _twice_integrated() @ _FIT
+_ONCE = chebyshev.chebder(_TWICE)
+_RATES = chebyshev.chebvander(_POINTS, NODES) @ _ONCE
+_END_RATES = chebyshev.chebvander(np.array([-1.0, 1.0]), NODES) @ _ONCE
+
+
+def bent(
+    x: np.ndarray, tau: np.ndarray, places: np.ndarray, a: np.ndarray, k: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """D (B, F, n) at times x (F,), and D' at both ends (B, 2, n), of B flights.
+
+    Args:
+        x: times (F,).
+        tau: of both ends (B, 2).
+        places: there (B, 2, n).
+        a: acceleration without drag (B, n).
+        k: drag (B,) [1/m].
+
+    Raises:
+        ValueError: drag bends flights too much for the iteration.
+    """
+    h = np.diff(tau)[:, :, None]
+    chord = (places[:, 1] - places[:, 0])[:, None]
+    arc = chord / h + a[:, None] * h / 2 * _POINTS[:, None]  # velocity of the arc at the points
+    force, length = np.zeros_like(arc), np.abs(arc).max() * h.max()
+    for _ in range(ROUNDS):
+        v = arc + h / 2 * (_RATES @ force)
+        new = -k[:, None, None] * np.linalg.norm(v, axis=2, keepdims=True) * v
+        moved, force = np.abs(new - force).max() * h.max() ** 2, new
+        if not SETTLED * length < moved < DIVERGED * length:
+            break
+    if not moved <= 1e-6 * length:
+        raise ValueError(
+            f"Argument `drag` must be a coefficient [1/m] that bends flights little, but "
+            f"{float(np.max(np.abs(k))):.3g} is too much for a flight of {float(h.max()):.3g} s at "
+            f"{float(np.linalg.norm(arc, axis=2).max()):.3g} m/s."
+        )
+    u = 2 * (x - tau[:, :1]) / h[:, 0] - 1
+    D = (h / 2) ** 2 * (chebyshev.chebvander(u, NODES + 1) @ (_TWICE @ force))
+    return D, h / 2 * (_END_RATES @ force)
+
+
+def bent_slopes(
+    x: np.ndarray, tau: np.ndarray, places: np.ndarray, a: np.ndarray, k: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """D (F, n) and D' (2, n) of one flight, and their slopes (F, n, P) and (2, n, P).
+
+    In P = 3 n + 3 values: place and instant of the first end, of the last one, acceleration, drag.
+    """
+    n, h = len(a), tau[1] - tau[0]
+    length = np.linalg.norm(places[1] - places[0]) + np.linalg.norm(a) * h**2 / 2
+    length = length if length > 0 else 1.0
+    end = [length] * n + [h]
+    sizes = STEP * np.array(end + end + [length / h**2] * n + [1 / length])
+    moves = np.vstack([np.zeros(len(sizes)), np.diag(sizes)])
+    first, last, rest = np.split(moves, [n + 1, 2 * n + 2], axis=1)
+    D, rates = bent(
+        x,
+        tau + np.stack([first[:, n], last[:, n]], axis=1),
+        places + np.stack([first[:, :n], last[:, :n]], axis=1),
+        a + rest[:, :n],
+        k + rest[:, n],
+    )
+    slopes = (np.moveaxis(y[1:] - y[0], 0, 2) / sizes for y in (D, rates))
+    return D[0], rates[0], *slopes
+
+
+def straightened(t: np.ndarray, q: np.ndarray, k: float) -> np.ndarray:
+    """Places (T, n) as they were without drag, up to a line in each flight.
+
+    The acceleration of drag, by velocities over four frames, is integrated twice and taken away:
+    good enough to find flights. Velocities near an impact are wrong, but only for two frames.
+    """
+    whole, frames = between(t, t, q), np.arange(len(t))
+    low, high = np.maximum(frames - 2, 0), np.minimum(frames + 2, len(t) - 1)
+    v = (whole[high] - whole[low]) / (t[high] - t[low])[:, None]
+    slowing = np.linalg.norm(v, axis=1, keepdims=True) * v
+    slower = cumulative_trapezoid(slowing, t, axis=0, initial=0)
+    return q + k * cumulative_trapezoid(slower, t, axis=0, initial=0)
+
+
+def between(times: np.ndarray, t: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Places (.., n) at times, linear between frames that were seen."""
+    seen = np.isfinite(q)
+    columns = [np.interp(times, t[ok], x[ok]) for x, ok in zip(q.T, seen.T)]
+    return np.stack(columns, axis=1)

@@ -1,0 +1,156 @@
+"""Poses of a body in space: shots of its velocities (x', omega), omega in its own axes.
+
+The arcs of its places and the free rotation of each flight are known first, each by itself. At an
+impact the orientations of both flights meet: under this condition places, instants and rotations
+have their most likely values, and their covariance, all at once.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from jimpact.fits.covariances import diagonal_blocks
+from jimpact.fits.shots_file import ANGULAR, LINEAR
+from jimpact.tracks.arcs import Arcs
+from jimpact.tracks.judging import findings_of_noise, findings_of_turns
+from jimpact.tracks.quaternions import turns_since_first
+from jimpact.tracks.segments import noise
+from jimpact.tracks.track import Track, TrackImpact
+from jimpact.tracks.turning import Turning, fit_turning
+
+MEETINGS = 5  # times that the condition is taken anew; the third changes nothing that is seen
+
+
+def with_turns(
+    track: Track, e: np.ndarray, sigma: np.ndarray | None, inertia: np.ndarray | None
+) -> Track:
+    """The track of places with orientations e (T, 4): impacts with velocities (x', omega).
+
+    sigma (3,) of turns about the axes of the body [rad]; None: taken from the residuals.
+    """
+    frames = [some[np.isfinite(e[some, 0])] for some in track.flights]
+    for k, some in enumerate(frames, 1):
+        if len(some) < 2:
+            raise ValueError(
+                "Argument `q` must have an orientation in 2 frames or more of each flight, but in "
+                f"flight {k} it has {len(some)}."
+            )
+    turns = [Rotation.from_quat(np.roll(e[some], -1, axis=1)) for some in frames]
+    given, notes = np.ones(3) if sigma is None else sigma, []
+    fitted = [fit_turning(track.t[f], r, given, inertia) for f, r in zip(frames, turns)]
+    if sigma is None:  # each flight takes two values of each axis
+        square = sum((rest**2).sum(axis=0) for _, rest in fitted)
+        given = np.sqrt(square / max(sum(map(len, frames)) - 2 * len(frames), 1))
+        given = np.maximum(given, np.finfo(float).eps ** 0.5)
+        fitted = [fit_turning(track.t[f], r, given, inertia) for f, r in zip(frames, turns)]
+        notes = findings_of_noise(noise(turns_since_first(e)), given, first=4)
+    arcs, flights, covariance, p_values = _met(track, [flight for flight, _ in fitted])
+    residual = np.full((len(e), 3), np.nan)
+    for flight, some, measured in zip(flights, frames, turns):
+        residual[some] = (flight.at(track.t[some])[0].inv() * measured).as_rotvec() / given
+    arcs = replace(arcs, residual=np.hstack([track.residual, residual]))
+    taken = 6 * len(flights) - 2 * len(p_values)  # meetings give back three, for half an instant
+    notes += findings_of_turns(e, given, residual, p_values, taken)
+    return replace(
+        _with_velocities(track, arcs, flights, covariance),
+        sigma=np.concatenate([track.sigma, given]),
+        warnings=(*track.warnings, *notes),
+        units=(LINEAR,) * 3 + (ANGULAR,) * 3,
+        q=np.hstack([track.q, e]),
+    )
+
+
+def _met(
+    track: Track, flights: list[Turning]
+) -> tuple[Arcs, list[Turning], np.ndarray, np.ndarray]:
+    """Arcs and rotations that meet at the instants, their covariance, and p-values (K,).
+
+    The least change of all, in units of their errors, with which they do: Gauss-Newton for normal
+    errors under a condition. The p-value is that of the changes that an impact asks for.
+    """
+    first, impacts = track.arcs, len(track.arcs.instants) - 2
+    free = len(first.covariance)  # values of the arcs: places and instant of each end, acceleration
+    C = block_diag(first.covariance, *(flight.covariance for flight in flights))
+    change, arcs, turned = np.zeros(len(C)), first, flights
+    p_values = np.ones(impacts)
+    if not impacts:
+        return arcs, turned, C, p_values
+    for k in range(MEETINGS):
+        apart, H = _apart(arcs, turned, track.t.mean(), free)
+        S = H @ C @ H.T
+        if k == 0:
+            each = apart.reshape(-1, 3), diagonal_blocks(S, 3)
+            p_values = np.array([chi2.sf(x @ np.linalg.solve(A, x), 3) for x, A in zip(*each)])
+        change = C @ H.T @ np.linalg.solve(S, H @ change - apart)
+        arcs = _changed(first, change[:free])
+        turned = [f.moved(x) for f, x in zip(flights, change[free:].reshape(-1, 6))]
+    return arcs, turned, C - C @ H.T @ np.linalg.solve(S, H @ C), p_values
+
+
+def _apart(
+    arcs: Arcs, flights: list[Turning], zero: float, free: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Turns (3K,) from the flight before an impact to the one after it, and their slopes.
+
+    zero: time of the zero of instants [s]; free: values of the arcs, before those of the flights.
+    """
+    impacts = len(flights) - 1
+    apart, H = np.zeros(3 * impacts), np.zeros((3 * impacts, free + 6 * len(flights)))
+    for i, instant in enumerate(arcs.instants[1:-1] + zero):
+        rows, own = slice(3 * i, 3 * i + 3), free + 6 * i
+        (before, w0, turn0, _), (after, w1, turn1, _) = (
+            flight.at(np.array([instant])) for flight in flights[i : i + 2]
+        )
+        between = before[0].inv() * after[0]
+        apart[rows] = between.as_rotvec()
+        H[rows, own : own + 6] = -between.as_matrix().T @ turn0[0]
+        H[rows, own + 6 : own + 12] = turn1[0]
+        H[rows, 4 * (i + 1) + 3] = w1[0] - w0[0]  # an instant is the last of four values
+    return apart, H
+
+
+def _changed(arcs: Arcs, change: np.ndarray) -> Arcs:
+    """Arcs with other places, instants and acceleration."""
+    ends = 4 * len(arcs.instants)
+    each, a, k = np.split(change, [ends, ends + 3 * arcs.free[0]])
+    each = each.reshape(-1, 4)
+    return replace(
+        arcs,
+        places=arcs.places + each[:, :3],
+        instants=arcs.instants + each[:, 3],
+        acceleration=arcs.acceleration + (a if a.size else 0.0),
+        drag=arcs.drag + float(k.sum()),
+    )
+
+
+def _with_velocities(
+    track: Track, arcs: Arcs, flights: list[Turning], covariance: np.ndarray
+) -> Track:
+    """The track with these flights: its impacts, and the covariance of their velocities."""
+    free, (before, after) = len(arcs.covariance), arcs.velocities()
+    impacts = len(before)
+    gain = np.zeros((impacts, 2, 6, len(covariance)))
+    gain[:, :, :3, :free] = arcs.gain()
+    times, poses = arcs.instants[1:-1] + track.t.mean(), []
+    omegas = np.zeros((impacts, 2, 3))
+    for k, instant in enumerate(times):
+        for side in (0, 1):
+            flight, first = flights[k + side], free + 6 * (k + side)
+            turn, omega, _, slopes = flight.at(np.array([instant]))
+            omegas[k, side], gain[k, side, 3:, first : first + 6] = omega[0], slopes[0]
+            gain[k, side, 3:, 4 * (k + 1) + 3] = flight.rate(omega[0])
+            if side == 0:
+                quaternion = np.roll(turn[0].as_quat(), 1)
+                poses.append(np.concatenate([arcs.places[k + 1], quaternion]))
+    flat = gain.reshape(12 * impacts, len(covariance))
+    whole = flat @ covariance @ flat.T
+    found = []
+    for k, (instant, pose) in enumerate(zip(times, poses)):
+        own, at = slice(12 * k, 12 * (k + 1)), 4 * (k + 1) + 3
+        pre, post = (np.append(v[k], w) for v, w in zip((before, after), omegas[k]))
+        error = float(np.sqrt(covariance[at, at]))
+        found.append(TrackImpact(float(instant), error, pose, pre, post, whole[own, own]))
+    return replace(track, impacts=tuple(found), covariance=whole, arcs=arcs)

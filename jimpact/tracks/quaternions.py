@@ -1,0 +1,76 @@
+"""Poses as a tracker writes them: the order of the quaternion, its length, moments of inertia."""
+
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from jimpact.tools.checks import check_choice
+
+ORDERS = {"wxyz": (1, 2, 3, 0), "xyzw": (0, 1, 2, 3)}  # where x, y, z, w stand
+# How far a measured quaternion may be from length 1; with three digits it is off by less. Ten times
+# more would pass angles for quaternions in one of ten frames.
+LENGTH_WITHIN = 1e-2
+
+
+def as_poses(q: Any, order: str) -> tuple[np.ndarray, np.ndarray]:
+    """Places (T, 3) and unit quaternions (T, 4), scalar first, NaN where lost."""
+    check_choice("quaternion", order, tuple(ORDERS))
+    q = np.array(q, float)
+    if q.ndim != 2 or q.shape[1] != 7:
+        raise ValueError(
+            "Argument `q` must have shape (T, 7), x, y, z and a quaternion, as `quaternion` is "
+            f"given, but has shape {q.shape}."
+        )
+    e = q[:, 3:][:, np.roll(ORDERS[order], 1)]
+    length = np.linalg.norm(e, axis=1)
+    far = np.abs(length - 1) > LENGTH_WITHIN  # no where a frame is lost
+    if far.any():
+        k = int(far.argmax())
+        raise ValueError(
+            f"Argument `q` must have quaternions of length 1, but that of frame {k + 1} has length "
+            f"{length[k]:.4g}. Are these angles? A lost frame must be NaN, not 0."
+        )
+    return q[:, :3], e / length[:, None]
+
+
+def as_inertia(inertia: Any) -> np.ndarray | None:
+    """(3, 3), or None where a body turns like a sphere."""
+    if inertia is None:
+        return None
+    array = np.asarray(inertia, float)
+    array = np.diag(array) if array.shape == (3,) else array
+    symmetric = array.shape == (3, 3) and np.isfinite(array).all() and np.allclose(array, array.T)
+    moments = np.linalg.eigvalsh(array) if symmetric else np.zeros(3)
+    if not moments[0] > 0:
+        raise ValueError(
+            "Argument `inertia` must be three moments > 0 along the axes of the body, or a "
+            f"symmetric (3, 3), but has value {np.asarray(inertia).tolist()}."
+        )
+    return None if np.allclose(moments, moments[0]) else array
+
+
+def turns_since_first(e: np.ndarray) -> np.ndarray:
+    """Sums (T, 3) of the turns from frame to frame, about the axes of the body, NaN where lost."""
+    seen, sums = np.isfinite(e).all(axis=1), np.full((len(e), 3), np.nan)
+    measured = Rotation.from_quat(np.roll(e[seen], -1, axis=1))
+    steps = (measured[:-1].inv() * measured[1:]).as_rotvec()
+    sums[seen] = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    return sums
+
+
+def in_the_other_order(e: np.ndarray, order: str) -> tuple[np.ndarray, np.ndarray]:
+    """The quaternion (4,) if the file stood in the other order than `order`, and A (3, 3).
+
+    Poses turn evenly in either order, as it turns the unit sphere of quaternions only: frames
+    alone cannot tell. omega = 2 e* e' becomes A omega.
+    """
+    shift = 1 if order == "wxyz" else -1
+    other = np.roll(e, shift)
+    return other, (_left(other).T @ np.roll(_left(e), shift, axis=0))[1:, 1:]
+
+
+def _left(e: np.ndarray) -> np.ndarray:
+    """(4, 4), by which `e f` is its product with f."""
+    w, x, y, z = e
+    return np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
