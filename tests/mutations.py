@@ -85,7 +85,7 @@ MUTATIONS = [
     Mutation("friction of the other contact", "FrictionFlow.constants", "-slip.astype(self.friction.dtype) * self.friction", "-slip.astype(self.friction.dtype) * self.friction[::-1]", ("test_friction.py::test_lzb_in_the_plane",)),
     Mutation("pulling is not reported", "_signs", "-floor", "-1000000000.0 * floor", ("test_documents.py::test_docstrings_run[jimpact.core.impacts]",)),
     Mutation("open contacts take part", "_resolved", "law.uses_gaps", "True", ("test_own_law.py::test_what_every_law_gets_for_nothing",)),
-    Mutation("oblique tangents are not reported", "_is_oblique", "known & (off > _SQUARE * bodies)", "known & False & (off > _SQUARE * bodies)", ("test_scenes.py::test_tangents_that_distort_friction_are_reported",)),
+    Mutation("oblique tangents are not reported", "_is_oblique", "are_positions & (error > _SQUARE * bodies)", "are_positions & False & (error > _SQUARE * bodies)", ("test_scenes.py::test_tangents_that_distort_friction_are_reported",)),
     Mutation("energies that no number holds pass", "Traced.status", "_has_scale(size, arguments[2])", "True", ("test_contract.py::test_energies_that_no_number_holds_are_out_of_range[moreau]",)),
     Mutation("gaps that are not known count as open", "Traced._refusal", "[jnp.any(jnp.isnan(x)) for x in numbers]", "[]", ("test_contract.py::test_what_the_host_refuses_has_a_status_inside_jit[moreau]",)),
     Mutation("an asymmetric mass passes inside jit", "is_allowed", "_is_symmetric(scene.mass)", "jnp.asarray(True)", ("test_contract.py::test_what_the_host_refuses_has_a_status_inside_jit[moreau]",)),

@@ -231,38 +231,44 @@ def _closed(
 
 
 def active_pairs(bodies: Pile, q: jax.Array, later: jax.Array, below: jax.Array) -> ActivePairs:
-    """The contacts, at q, with gaps up to `below` at q or `later`."""
+    """The contacts whose gap is at most `below` at the coordinates q, or `later` at a step's end.
+
+    Of all candidates the closed ones get the rows 0, 1, .. of arrays of fixed length, `bodies.room`
+    rounded up to blocks, in the order of their numbers. Rows that are not used are 0, and have the
+    number `no_contact`. It overflows where there are more than `bodies.room`.
+    """
     numbers, closed, overflows = _closed(bodies, q, later, below)
     rows = -(-bodies.room // BLOCK) * BLOCK
-    so_far = jnp.cumsum(closed, dtype=jnp.int32)
-    count = jnp.minimum(so_far[-1], rows)
-    d, none = bodies.dimension, jnp.int32(slots(bodies) * bodies.count * stride(bodies))
+    closed_up_to = jnp.cumsum(closed, dtype=jnp.int32)  # among the first k candidates
+    count = jnp.minimum(closed_up_to[-1], rows)
+    d = bodies.dimension
+    no_contact = jnp.int32(slots(bodies) * bodies.count * stride(bodies))  # above all numbers
 
-    def one(first: jax.Array, filled: Any) -> Any:
-        """The next rows."""
-        used, chosen = chosen_rows(so_far, first, count)
+    def fill_block(first: jax.Array, filled: Any) -> Any:
+        """The arrays with the rows from `first` on, as many as a block has."""
+        used, chosen = chosen_rows(closed_up_to, first, count)
         chosen = jnp.where(used, numbers[chosen], 0)
-        i, j, ways = _of_contacts(bodies, q, chosen)
+        i, j, directions = _of_contacts(bodies, q, chosen)
         new = (
-            jnp.where(used, chosen, none),
+            jnp.where(used, chosen, no_contact),
             jnp.where(used[:, None], jnp.stack([i, j], axis=1), 0),
-            jnp.where(used[:, None, None, None], ways, 0.0),
+            jnp.where(used[:, None, None, None], directions, 0.0),
         )
         return tuple(with_block(x, part, first) for x, part in zip(filled, new))
 
     start = (
-        jnp.full(rows, none, jnp.int32),
+        jnp.full(rows, no_contact, jnp.int32),
         jnp.zeros((rows, 2), jnp.int32),
         jnp.zeros((rows, d, 2, d + bodies.angular), q.dtype),
     )
-    number, between, directions = over_blocks(count, one, start)
+    number, between, directions = over_blocks(count, fill_block, start)
     return ActivePairs(
         number,
         jnp.asarray(np.arange(rows, dtype=np.int32)) < count,
         count,
         between,
         directions,
-        overflows | (so_far[-1] > bodies.room),
+        overflows | (closed_up_to[-1] > bodies.room),
         least_radius(bodies),
     )
 

@@ -59,13 +59,17 @@ class Call:
         return "jimpact" if self.command is None else f"jimpact {self.command.name()}"
 
     def interrupt_message(self) -> str:
-        """What ctrl-C leaves behind."""
+        """What ctrl-C leaves behind: steps that are done, and what is kept in files.
+
+        What is finished is printed and drawn at once, where a command can do so.
+        """
         done = f" after: {'; '.join(self.steps.done)}" if self.steps and self.steps.done else ""
-        remains = "" if self.command is None else self.command.remains()
         if self.steps is not None and self.steps.show_finished is not None:
             self.steps.show_finished()
             sys.stdout.flush()
             remains = "What was finished is printed and drawn."
+        else:
+            remains = "" if self.command is None else self.command.remains()
         return f"{self.name}: stopped{done}. {remains}".rstrip()
 
     def warn(self, message: Any, *_: Any) -> None:

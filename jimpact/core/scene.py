@@ -605,20 +605,25 @@ def _check_scene(scene: Scene) -> None:
 
 
 def _check_directions(scene: Scene) -> None:
-    """Warn where directions of a contact depend on each other, or are not at right angles."""
+    """Warn where the normal and tangents D_i (n, d) of a contact are dependent, or oblique.
+
+    Equation: dependent where the least eigenvalue of `D_i^T M^-1 D_i`, scaled to a diagonal of 1,
+    is below `_DEPENDENT`; oblique as of `_is_oblique`.
+    """
     if is_traced((scene.mass, scene.normals, scene.tangents)):
         return
     n, m, mass = scene.size, scene.contacts, np.asarray(scene.mass, float)
     tangents = np.asarray(scene.tangents, float).reshape(n, m, -1)
     directions = np.concatenate([np.asarray(scene.normals, float)[:, :, None], tangents], axis=2)
-    rows = directions.reshape(n, -1)
-    diagonal = mass.ndim == 1
-    kinetic = (
-        rows.T / np.sqrt(mass) if diagonal else np.linalg.solve(np.linalg.cholesky(mass), rows).T
-    )
+    columns = directions.reshape(n, -1)
+    if mass.ndim == 1:
+        kinetic = columns.T / np.sqrt(mass)
+    else:  # M = L L^T: the rows `D^T L^-T` have the products of `D^T M^-1 D`
+        kinetic = np.linalg.solve(np.linalg.cholesky(mass), columns).T
     length = np.linalg.norm(kinetic, axis=1, keepdims=True)
     unit = (kinetic / np.where(length > 0, length, 1.0)).reshape(m, -1, n)
     least = np.linalg.eigvalsh(unit @ np.swapaxes(unit, 1, 2))[:, 0]
+    # more directions than coordinates always depend on each other
     dependent = (least < _DEPENDENT) & (n >= unit.shape[1])
     oblique = _is_oblique(dense_mass(scene), np.moveaxis(directions, 1, 0))
     if dependent.any():
@@ -639,9 +644,11 @@ def _check_directions(scene: Scene) -> None:
 def _is_oblique(mass: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Contacts (m,) whose directions (m, n, d) are not orthonormal in the bodies' positions.
 
-    A scene does not say which coordinates are positions. Those of bodies of one mass are taken for
-    positions if they are uncoupled in M, as many as the directions of each body that the contact
-    moves, and if the normal has length 1 in each body. Rotations do not fit this but by chance.
+    A scene does not say which coordinates are positions. Of each value on the diagonal of M, take
+    the uncoupled coordinates of this mass, and D, the rows of the d directions for them. If they
+    are positions of b bodies, in each of which the normal has length 1, then its square is b, and
+    the contact moves d b of them. Where both hold they are taken for positions, and the directions
+    are oblique unless `D^T D = b I`. Rotations do not fit this but by chance.
     """
     masses, count = np.diag(mass), directions.shape[2]
     moves: np.ndarray = np.any(directions, axis=2)
@@ -651,10 +658,10 @@ def _is_oblique(mass: np.ndarray, directions: np.ndarray) -> np.ndarray:
         position = np.flatnonzero(uncoupled & (masses == value))
         part = directions[:, position]
         gram = np.swapaxes(part, 1, 2) @ part
-        bodies, coordinates = gram[:, 0, 0], moves[:, position].sum(axis=1)
-        known = np.isclose(coordinates, count * bodies, rtol=_SQUARE) & (bodies > 0)
-        off = np.abs(gram - bodies[:, None, None] * np.eye(count)).max(axis=(1, 2))
-        oblique |= known & (off > _SQUARE * bodies)
+        bodies, moved = gram[:, 0, 0], moves[:, position].sum(axis=1)  # b, of unit normals
+        are_positions = np.isclose(moved, count * bodies, rtol=_SQUARE) & (bodies > 0)
+        error = np.abs(gram - bodies[:, None, None] * np.eye(count)).max(axis=(1, 2))
+        oblique |= are_positions & (error > _SQUARE * bodies)
     return oblique
 
 

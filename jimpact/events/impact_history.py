@@ -46,12 +46,12 @@ class HistoryProgram:
     outcome: ImpulseProgram  # `with_end_time`: no closed form ends it
     samples: int
 
-    def each(self, x: jax.Array) -> jax.Array:
-        """x (k, B) in each sample."""
+    def one_per_sample(self, x: jax.Array) -> jax.Array:
+        """x (k, B), once for each sample (s, k, B)."""
         return jnp.broadcast_to(x, (self.samples, *x.shape))
 
-    def parts(self, dtype: Any) -> jax.Array:
-        """Samples (s,) as parts of the duration."""
+    def fractions(self, dtype: Any) -> jax.Array:
+        """Times of the samples (s,) over the duration, from 0 to 1."""
         return jnp.linspace(0.0, 1.0, self.samples, dtype=dtype)
 
     def __call__(self, *leaves: jax.Array) -> tuple[jax.Array, ...]:
@@ -61,7 +61,7 @@ class HistoryProgram:
         gamma, most, checkpoints = problem.gamma, self.outcome.most, self.outcome.checkpoints
         constant = jax.lax.stop_gradient((flow, gamma, modes, y))
         duration = run(*constant, most, inspect, checkpoints).reached[-1:]
-        t = self.parts(y.dtype)[:, None, None] * jax.lax.stop_gradient(duration)[None]
+        t = self.fractions(y.dtype)[:, None, None] * jax.lax.stop_gradient(duration)[None]
 
         def observe(seen: Seen, now: stepper.StepperState, accept: jax.Array) -> Seen:
             """With this step where it may contain a sample."""
@@ -76,7 +76,9 @@ class HistoryProgram:
 
         first = flow.contact_states(modes, y).force
         clock = jnp.zeros((4, *y.shape[1:]), y.dtype)
-        seen = Seen(self.each(y), self.each(modes), self.each(clock), first)
+        seen = Seen(
+            self.one_per_sample(y), self.one_per_sample(modes), self.one_per_sample(clock), first
+        )
         end = run(flow, gamma, modes, y, most, inspect, checkpoints, observe, seen)
         last = flow.contact_states(end.carry.step.modes, end.reached).force
         no_target = jnp.zeros(end.carry.step.target.shape, bool)
@@ -96,7 +98,7 @@ class HistoryProgram:
         states = jnp.where(over, end.reached[None], end.seen.states)
         now = jnp.where(over, end.carry.step.modes[None], end.seen.modes)
         clock = jnp.where(over, 0.0, end.seen.clock)
-        rows = self.parts(y.dtype), states, now, clock
+        rows = self.fractions(y.dtype), states, now, clock
         time, energy, states_at = jax.lax.map(at, rows)
         force = jnp.where(last > end.seen.force, last, end.seen.force)
         return time, energy, *states_at, force, end.status.astype(y.dtype)
@@ -112,33 +114,39 @@ class ImplicitHistoryProgram(HistoryProgram):
     outcome: ImplicitProgram
 
     def __call__(self, *leaves: jax.Array) -> tuple[jax.Array, ...]:
-        """The results from the leaves of a problem; see `HistoryProgram`."""
+        """Times, energies, the rows of `ContactStates`, largest forces, status.
+
+        A first run finds the duration T. A second one keeps for each sample the last state before
+        its time `fraction T`, from which one more step leads to it, and the largest forces.
+        """
         outcome = self.outcome
         flow, start = outcome.steps(jax.tree.unflatten(outcome.tree, leaves))
         m, most, checkpoints = flow.contacts, outcome.most, outcome.checkpoints
         constant = jax.lax.stop_gradient((flow, start))
         duration = implicit_steps.run(*constant, most, checkpoints).state.time
-        t = self.parts(duration.dtype)[:, None, None] * jax.lax.stop_gradient(duration)[None]
+        # it only chooses the step of a sample; the time in the step is that of the second run
+        t = self.fractions(duration.dtype)[:, None, None] * jax.lax.stop_gradient(duration)[None]
 
         def force(s: ImplicitState) -> jax.Array:
             """Normal forces (m, B)."""
             return flow.force_of(s.indentation, s.velocity[:m])
 
-        def observe(seen: Any, now: ImplicitState, accept: jax.Array) -> Any:
-            """With the state before this step where it may contain a sample."""
+        def observe(seen: Any, before: ImplicitState, accept: jax.Array) -> Any:
+            """What is kept, with the state before an accepted step where a sample comes later."""
             states, largest = seen
-            may_hold_sample = accept[None] & (now.time[None] <= t)
-            kept = jax.tree.map(lambda a, b: jnp.where(may_hold_sample, a[None], b), now, states)
-            return kept, jnp.where(accept, jnp.maximum(force(now), largest), largest)
+            earlier = accept[None] & (before.time[None] <= t)
+            kept = jax.tree.map(lambda a, b: jnp.where(earlier, a[None], b), before, states)
+            return kept, jnp.where(accept, jnp.maximum(force(before), largest), largest)
 
-        seen = jax.tree.map(self.each, start), force(start)
+        seen = jax.tree.map(self.one_per_sample, start), force(start)
         run = implicit_steps.run(flow, start, most, checkpoints, observe, seen)
         states, largest = run.seen
 
         def at(sample: Any) -> tuple[jax.Array, jax.Array, ContactStates]:
             """A sample is one more step from the state before it."""
-            part, state = sample
-            s = implicit_steps.between(flow, state, part * run.state.time - state.time)
+            fraction, before = sample
+            ahead = fraction * run.state.time - before.time
+            s = implicit_steps.between(flow, before, ahead)
             x, gamma = jnp.maximum(s.indentation, 0.0), s.velocity[:m]
             sample = ContactStates(
                 force=flow.force_of(x, gamma),
@@ -148,10 +156,10 @@ class ImplicitHistoryProgram(HistoryProgram):
                 tangential_force=s.rate[m:],
                 tangential_impulse=s.impulse[m:],
                 slip=s.velocity[m:],
-                rate=jnp.ones_like(s.time),
+                rate=jnp.ones_like(s.time),  # of time: these steps advance in time itself
             )
             return s.time, flow.energy(x), sample
 
-        time, energy, states_at = jax.lax.map(at, (self.parts(t.dtype), states))
+        time, energy, states_at = jax.lax.map(at, (self.fractions(t.dtype), states))
         code = outcome.code(flow, run).astype(t.dtype)
         return time, energy, *states_at, jnp.maximum(largest, force(run.state)), code

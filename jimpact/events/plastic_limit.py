@@ -158,20 +158,21 @@ def plastic_impulses(
 def final_impulses(
     flow: ContactFlow, gamma: jax.Array, state: jax.Array, carries: jax.Array
 ) -> jax.Array:
-    """p (m, B) after the last `state`; that of contacts at rest follows from `gamma+ = 0`.
+    """p (m, B) after the last `state`, from gap velocities gamma (m, B) before the impact.
 
-    Their closings do not matter for it: derivatives of earlier impulses grow with each closing, and
-    their rounding would remain where they cancel.
+    Equation: `gamma_R + (W p)_R = 0` of the contacts R at rest, which `carries` marks, with the
+    impulses of the others as they are. So p_R does not depend on the many closings before, whose
+    derivatives grow with each of them and would cancel but for rounding.
     """
     m, p = flow.contacts, flow.rows(state)[2]
 
-    def some() -> jax.Array:
-        """Impulses where a contact carries."""
-        others = state.at[2 * m : 3 * m].set(jnp.where(carries, 0.0, p))
-        of_rest = impulse_of_rest(flow, carries, gamma + flow.change(others))
-        return jnp.where(carries, of_rest, p)
+    def solved() -> jax.Array:
+        """Impulses where contacts rest."""
+        others = state.at[2 * m : 3 * m].set(jnp.where(carries, 0.0, p))  # the rows of p
+        at_rest = impulse_of_rest(flow, carries, gamma + flow.change(others))  # gamma + W p
+        return jnp.where(carries, at_rest, p)
 
-    return cond(jnp.any(carries), some, lambda: p)
+    return cond(jnp.any(carries), solved, lambda: p)
 
 
 def impulse_of_rest(flow: ContactFlow, carries: jax.Array, after: jax.Array) -> jax.Array:

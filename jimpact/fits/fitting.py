@@ -329,7 +329,7 @@ def _alike(problems: Sequence[FitProblem]) -> list[list[int]]:
     """Problems that share one program: their arrays have the same shapes."""
     groups: dict[Any, list[int]] = {}
     for k, problem in enumerate(problems):
-        leaves, structure = jax.tree.flatten(problem.program())
+        leaves, structure = jax.tree.flatten(problem.for_compiled())
         groups.setdefault((structure, *map(np.shape, leaves)), []).append(k)
     return list(groups.values())
 

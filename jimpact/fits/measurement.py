@@ -82,14 +82,14 @@ class Measurement:
         weight, sigma = self.weight * old / sigma, np.where(here, sigma, np.nan)
         return Measurement.of(self.value, sigma, weight, self.unit, mixing)
 
-    def filled(self, last: np.ndarray) -> "Measurement":
+    def filled(self, shots: np.ndarray) -> "Measurement":
         """The shots of these indices, of which those after the last one have no weight."""
         count = len(self.value)
         parts = self.value, self.weight, self.mixing
-        value, weight, mixing = jax.tree.map(lambda x: np.asarray(x)[last], parts)
+        value, weight, mixing = jax.tree.map(lambda x: np.asarray(x)[shots], parts)
         weight[count:] = 0.0
         if mixing is not None and mixing.ndim == 4:
-            mixing = mixing[:, :, last]
+            mixing = mixing[:, :, shots]
             mixing[count:] = 0.0  # or a copy would count as the shot
         return replace(self, value=value, weight=weight, mixing=mixing)
 

@@ -59,8 +59,8 @@ from jimpact.tools.compiling import full_precision
 FEW = 64
 
 _STATIC = {"static": True}  # fields that are no arrays for JAX
-# ... of which a compiled function knows none
-_ON_HOST: dict[str, Any] = dict.fromkeys(
+# ... and what a compiled function does not get: it would be compiled anew for each value
+_ONLY_ON_HOST: dict[str, Any] = dict.fromkeys(
     ("matrix", "parameters", "domains", "priors", "notes", "experiments", "scene", "left_out")
 )
 
@@ -267,34 +267,36 @@ class FitProblem:
         changed = self.measurement.with_covariance(covariance)
         return replace(self, measurement=_in(self.dtype, changed))
 
-    def program(self) -> "FitProblem":
-        """As compiled functions take it: without what differs between fits of one program.
+    def for_compiled(self) -> "FitProblem":
+        """The same as an argument of compiled functions, which serve many problems.
 
-        Shots are filled up with copies of the last one, of no weight.
+        What only the host needs is None. The number of shots is raised to one of few (4, 8, 16,
+        ..) by copies of the last one, of no weight.
         """
-        bare = replace(self, **_ON_HOST, measurement=replace(self.measurement, sigma=None))
+        measurement = replace(self.measurement, sigma=None)  # its weights have it
+        bare = replace(self, **_ONLY_ON_HOST, measurement=measurement)
         if not isinstance(self.observe, Shots):
             return bare
         count = len(self.measured)
-        last = np.minimum(np.arange(filled_count(count)), count - 1)
-        observe = jax.tree.map(lambda x: np.asarray(x)[last], self.observe)
-        return replace(bare, observe=observe, measurement=bare.measurement.filled(last))
+        shots = np.minimum(np.arange(filled_count(count)), count - 1)
+        observe = jax.tree.map(lambda x: np.asarray(x)[shots], self.observe)
+        return replace(bare, observe=observe, measurement=bare.measurement.filled(shots))
 
     def least_squares(self) -> LeastSquares:
         """The problem as a solver knows it."""
-        program, low = self.program(), self.variables.low
-        shape, q, dtype = program.measured.shape, len(low), low.dtype
+        bare, low = self.for_compiled(), self.variables.low
+        shape, q, dtype = bare.measured.shape, len(low), low.dtype
         listed = isinstance(self.observe, Shots) or self.measured.ndim == 2
         statuses = shape[0] if isinstance(self.observe, Shots) else 1
         rest: Any = (np.zeros(shape, dtype), np.zeros(statuses, np.int32))
-        if program.measurement.mixing is not None:  # dv+/dv- of each shot
+        if bare.measurement.mixing is not None:  # dv+/dv- of each shot
             rest += (np.zeros((*shape, shape[-1]), dtype),)
         residual = np.zeros(math.prod(shape) + q, dtype)
         project = None
         if self.matrix is not None:
             project = jax.tree_util.Partial(AdmissibleMatrices.nearest, self.matrix)
         return LeastSquares(
-            evaluate=jax.tree_util.Partial(FitProblem.evaluate, program),
+            evaluate=jax.tree_util.Partial(FitProblem.evaluate, bare),
             low=low,
             high=self.variables.high,
             size=self.measurement.size,

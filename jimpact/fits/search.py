@@ -334,7 +334,7 @@ def _lowest(problem: FitProblem, points: np.ndarray, count: int) -> np.ndarray:
         law = replace(law, max_steps=steps)  # type: ignore[call-arg]
     squares, many = (
         np.empty(len(points)),
-        stacked([replace(problem, law=law).program()], len(points)),
+        stacked([replace(problem, law=law).for_compiled()], len(points)),
     )
     for rows, some in in_parts(_squares, (many, points), SCAN_LANES, np.arange(len(points))):
         squares[rows] = np.nan_to_num(some, nan=np.inf)

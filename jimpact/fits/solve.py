@@ -200,7 +200,11 @@ def begin(problems: Any, y: Any, solver: "Solver") -> SolverState:
 def advance_all(
     problems: Any, states: SolverState, method: Method, max_steps: int, stop: jax.Array
 ) -> SolverState:
-    """Up to `PASSES` passes more of every problem; `stop`: see `FINE`."""
+    """Every problem by at most `PASSES` trials more, until it is done or has made `max_steps`.
+
+    The host calls it again and again; in between it shows progress and drops what is done. `stop`
+    (): a problem is done where a Gauss-Newton step promises less than this part of `|r|^2 / R`.
+    """
 
     def one(problem: Any, state: SolverState) -> SolverState:
         """One problem, until it is done or at the step limit."""

@@ -139,9 +139,14 @@ def turning_errors(axes: SlipAxes, rtol: float, speed_scale: jax.Array) -> jax.A
 def _first_directions(
     contacts: Contacts, mu: jax.Array, modes: Modes, starts: jax.Array, moving: jax.Array
 ) -> jax.Array:
-    """d (m, 2) with `n . u' = 0` where slip `starts`; first against the force that would hold."""
+    """Directions d (m, 2) of slip: those in which it `starts`, elsewhere the `moving` ones.
+
+    Equation: slip starts along its own acceleration, `d x u' = 0` with `u' = a + W lambda` and the
+    friction `lambda_t = -mu lambda_n d`: Newton's iterations on the angles of d, which begin
+    against the forces that would make the contacts stick.
+    """
     m = len(mu)
-    plain = modes._replace(sign=jnp.ones_like(modes.sign))
+    plain = modes._replace(sign=jnp.ones_like(modes.sign))  # slip along d, not against it
     stuck = forces(contacts, mu, plain._replace(stick=modes.stick | starts), moving)
     assert stuck.tangential is not None
     against = -by_contact(stuck.tangential, m)
@@ -154,24 +159,25 @@ def _first_directions(
         return jnp.where(starts[:, None], turned, moving)
 
     def across(angle: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """`n . u'` (m,) of what starts, twice."""
-        along = unit(angle)
-        held = forces(contacts, mu, plain, along)
-        assert held.tangential is not None
-        both = jnp.concatenate([held.normal, held.tangential])
-        rate = by_contact((contacts.approach + contacts.delassus @ both)[m:], m)
-        turn = jnp.where(starts, along[:, 0] * rate[:, 1] - along[:, 1] * rate[:, 0], 0.0)
+        """`d x u'` (m,) where slip starts; again as what `jacfwd` returns beside the Jacobian."""
+        d = unit(angle)
+        sliding = forces(contacts, mu, plain, d)
+        assert sliding.tangential is not None
+        all_forces = jnp.concatenate([sliding.normal, sliding.tangential])
+        rate = by_contact((contacts.approach + contacts.delassus @ all_forces)[m:], m)
+        turn = jnp.where(starts, d[:, 0] * rate[:, 1] - d[:, 1] * rate[:, 0], 0.0)
         return turn, turn
 
     eye = jnp.eye(m, dtype=mu.dtype)
 
     def newton(_: int, angle: jax.Array) -> jax.Array:
-        """One iteration."""
+        """One step of Newton's, of at most `_MOST_TURN`."""
         jacobian, turn = jax.jacfwd(across, has_aux=True)(angle)
         size = jax.lax.stop_gradient(jnp.max(jnp.abs(jacobian)))
         size = jnp.where(size > 0, size, 1.0)
-        away = jnp.where(starts, -_RIDGE, 1.0)
-        equations = jacobian / size + eye * away[:, None]
+        # friction makes the diagonal negative: a little more keeps it regular; other angles stay
+        ridge = jnp.where(starts, -_RIDGE, 1.0)
+        equations = jacobian / size + eye * ridge[:, None]
         change = solve_by_pivots(equations, -turn[:, None] / size)[0][:, 0]
         return angle + jnp.clip(change, -_MOST_TURN, _MOST_TURN)
 

@@ -90,7 +90,11 @@ def as_times(t_end: Any) -> tuple[Any, Any]:
 def _check_coordinates(
     system: System, q: jax.Array, v: jax.Array, start: jax.Array, end: jax.Array
 ) -> None:
-    """Raise for coordinates, velocities and times of wrong shapes or values."""
+    """Raise for coordinates, velocities and times of wrong shapes or values.
+
+    The body, or else its constant mass, says how many there are; a body with quaternions has more
+    coordinates than velocities. With a mass M(q), `check_functions` compares v with M.
+    """
     if q.ndim != 1:
         raise ValueError(f"Argument `q0` must have shape (n,), but has shape {q.shape}.")
     coordinates, mass = system.body.coordinates, system.body.mass
@@ -104,6 +108,7 @@ def _check_coordinates(
         check_shape("v0", v, mass.shape[:1], "the velocities of the body, as many as its mass has")
     for time in (start, end):
         check_shape("t_end", time, (), "a time, or a pair (t_start, t_end)")
+    # the argument `t_end` may hold the start, too
     for name, value in (("q0", q), ("v0", v), ("t_end", start), ("t_end", end)):
         check_values(name, value)
     if not is_traced((start, end)) and not float(end) > float(start):

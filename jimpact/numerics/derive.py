@@ -171,12 +171,13 @@ class _WithTangents:
         return _with_rates(results_of(self.function, *at), many)
 
     def __call__(self, *arrays: jax.Array) -> Arrays:
-        """Results and rates."""
-        at, directions = arrays[: len(self.marked)], arrays[len(self.marked) :]
+        """f(x), and `rate = sum_i (df / dx_i) t_i` for each direction t (a tangent of JAX)."""
+        values, directions = arrays[: len(self.marked)], arrays[len(self.marked) :]
         if not self.many:
             directions = tuple(x[None] for x in directions)
+        # a function that takes `Dual`s pushes tangents through its loops itself
         push = _push_duals if getattr(self.function, "takes_duals", False) else _push
-        outs, rates = push(self.function, self.marked, at, directions)
+        outs, rates = push(self.function, self.marked, values, directions)
         return *outs, *(rates if self.many else (x[0] for x in rates))
 
 
@@ -389,15 +390,20 @@ def _chunk_of(function: Any) -> int:
 
 @functools.cache
 def _lanes(function: Function) -> Function:
-    """`function` compiled; `vmap` makes the last axis of its arrays longer."""
+    """`function` as one operation of JAX, of arrays whose last axis is that of a batch.
 
-    def call(*arrays: jax.Array) -> Arrays:
-        """Its results."""
-        arrays = tuple(varying_like(arrays, arrays))
-        kinds = results_of(function, *(Kind(x.shape[:-1], x.dtype) for x in arrays))
+    `vmap` makes this axis longer. Only where the operation is compiled is `function` traced, once,
+    at the batch that there is.
+    """
+
+    def bind(*arrays: jax.Array) -> Arrays:
+        """Results (.., B) of arrays (.., B)."""
+        arrays = tuple(varying_like(arrays, arrays))  # all over the same axes of a mesh
+        one = (Kind(x.shape[:-1], x.dtype) for x in arrays)  # of a batch
+        kinds = results_of(function, *one)
         return tuple(_lanes_p.bind(*arrays, function=function, results=kinds))
 
-    return call
+    return bind
 
 
 @functools.cache

@@ -138,25 +138,32 @@ def _projected(x: jax.Array, slope: jax.Array, load: jax.Array | None) -> jax.Ar
 
 
 def _with_momentum(at: _At, x: jax.Array, ax: jax.Array, most: Any) -> _At:
-    """The iteration after a projected step to x; a step that overshoots is taken back."""
-    step, bent = x - at.y, ax - at.ay
+    """The iterate after a projected step from y to x, with A x: Nesterov's method with restarts.
+
+    Equation: y+ is `x + (t - 1) / t+ (x - x before)`, `t+ = (1 + sqrt(1 + 4 t^2)) / 2`. Where
+    `step . A step > L |step|^2`, L the inverse step size, the step overshoots: x is not taken, and
+    L grows. There, and where the momentum points uphill, t begins again with 1. The best x is that
+    of the least misfit, `L max|step|`.
+    """
+    step, a_step = x - at.y, ax - at.ay
     square = jnp.vdot(step, step)
-    long = jnp.vdot(step, bent) > at.inverse_step_size * square * (1 + 1e-9)
-    back = long | (jnp.vdot(step, x - at.x) < 0)
+    overshoots = jnp.vdot(step, a_step) > at.inverse_step_size * square * (1 + 1e-9)
+    restarts = overshoots | (jnp.vdot(step, x - at.x) < 0)
     weight = (1 + jnp.sqrt(1 + 4 * at.weight**2)) / 2
+    # less momentum where many iterations did not suffice
     allowed = jnp.asarray(MOMENTUM, x.dtype)[len(MOMENTUM) * at.tries // jnp.maximum(most, 1)]
-    gain = jnp.where(back, 0.0, jnp.minimum((at.weight - 1) / weight, allowed))
-    x, ax = jnp.where(long, at.x, x), jnp.where(long, at.ax, ax)
-    misfit = jnp.where(long, jnp.inf, at.inverse_step_size * jnp.max(jnp.abs(step)))
+    momentum = jnp.where(restarts, 0.0, jnp.minimum((at.weight - 1) / weight, allowed))
+    x, ax = jnp.where(overshoots, at.x, x), jnp.where(overshoots, at.ax, ax)
+    misfit = jnp.where(overshoots, jnp.inf, at.inverse_step_size * jnp.max(jnp.abs(step)))
     better = ~(misfit >= at.misfit)  # also NaN, which is then the result
     return _At(
-        x,
-        ax,
-        x + gain * (x - at.x),
-        ax + gain * (ax - at.ax),
-        jnp.where(back, 1.0, weight),
-        jnp.where(long, STEEPER, 1.0) * at.inverse_step_size,
-        jnp.where(better, x, at.best),
-        jnp.where(better, misfit, at.misfit),
-        at.tries + 1,
+        x=x,
+        ax=ax,
+        y=x + momentum * (x - at.x),
+        ay=ax + momentum * (ax - at.ax),
+        weight=jnp.where(restarts, 1.0, weight),
+        inverse_step_size=jnp.where(overshoots, STEEPER, 1.0) * at.inverse_step_size,
+        best=jnp.where(better, x, at.best),
+        misfit=jnp.where(better, misfit, at.misfit),
+        tries=at.tries + 1,
     )

@@ -28,10 +28,11 @@ _ZERO = 1e-12  # printed as 0 below this multiple of the largest velocity
 class AdmissibleSet:
     """The outcomes v+ of `admissible_set`; `print(result)` describes them.
 
-    Every outcome is v = `centre` + `axes` u, u (d,) in a convex set `coordinates`, and has the
-    energy `T(centre) + |u|^2 / 2`: u are kinetic coordinates [sqrt(J)]. `dimension` d is 0 where
-    only one outcome is possible. `plastic` v+ (n,) has the `least_energy` [J]; `energy` is T-.
-    `scene` and `velocity` v- (n,) [m/s] are the arguments, `tolerance` that of `contains`.
+    Every outcome is v = `centre` + `axes` u, u (d,) in a convex set `coordinates`, with
+    `axes^T M axes = I`, and has the energy `T(centre) + |u|^2 / 2`: u are kinetic coordinates
+    [sqrt(J)]. `dimension` d is 0 where only one outcome is possible. `plastic` v+ (n,) has the
+    `least_energy` [J]; `energy` is T-. `scene` and `velocity` v- (n,) [m/s] are the arguments,
+    `tolerance` that of `contains`.
     """
 
     scene: Scene
@@ -70,10 +71,12 @@ class AdmissibleSet:
         return np.array([[low[i], high[i]] for i, (low, high) in enumerate(ends)])
 
     def contains(self, velocity: Any, tolerance: float | None = None) -> Any:
-        """Whether a velocity v+ (n,), or each of (k, n), is admissible up to `tolerance` impacts.
+        """Whether a velocity v+ (n,), or each of (k, n), is admissible up to an error.
 
-        None: the tolerance of `audit`. The size of an impact: `sqrt(2 (T- - T(centre)))`, the
-        largest |u|.
+        Equation: with `v - centre = axes u + w`, `u = axes^T M (v - centre)`, the error is the
+        larger of `sqrt(w^T M w)`, which violates the balance of momentum, and the distance of u
+        from the convex set [sqrt(J)]. It may be `tolerance` times the size of the impact,
+        `sqrt(2 (T- - T(centre)))`, the largest |u|; None: that of `audit`.
         """
         v = np.asarray(as_float_array("velocity", velocity), float)
         if v.ndim not in (1, 2) or v.shape[-1] != self.scene.size:
@@ -88,8 +91,9 @@ class AdmissibleSet:
         mass = dense_mass(self.scene)
         u = offset @ mass @ self.axes
         outside = offset - u @ self.axes.T  # violates the momentum balance
-        off = np.sqrt(np.maximum(np.einsum("...i,ij,...j->...", outside, mass, outside), 0.0))
-        inside = np.maximum(self.coordinates.excess(u), off) <= allowed * self._size
+        square = np.einsum("...i,ij,...j->...", outside, mass, outside)
+        norm_outside = np.sqrt(np.maximum(square, 0.0))
+        inside = np.maximum(self.coordinates.excess(u), norm_outside) <= allowed * self._size
         return bool(inside) if v.ndim == 1 else inside
 
     def sample(self, seed: int, count: int) -> np.ndarray:

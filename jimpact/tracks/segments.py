@@ -168,33 +168,38 @@ def flights_and_acceleration(
     shortest: int,
     drag: float | None = 0.0,
 ) -> tuple[list[np.ndarray], np.ndarray, float]:
-    """Flights, the acceleration (n,) and the drag: known, or those that all have in common."""
+    """Flights, their acceleration (n,) [m/s^2] and drag k [1/m].
+
+    `known` None, or `drag` None: found, as one that is common to all flights. By turns, `ROUNDS`
+    times: `q - k s` is divided into flights, then the acceleration is fitted, then k. What a drag
+    of 1/m adds to the places is s; its effect is taken as proportional to k.
+    """
     acceleration = curvature(t, q, shortest) if known is None else known
-    slowed = q - straightened(t, q, 1.0) if drag != 0 else np.zeros_like(q)  # by a drag of 1/m
+    added_by_drag = q - straightened(t, q, 1.0) if drag != 0 else np.zeros_like(q)
     flights: list[np.ndarray] = []
     k = 0.0 if drag is None else drag
     for _ in range(ROUNDS if known is None or drag is None else 1):
-        straight = q - k * slowed
-        flights = flights_of(t, straight, sigma, acceleration, shortest)
+        without_drag = q - k * added_by_drag
+        flights = flights_of(t, without_drag, sigma, acceleration, shortest)
         if flights and known is None:
-            flights = _joined_at_any(t, straight, sigma, acceleration, flights)
-            acceleration = common_acceleration(t, straight, flights)
+            flights = _joined_at_any(t, without_drag, sigma, acceleration, flights)
+            acceleration = common_acceleration(t, without_drag, flights)
         if flights and drag is None:
-            k = _common_drag(t, q, slowed, sigma, None if known is None else acceleration, flights)
+            k = _common_drag(t, q, added_by_drag, sigma, known, flights)
     return flights, acceleration, k
 
 
 def _common_drag(
     t: np.ndarray,
     q: np.ndarray,
-    slowed: np.ndarray,
+    added_by_drag: np.ndarray,
     sigma: np.ndarray,
     acceleration: np.ndarray | None,
     flights: list[np.ndarray],
 ) -> float:
     """By least squares, each flight with a line of its own, or a parabola of its own acceleration.
 
-    slowed: places (T, n) that a drag of 1/m adds.
+    added_by_drag: to the places (T, n), by a drag of 1/m.
     """
     above, below = 0.0, 0.0
     for frames in flights:
@@ -204,7 +209,7 @@ def _common_drag(
             if acceleration is not None:
                 y = y - acceleration[c] * x**2 / 2
             line = np.linalg.qr(np.vander(x, 2 if acceleration is not None else 3))[0]
-            drag = slowed[ok, c] - line @ (line.T @ slowed[ok, c])
+            drag = added_by_drag[ok, c] - line @ (line.T @ added_by_drag[ok, c])
             above, below = above + float(drag @ y) / scale**2, below + float(drag @ drag) / scale**2
     return above / below if below > 0 else 0.0
 

@@ -51,6 +51,7 @@ def spread(count, coordinates, seed):
     ]
 
 
+@pytest.mark.slow
 def test_moreau_and_poisson_against_every_support():
     states = spread(100, 4, seed=5)
     states = [s for s in states if (problem(s)[1] < 0).any()]

@@ -171,6 +171,7 @@ RODS = [
 ]
 
 
+@pytest.mark.slow
 def test_rods_are_rouths():
     """One contact with friction: slip, slip and stick, reversal, jam."""
     mass, normals, tangents, v, e, mu = (np.stack(x) for x in zip(*RODS))

@@ -304,6 +304,7 @@ def struck(law=LOSSY, samples=2100, **options):
     return monte_carlo(law, BALLS, SPEEDS, None, samples, chunk=256, **options)
 
 
+@pytest.mark.slow
 def test_a_run_is_as_fine_as_its_standard_errors_need(tmp_path):
     """The error of a coarser tolerance is measured, stated, and a tenth of them at most."""
     result = struck()
@@ -342,6 +343,7 @@ def test_a_folder_keeps_its_tolerance(tmp_path):
     assert more.rtol == whole.rtol
 
 
+@pytest.mark.slow
 def test_an_impact_to_a_given_tolerance():
     coarse = Compliant(LOSSY.force, rtol=1e-3)
     before = jnp.array([0.0, 0.0, -1.0])

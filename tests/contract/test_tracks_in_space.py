@@ -134,6 +134,7 @@ def test_a_brick_turns_freely_between_impacts():
         as_sphere.experiments(BRICK)
 
 
+@pytest.mark.slow
 def test_both_orders_of_quaternions_and_both_signs():
     rng = np.random.default_rng(3)
     t, q = seen(landed(CUBE)[0], rng)

@@ -120,6 +120,7 @@ def test_ties_reach_across_fields_in_any_order():
     assert chosen.names == ("restitution[1]", "restitution[3]")  # stiffness[1]: only ratios matter
 
 
+@pytest.mark.slow
 def test_masks_groups_and_held_contacts():
     truth = ji.LZB([0.9, 0.9], [3.0, 6.0])
     data = ji.Experiments(PRE_3, simulated(truth, BALLS, PRE_3))
