@@ -112,13 +112,17 @@ def degrees(count: int) -> str:
 
 
 def formatted(value: Any, form: str) -> str:
-    """A number as of `format`; one that rounds to 0 has no minus sign.
+    """A number or words as of `format`; a number that rounds to 0 has no minus sign.
 
     >>> from jimpact.tools.records import formatted
     >>> formatted(-0.0, "6g"), formatted(-4e-9, ".5f"), formatted(-0.01, ".1e")
     ('     0', '0.00000', '-1.0e-02')
+    >>> formatted("air-track", "")
+    'air-track'
     """
     text = format(value, form)
+    if isinstance(value, str):
+        return text
     if "-" in text and value <= 0 and not re.search("[1-9]|inf", text.partition("e")[0]):
         text = text.replace("-", "", 1).rjust(len(text) if text[0] == " " else 0)
     return text

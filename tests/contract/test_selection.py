@@ -290,3 +290,10 @@ def test_a_posterior_by_an_arviz_that_is_too_new_is_refused_before_it_is_drawn(m
     monkeypatch.setitem(sys.modules, "arviz", SimpleNamespace(__version__="1.3.0"))
     with pytest.raises(ImportError, match=r"arviz must be older than 1 .* is 1\.3\.0: pip install"):
         ji.posterior(None)
+
+
+def test_values_with_an_exponent_are_printed():
+    post = [[0.49999999, 0.50000001], [0.99999, 1.00001]]
+    data = ji.Experiments(pre=[[1.0, 0.0], [2.0, 0.0]], post=post, sigma=1e-6)
+    report = str(ji.fit_laws(PAIR, data, ["newton", "moreau"]))
+    assert report.count("restitution 8.004e-06") == 2
