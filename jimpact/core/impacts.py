@@ -31,7 +31,7 @@ from jimpact.tools.checks import (
     is_traced,
 )
 from jimpact.tools.compiling import full_precision, is_top_level_call, quick_jit
-from jimpact.tools.precision import precision
+from jimpact.tools.precision import check_rtol, precision
 from jimpact.tools.status import CODE, STATUS, raise_for, sign_tolerance
 
 # Negative impulses are rounding up to this many times the impulse that would undo the noise of
@@ -107,7 +107,8 @@ def impact(
             rounding of the largest earlier speeds. None: the rounding of v-.
         approach: speed () [m/s] subtracted from every gap velocity before the law is applied; a
             small value starts an impact without collision. None: 0.
-        rtol: tolerance () on v+ for a law whose option `rtol` is None; unlike that option it may be
+        rtol: tolerance () on v+ for a law whose option `rtol` is None, at most 1 and at least what
+            the type holds (3.6e-15, in single precision 1.9e-6); unlike that option it may be
             traced. None: the law's default.
 
     Returns:
@@ -118,10 +119,10 @@ def impact(
         ValueError: shapes or ranges, on the host. Where they are traced, the status reports them:
             `not_finite` (NaN in the velocity, a gap, `noise`, `approach` or `rtol`), or
             `out_of_range` (a parameter outside its domain, a normal that is 0, a mass that is
-            asymmetric or not positive, a negative gap, `noise`, `approach` or `rtol`, a velocity
-            that breaks a bilateral constraint). An energy of the impact, `sum gamma-^2 / W_jj`,
-            that the floating type takes for 0 or infinite is `out_of_range` on the host, too:
-            choose other units.
+            asymmetric or not positive, a negative gap, `noise` or `approach`, an `rtol` beyond its
+            range, a velocity that breaks a bilateral constraint). An energy of the impact,
+            `sum gamma-^2 / W_jj`, that the floating type takes for 0 or infinite is `out_of_range`
+            on the host, too: choose other units.
             Warns where only open contacts approach and the law leaves those out.
 
     >>> import jimpact as ji
@@ -137,6 +138,8 @@ def impact(
     law, scene, v = in_common_dtype(law, scene, v)
     check_law(law, scene, v.dtype)
     check_values("rtol", rtol, low=0.0, high=1.0, open_low=True)
+    if rtol is not None and not is_traced(rtol):
+        check_rtol(float(np.max(rtol)), v.dtype)
     for name, number in (("noise", noise), ("approach", approach), ("rtol", rtol)):
         check_values(name, number, low=0.0)
         if number is not None:
@@ -235,6 +238,8 @@ class Traced(NamedTuple):
             allowed.append(jnp.all(_keeps_constraints(scene.constraints, v)))
         if self.given:
             allowed += [(x >= 0) & (x < jnp.inf) for x in given if x is not None]
+        if self.given and given.rtol is not None:
+            allowed.append((given.rtol >= precision(v.dtype).noise) & (given.rtol <= 1))
         code = jnp.where(jnp.all(jnp.asarray(allowed)), CODE["ok"], CODE["out_of_range"])
         return jnp.where(jnp.any(jnp.asarray(unknown, bool)), CODE["not_finite"], code)
 

@@ -29,7 +29,7 @@ from jimpact.numerics.sparse import Neighbours
 _PACKAGES = ("jimpact", "jax", "jaxlib", "equinox", "numpy", "scipy")
 # of values in the file that are not arrays, mappings or classes with fields
 _KINDS: dict[str, Any] = {
-    kind.__name__: kind for kind in (StaticNumber, StaticNumbers, float, tuple, list)
+    kind.__name__: kind for kind in (StaticNumber, StaticNumbers, float, np.float64, tuple, list)
 } | {"Prior": Prior._make}
 _LATER = {"covariance", "curve"}  # that files of format 1 may lack: they had no such thing
 # classes of a fit that have no public name, by their own

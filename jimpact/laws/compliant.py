@@ -19,11 +19,12 @@ from jimpact.events.impact_dynamics import (
     tangential_of,
 )
 from jimpact.laws.forces import Bistiffness, Force, HuntCrossley, KelvinVoigt, KuwabaraKono
-from jimpact.laws.lzb import check_few_contacts, check_rtol, solver_of
+from jimpact.laws.lzb import check_few_contacts, solver_of
 from jimpact.numerics.derive import ADJOINTS
 from jimpact.numerics.tridiagonal import diagonal
 from jimpact.tools.checks import check_choice, check_values
 from jimpact.tools.compiling import full_precision
+from jimpact.tools.precision import check_rtol
 
 
 class Compliant(Law):

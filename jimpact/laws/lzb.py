@@ -28,7 +28,7 @@ from jimpact.events.impact_dynamics import (
 from jimpact.laws.forces import Bistiffness
 from jimpact.numerics.derive import ADJOINTS
 from jimpact.tools.compiling import full_precision
-from jimpact.tools.precision import precision
+from jimpact.tools.precision import check_rtol
 
 # Tolerances of v+ if the law has no `rtol`, relative to max |v-|. Ten times more would make every
 # outcome right to one digit less.
@@ -54,16 +54,6 @@ def solver_of(law: Any, contact: Contact) -> tuple[str, Any]:
         return method, law.rtol
     default = default_rtol(method, contact.gap_velocity.dtype)
     return method, default if contact.rtol is None else contact.rtol
-
-
-def check_rtol(rtol: float, dtype: jnp.dtype) -> None:
-    """Raise a ValueError where the precision cannot hold this tolerance."""
-    finest = precision(dtype).noise
-    if rtol < finest:
-        raise ValueError(
-            f"Argument `rtol` must be at least {finest:.2g} in {dtype}, "
-            f"but has value {rtol:g}: enable jax_enable_x64 for finer tolerances."
-        )
 
 
 def check_few_contacts(scene: Scene) -> None:

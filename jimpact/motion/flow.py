@@ -343,16 +343,6 @@ class MechanicalFlow(MotionFlow):
         return selected(jnp.any(jumps), at, back), jumps
 
 
-def check_rtol(rtol: float, dtype: jnp.dtype) -> None:
-    """Raise for a relative tolerance that steps in this precision cannot reach."""
-    finest = precision(dtype).noise
-    if rtol < finest:
-        raise ValueError(
-            f"Argument `rtol` must be at least {finest:.1e}, the rounding of {dtype}, but has "
-            f"value {rtol:g}: enable jax_enable_x64, or give a coarser one."
-        )
-
-
 def packed(state: State) -> jax.Array:
     """Rows (.., 1) of a state."""
     return ravel_pytree(state)[0][:, None]

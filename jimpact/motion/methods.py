@@ -10,7 +10,6 @@ import numpy as np
 
 from jimpact.core.law import Law
 from jimpact.motion.dynamics import is_pile
-from jimpact.motion.flow import check_rtol
 from jimpact.motion.pile_contacts import PileContacts, contacts_of_step
 from jimpact.motion.start import Start, start_of
 from jimpact.motion.system import System
@@ -22,6 +21,7 @@ from jimpact.tools.checks import (
     is_traced,
     short_repr,
 )
+from jimpact.tools.precision import check_rtol
 
 # Contacts of a pile above which motions by events warn: 1 100 compile for more than two minutes.
 # Ten times more, and nobody is warned of that.

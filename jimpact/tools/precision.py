@@ -49,3 +49,13 @@ def precision(dtype: Any) -> Precision:
     info = jnp.finfo(dtype)
     eps, tiny = float(info.eps), float(info.tiny)
     return Precision(eps, tiny, 4 * eps, 16 * eps, 64 * eps, 100 * eps, eps**0.5)
+
+
+def check_rtol(rtol: float, dtype: jnp.dtype) -> None:
+    """Raise a ValueError where the precision cannot hold this tolerance."""
+    finest = precision(dtype).noise
+    if rtol < finest:
+        raise ValueError(
+            f"Argument `rtol` must be at least {finest:.2g} in {dtype}, "
+            f"but has value {rtol:g}: enable jax_enable_x64 for finer tolerances."
+        )

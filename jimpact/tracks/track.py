@@ -139,6 +139,10 @@ class Track:
         chain counts coordinates and velocities towards its right end: of bodies that move the other
         way round, mirror the track (-q, and the bodies in reverse).
 
+        The scene of a pose counts as known: the covariance has no errors of orientations. Where an
+        angle's error is not small beside the relative errors of velocities (many frames a flight),
+        a fit shows them as lack of fit, and its errors of friction are too small.
+
         Args:
             scene: of all impacts; a body, which each pose places; None: `fit` is given one, and no
                 impact is left out.

@@ -10,6 +10,7 @@ from scipy import stats
 
 import jimpact as ji
 from jimpact import (
+    STATUS,
     Binary,
     Compliant,
     Hertz,
@@ -355,6 +356,12 @@ def test_an_impact_to_a_given_tolerance():
     np.testing.assert_allclose(own, wanted, rtol=1e-14)
     with pytest.raises(ValueError, match=r"`rtol` must lie in \(0, 1\], but has value 0"):
         impact(LOSSY, BALLS, before, rtol=0.0)
+    with pytest.raises(ValueError, match=r"`rtol` must be at least 3\.6e-15 in float64"):
+        impact(LOSSY, BALLS, before, rtol=1e-20)
+    traced = jax.jit(jax.vmap(lambda rtol: impact(LOSSY, BALLS, before, rtol=rtol).status))
+    codes = traced(jnp.array([1e-3, 0.0, 1e-20, 2.0, -1.0, jnp.inf, jnp.nan]))
+    names = [STATUS[int(code)].name for code in codes]
+    assert names == ["ok", *["out_of_range"] * 5, "not_finite"]
 
 
 @pytest.mark.release

@@ -44,3 +44,16 @@ def test_an_unknown_law_is_named(tmp_path):
     (tmp_path / "fit.json").write_text(text)
     with pytest.raises(ValueError, match="Zorn is no class of jimpact"):
         ji.load(tmp_path / "fit.json")
+
+
+@pytest.mark.parametrize("loss", ["huber", "student"])
+def test_a_robust_fit_is_read_as_it_was_saved(tmp_path, loss):
+    """The factors of its errors are NumPy numbers, which a file has to hold, too."""
+    before = np.array([[1.0, 0.0], [1.5, -0.2], [2.0, 0.1], [1.2, -0.4], [1.1, 0.3]])
+    after = before + np.outer(1.7 * (before[:, 0] - before[:, 1]) / 2, [-1, 1])
+    after[2] += 0.3  # an outlier
+    data = ji.Experiments(before, after, sigma=0.01)
+    fit = ji.fit(ji.Newton(0.5), ji.chain([1.0, 1.0]), data, search=ji.Search(loss=loss))
+    again = ji.load(fit.save(tmp_path / "fit.json"))
+    assert str(again) == str(fit)
+    np.testing.assert_array_equal(again.standard_error, fit.standard_error)
