@@ -392,6 +392,31 @@ SYSTEMS = [
     (lambda: fit_of_a_ball(sigma=np.full(3, 0.01)), r"`sigma` must have shape \(3, 1\)"),
     (lambda: fit_of_a_ball(observe="q"), "`observe` must be a function, but is 'q'"),
     (lambda: fit_of_a_ball(search="adam"), "`search` must be of type Search, but is 'adam'"),
+    (lambda: ji.impact(ji.LZB, BALLS, V), r"That is the class; LZB\(\.\.\.\) makes"),
+    (lambda: ji.impact("LZB", BALLS, V), r"`law` must be of type Law.*as ji\.LZB\(0\.9\)"),
+    (lambda: ji.impact(BALLS, ji.LZB(0.9), V), "a Scene. The law comes before the scene"),
+    (lambda: ji.impact(ji.LZB(0.9), BALLS, [V, V]), r"shape \(3,\).*jax\.vmap takes one row"),
+    (lambda: ji.LZB(restituton=0.9), "no `restituton`. Did you mean restitution"),
+    (lambda: ji.LZB(0.9, mu=0.3), "no `mu`. Did you mean friction"),
+    (lambda: ji.RandomLaw(ji.Newton(0.9), e=ji.Uniform(0.8, 0.9)), "`e`. Did you mean restitution"),
+    (lambda: ji.compare(BALLS, V, e=0.9), "'e'. Did you mean restitution"),
+    (lambda: ji.fit(ji.Newton(0.5), PAIR, "a.csv"), r"'a\.csv'. `ji\.read_experiments\(path\)`"),
+    (lambda: ji.fit(ji.Newton(0.5), PAIR, {}), r"is {}. `ji\.Experiments\(pre, post\)`"),
+    (
+        lambda: ji.fit(ji.Newton(0.5), ji.Block(0.2, 0.6), ji.Experiments([V], [V])),
+        "`scene` must be of type Scene, but is Block.*A body has a scene",
+    ),
+    (lambda: fit_of_a_ball(search="sgd"), r"Give ji\.Search\('sgd'\)"),
+    (lambda: samples(gaps=lambda key: jnp.array([0.0, 1e-6])), "`gaps` must draw by its key"),
+    (lambda: samples(law=lambda key: ji.Binary(0.9, "earliest")), "`law` must draw by its key"),
+    (
+        lambda: ji.simulate(ji.Block(0.2, 0.6), ji.Newton(0.5), [0, 1, 0], [0, 0, 0], 1.0),
+        r"but is Block.*ji\.System\(body, gravity=True\)",
+    ),
+    (lambda: ji.System(lambda q: q), "`mass` must be given where `gap_function` is a function"),
+    (lambda: ji.summary(BALLS, BALLS, V), "`out` must be of type Impact, but is a Scene"),
+    (lambda: ji.history("LZB", BALLS, V), "`law` must be of type Law, but is 'LZB'"),
+    (lambda: ji.data.engine_impacts("bulet"), "'bulet'. Did you mean bullet"),
     (lambda: fit_of_a_ball(search=ji.Search(limit=-1)), r"`limit` must lie in \[0, inf\)"),
     (lambda: fit_of_a_ball(search=ji.Search(limit=np.nan)), "`limit`.*nan"),
 ]
@@ -405,6 +430,12 @@ def test_bad_input(call, message):
     assert text.count("\n") == 0
     assert "Array(" not in text
     assert "Traced" not in text
+
+
+def test_a_misspelt_public_name():
+    with pytest.raises(AttributeError, match=r"no name `Newtons`\. Did you mean Newton\?"):
+        ji.Newtons  # noqa: B018
+    assert not hasattr(ji, "Nothing of this kind")
 
 
 @jax.jit
