@@ -432,12 +432,6 @@ def test_bad_input(call, message):
     assert "Traced" not in text
 
 
-def test_a_misspelt_public_name():
-    with pytest.raises(AttributeError, match=r"no name `Newtons`\. Did you mean Newton\?"):
-        ji.Newtons  # noqa: B018
-    assert not hasattr(ji, "Nothing of this kind")
-
-
 @jax.jit
 @jax.vmap
 def traced(velocity, noise, approach):
