@@ -20,5 +20,14 @@ __version__ = "0.1.0"
 # `__init__.pyi` lists the public names; a module is imported on first use of one of its names, so
 # that `jimpact --help` stays fast. No module here is named like a public name: importing it would
 # put the module in the function's place.
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_public, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 __all__ += ["__version__"]
+
+
+def __getattr__(name: str) -> object:
+    """The public name; an AttributeError that says which one was probably meant."""
+    if name in __all__ or name.startswith("__"):
+        return _public(name)
+    from jimpact.tools.checks import suggestion
+
+    raise AttributeError(f"jimpact has no name `{name}`.{suggestion(name, __all__)}")

@@ -19,7 +19,7 @@ from jimpact.core.scene import (
     velocity_unit,
 )
 from jimpact.numerics.tridiagonal import diagonal
-from jimpact.tools.checks import check_shape
+from jimpact.tools.checks import check_kind, check_shape
 from jimpact.tools.compiling import full_precision
 from jimpact.tools.records import formatted
 from jimpact.tools.status import STATUS, sign_tolerance
@@ -158,6 +158,8 @@ def summary(out: Impact, scene: Scene, velocity: Any, names: Sequence[str] = ())
     >>> print(ji.summary(ji.impact(ji.Newton(0.5), scene, v), scene, v).splitlines()[0])
     status         ok: resolved within tolerance
     """
+    check_kind("out", out, Impact)
+    check_kind("scene", scene, Scene)
     codes = np.asarray(out.status)
     if codes.ndim:
         counts = zip(*np.unique(codes, return_counts=True))

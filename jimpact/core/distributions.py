@@ -10,7 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact.core.law import Domain, Law, free_parameters_of
-from jimpact.tools.checks import as_float_array, as_numbers, check_kind, check_shape
+from jimpact.tools.checks import (
+    ABBREVIATIONS,
+    as_float_array,
+    as_numbers,
+    check_kind,
+    check_shape,
+    suggestion,
+)
 
 OVERLAP = (
     "a negative gap is an overlap, that is a precompressed contact: give LZB the energy stored in "
@@ -173,6 +180,7 @@ class RandomLaw(eqx.Module):
                 raise ValueError(
                     f"Parameters of {type(law).__name__} that can be random are "
                     f"{', '.join(known)}, but not `{name}`."
+                    f"{suggestion(name, known, ABBREVIATIONS)}"
                 )
             if not isinstance(distribution, Distribution):
                 raise TypeError(
@@ -207,6 +215,7 @@ def as_source(name: str, value: Any, size: int, non_negative: bool) -> Any:
         if not eqx.is_array(drawn):
             raise TypeError(f"Argument `{name}` must give an array for a key, but gives {drawn!r}.")
         check_shape(f"{name}(key)", drawn, (size,), "one draw")
+        check_uses_key(name, value)
         return value
     array = as_float_array(name, value)
     several = array.ndim == 2
@@ -219,6 +228,17 @@ def as_source(name: str, value: Any, size: int, non_negative: bool) -> Any:
             f"{float(array[tuple(where)]):g} at index {where}; {OVERLAP}"
         )
     return array
+
+
+def check_uses_key(name: str, function: Any) -> None:
+    """Raise a ValueError where a function draws without its key, so that all samples are equal."""
+    program = jax.make_jaxpr(function)(jax.random.key(0, impl="threefry2x32")).jaxpr
+    if not any(program.invars[0] is x for step in program.eqns for x in step.invars):
+        raise ValueError(
+            f"Argument `{name}` must draw by its key, as jax.random.uniform(key, ...), but ignores "
+            "it: it is compiled, and all samples would be the same (as numpy.random would draw "
+            "once)."
+        )
 
 
 def _check_domain(name: str, drawn: Distribution, domain: Domain) -> None:

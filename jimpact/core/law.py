@@ -15,12 +15,14 @@ import numpy as np
 from jimpact.core.contact import Contact, contact_of
 from jimpact.core.scene import Scene
 from jimpact.tools.checks import (
+    ABBREVIATIONS,
     as_float_array,
     check_choice,
     check_shape,
     check_square,
     check_values,
     is_traced,
+    suggestion,
 )
 from jimpact.tools.status import CODE
 
@@ -255,7 +257,12 @@ def _check_arguments(cls: type, *args: Any, **kwargs: Any) -> None:
             f"`{name}`" if x.default is x.empty else f"`{name}` = {x.default!r}"
             for name, x in signature.parameters.items()
         )
-        raise TypeError(f"{cls.__name__} takes {names}: {why}.") from None
+        strange = "".join(
+            f" It has no `{word}`.{suggestion(word, signature.parameters, ABBREVIATIONS)}"
+            for word in kwargs
+            if word not in signature.parameters
+        )
+        raise TypeError(f"{cls.__name__} takes {names}: {why}.{strange}") from None
 
 
 if TYPE_CHECKING:
@@ -459,6 +466,13 @@ class Law(Declared):
     @abc.abstractmethod
     def impulses(self, contact: Contact) -> Impulses:
         """Impulses from what `contact` holds, and the law's own status code."""
+
+    @staticmethod
+    def _instead_of(value: Any) -> str:
+        """Advice for a value that is no law, ending the message of `check_kind`."""
+        if isinstance(value, Scene):
+            return " The law comes before the scene."
+        return " A law is an object, as ji.LZB(0.9)." if isinstance(value, str) else ""
 
     def contact(self, scene: Scene, velocity: jax.Array) -> Contact:
         """What `impulses` gets of a scene at a velocity v- (n,); to override to add to it."""

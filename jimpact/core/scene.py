@@ -391,7 +391,10 @@ def as_velocity(scene: Scene, velocity: Any, finite: bool = False) -> jax.Array:
     """`velocity` as an array; raise a ValueError unless it has one (finite) entry a coordinate."""
     check_kind("scene", scene, Scene)
     v = as_float_array("velocity", velocity)
-    check_shape("velocity", v, (scene.size,), "one per coordinate of the scene")
+    meaning = "one per coordinate of the scene"
+    if v.ndim == 2 and v.shape[1] == scene.size:
+        meaning += "; of a batch jax.vmap takes one row after another"
+    check_shape("velocity", v, (scene.size,), meaning)
     if finite:
         check_values("velocity", v)
     return v

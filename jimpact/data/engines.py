@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from importlib.resources import files
 from typing import NamedTuple
 
+from jimpact.tools.checks import check_choice
 from jimpact.tools.records import Column, Table, Tabular
 
 
@@ -101,10 +102,8 @@ def engine_impacts(engine: str | None = None, scene: str | None = None) -> Engin
         every = [_row(line) for line in csv.DictReader(file)]
     for name, value in (("engine", engine), ("scene", scene)):
         known = list(dict.fromkeys(getattr(row, name) for row in every))
-        if value is not None and value not in known:
-            raise ValueError(
-                f"Argument `{name}` must be one of {', '.join(known)}, but has value {value!r}."
-            )
+        if value is not None:
+            check_choice(name, value, known)
     chosen = (row for row in every if engine in (None, row.engine) and scene in (None, row.scene))
     return EngineImpacts(tuple(chosen))
 

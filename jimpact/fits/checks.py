@@ -12,6 +12,7 @@ import numpy as np
 from scipy.sparse import block_diag, coo_array
 from scipy.special import chdtrc, fdtrc
 
+from jimpact.core.law import free_parameters_of
 from jimpact.fits.data import ROUNDING, kept_by_corrections
 from jimpact.fits.data_checks import DATA_CHECKS, LISTED, DataBalances
 from jimpact.fits.findings import Finding, findings
@@ -294,9 +295,17 @@ def _beyond_sigma(judged: Judged) -> Iterator[Finding]:
             "lack_of_fit",
             f"Lack of fit: the residuals are {judged.stretch:.2g} times what sigma allows (chi^2 = "
             f"{judged.squares:.4g} with {degrees(judged.freedom)}): the law or "
-            f"the stated errors are wrong, or the parameters scatter; the standard errors {how}.",
+            "the stated errors are wrong, or the parameters scatter; the standard errors "
+            f"{how}.{_held(judged.problem)}",
             numbers={"ratio": judged.stretch, "chi_squared": judged.squares},
         )
+
+
+def _held(problem: FitProblem) -> str:
+    """Says that friction of the law is not fitted, which may be why the law does not fit."""
+    if "friction" not in free_parameters_of(problem.law) or "friction" in problem.fields:
+        return ""
+    return " The law's `friction` is held at its start: name it in `free` to fit it."
 
 
 def _beyond_noise(judged: Judged) -> Iterator[Finding]:
@@ -315,7 +324,7 @@ def _beyond_noise(judged: Judged) -> Iterator[Finding]:
             "lack_of_fit",
             f"Lack of fit: the residuals are {np.sqrt(ratio):.2g} times the noise that momentum "
             f"and repeated shots show ({rest} and {degrees(count)}): the law does not "
-            "fit, and the standard errors mean little.",
+            f"fit, and the standard errors mean little.{_held(problem)}",
             numbers={"ratio": float(np.sqrt(ratio))},
         )
 

@@ -171,6 +171,13 @@ class Experiments(eqx.Module):
             lines.append(f"... and {count - _PRINTED} more")
         return "\n".join(lines)
 
+    @staticmethod
+    def _instead_of(value: Any) -> str:
+        """Advice for a value that is no data, ending the message of `check_kind`."""
+        if isinstance(value, str | Path):
+            return " `ji.read_experiments(path)` reads a file."
+        return " `ji.Experiments(pre, post)` makes them of velocities."
+
     @property
     def lost_freedom(self) -> int:
         """Independent values that a correction has removed, of all shots."""

@@ -504,6 +504,8 @@ def of_shots(
     """
     check_kind("law", law, Law)
     check_kind("experiments", experiments, Experiments)
+    if scene is not None:
+        check_kind("scene", scene, Scene)
     check_concrete("law", law)
     check_concrete("scene", scene)
     law, of_tolerance = tolerated(law, scene, experiments)

@@ -113,6 +113,11 @@ class Search:
     limit: float | None = None
     progress: float | None = None
 
+    @staticmethod
+    def _instead_of(value: Any) -> str:
+        """Advice for a value that is no search, ending the message of `check_kind`."""
+        return f" Give ji.Search({value!r})." if isinstance(value, str) else ""
+
     def __post_init__(self) -> None:
         """Refuse a word that is not known, and numbers out of range."""
         as_whole("max_steps", step_limit(self.method, self.max_steps), 1)

@@ -13,7 +13,7 @@ from jimpact.core.scene import Scene, as_velocity, gap_velocity, velocity_change
 from jimpact.events.contact_flow import ContactStates
 from jimpact.events.impact_history import history_program
 from jimpact.numerics.derive import in_lanes, naming_the_adjoint
-from jimpact.tools.checks import as_whole, check_values, in_common_dtype
+from jimpact.tools.checks import as_whole, check_kind, check_values, in_common_dtype
 from jimpact.tools.compiling import full_precision, quick_jit
 
 
@@ -74,6 +74,7 @@ def history(law: Law, scene: Scene, velocity: Any, samples: int = 200) -> Histor
     >>> round(float(h.duration), 3), round(float(h.maximum_force[0]), 3)  # pi/sqrt(k), sqrt(k)
     (2.221, 1.414)
     """
+    check_kind("law", law, Law)
     if not law.has_history:
         raise TypeError(
             "Argument `law` must have a history (`has_history`: LZB, a "

@@ -73,6 +73,13 @@ class System(eqx.Module):
     base_directions: jax.Array | None
     friction: jax.Array | None
 
+    @staticmethod
+    def _instead_of(value: Any) -> str:
+        """Advice for a value that is no system, ending the message of `check_kind`."""
+        if isinstance(value, Body):
+            return " A body becomes one under its loads: ji.System(body, gravity=True)."
+        return ""
+
     def __str__(self) -> str:
         """The body, its mass, and the loads."""
         names = ("force", "potential", "base")
@@ -100,6 +107,11 @@ class System(eqx.Module):
             if function is not None:
                 check_function(name, function)
         if not isinstance(gap_function, Body):
+            if mass is None and callable(gap_function):
+                raise ValueError(
+                    "Argument `mass` must be given where `gap_function` is a function (a body has "
+                    "its own): an array or a function q -> M(q), but is None."
+                )
             self.body = FunctionBody(gap_function, mass, tangent_function)
         elif mass is None and tangent_function is None:
             self.body = gap_function

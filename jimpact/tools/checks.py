@@ -166,7 +166,8 @@ def check_word(what: str, word: Any, choices: Iterable[Any]) -> None:
     if word not in choices:
         known = ", ".join(map(str, choices))
         raise ValueError(
-            f"{what} must be one of {known}, but is {word!r}.{suggestion(word, choices)}"
+            f"{what} must be one of {known}, but is {word!r}."
+            f"{suggestion(word, choices, ABBREVIATIONS)}"
         )
 
 
@@ -221,6 +222,8 @@ def check_kind(name: str, value: Any, kind: type) -> None:
     hint = ""
     if kind is Mapping:
         hint = " Give each a name, as in {'a': ...}."
+    elif isinstance(value, type) and issubclass(value, kind):
+        hint = f" That is the class; {value.__name__}(...) makes an object of it."
     elif hasattr(kind, "_instead_of"):
         hint = kind._instead_of(value)
     raise TypeError(
@@ -237,7 +240,9 @@ def check_function(name: str, value: Any) -> None:
 def short_repr(value: Any) -> str:
     """The value as messages show it: its type where it takes more than 80 characters."""
     text = repr(value)
-    return text if "\n" not in text and len(text) < 80 else f"a {type(value).__name__}"
+    kind = type(value).__name__
+    article = "an" if kind[0] in "AEIOaeio" else "a"
+    return text if "\n" not in text and len(text) < 80 else f"{article} {kind}"
 
 
 def check_concrete(name: str, value: Any) -> None:

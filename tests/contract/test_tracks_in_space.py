@@ -145,8 +145,13 @@ def test_both_orders_of_quaternions_and_both_signs():
         np.testing.assert_allclose(each.impacts[0].pre, track.impacts[0].pre, rtol=1e-9)
         np.testing.assert_allclose(each.covariance, track.covariance, rtol=1e-6)
     np.testing.assert_allclose(np.abs(other.impacts[0].q), np.abs(track.impacts[0].q), rtol=1e-9)
-    fit = ji.fit(ji.Newton(0.5, friction=0.1), None, other.experiments(CUBE), starts=1)
+    shots, law = other.experiments(CUBE), ji.Newton(0.5, friction=0.1)
+    fit = ji.fit(law, None, shots, free=("restitution", "friction"), starts=1)
+    assert fit.warnings == ()
     assert (np.abs(fit.value - [0.6, 0.2]) < 4 * fit.standard_error).all()
+    held = ji.fit(law, None, shots, starts=1).warnings[0]
+    assert "Lack of fit" in held
+    assert "`friction` is held at its start" in held
     for wrong, order in ((q, "xyzw"), (q[:, TO_XYZW], "wxyz")):
         with pytest.raises(ValueError, match=r"order of the file.* in the other one 1"):
             found(t, wrong, order=order).experiments(CUBE)
