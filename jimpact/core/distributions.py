@@ -2,6 +2,7 @@
 
 import abc
 import operator
+import warnings
 from typing import Any
 
 import equinox as eqx
@@ -215,7 +216,7 @@ def as_source(name: str, value: Any, size: int, non_negative: bool) -> Any:
         if not eqx.is_array(drawn):
             raise TypeError(f"Argument `{name}` must give an array for a key, but gives {drawn!r}.")
         check_shape(f"{name}(key)", drawn, (size,), "one draw")
-        check_uses_key(name, value)
+        warn_without_key(name, value)
         return value
     array = as_float_array(name, value)
     several = array.ndim == 2
@@ -230,14 +231,14 @@ def as_source(name: str, value: Any, size: int, non_negative: bool) -> Any:
     return array
 
 
-def check_uses_key(name: str, function: Any) -> None:
-    """Raise a ValueError where a function draws without its key, so that all samples are equal."""
+def warn_without_key(name: str, function: Any) -> None:
+    """Warn where a function draws without its key, so that it is the same in all samples."""
     program = jax.make_jaxpr(function)(jax.random.key(0, impl="threefry2x32")).jaxpr
     if not any(program.invars[0] is x for step in program.eqns for x in step.invars):
-        raise ValueError(
-            f"Argument `{name}` must draw by its key, as jax.random.uniform(key, ...), but ignores "
-            "it: it is compiled, and all samples would be the same (as numpy.random would draw "
-            "once)."
+        warnings.warn(
+            f"Argument `{name}` draws without its key: it is compiled once, and the same in all "
+            "samples, whatever numpy.random would give. Draw by jax.random.uniform(key, ...), say.",
+            stacklevel=2,
         )
 
 

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jimpact
-from jimpact.core.distributions import Distribution, GivenRows, as_source, check_uses_key
+from jimpact.core.distributions import Distribution, GivenRows, as_source, warn_without_key
 from jimpact.core.impacts import impact
 from jimpact.core.law import Law, within_domains
 from jimpact.core.scene import Scene, rounded_gaps, with_gaps
@@ -292,7 +292,7 @@ def _checked_sources(sources: Sources, scene: Scene) -> Sources:
     if not isinstance(drawn, Law):
         raise TypeError(f"Argument `law` must give a Law for a key, but gives {drawn!r}.")
     if drawn is not law:
-        check_uses_key("law", law)
+        warn_without_key("law", law)
     if gaps is not None and not drawn.uses_gaps:
         raise ValueError(
             f"Argument `gaps` must be None for {type(drawn).__name__}, which leaves open contacts "

@@ -407,8 +407,6 @@ SYSTEMS = [
         "`scene` must be of type Scene, but is Block.*A body has a scene",
     ),
     (lambda: fit_of_a_ball(search="sgd"), r"Give ji\.Search\('sgd'\)"),
-    (lambda: samples(gaps=lambda key: jnp.array([0.0, 1e-6])), "`gaps` must draw by its key"),
-    (lambda: samples(law=lambda key: ji.Binary(0.9, "earliest")), "`law` must draw by its key"),
     (
         lambda: ji.simulate(ji.Block(0.2, 0.6), ji.Newton(0.5), [0, 1, 0], [0, 0, 0], 1.0),
         r"but is Block.*ji\.System\(body, gravity=True\)",
@@ -465,3 +463,15 @@ def test_python_numpy_and_jax_inputs_agree():
     ints = ji.impact(ji.Moreau([0.9, 0.8]), ji.chain([1, 2, 3]), [1, 0, 0])
     for out in (*outs, ints):
         np.testing.assert_allclose(out.velocity, outs[0].velocity, atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("name", "function"),
+    [
+        ("gaps", lambda key: jnp.array([0.0, 1e-6])),
+        ("law", lambda key: ji.Binary(0.9, "earliest")),
+    ],
+)
+def test_a_function_that_ignores_its_key_is_told(name, function):
+    with pytest.warns(UserWarning, match=f"`{name}` draws without its key"):
+        samples(**{name: function})
