@@ -12,6 +12,7 @@ from .distributions import (
     Distribution as Distribution,
     GivenRows as GivenRows,
     as_source as as_source,
+    warn_without_key as warn_without_key,
 )
 from .law import (
     AnyLaw as AnyLaw,

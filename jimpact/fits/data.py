@@ -112,16 +112,10 @@ class Experiments(eqx.Module):
         self.covariance = None
         if covariance is not None:
             others = {"sigma": sigma, "sigma_pre": sigma_pre, "resolution": resolution}
-            for name, beside in others.items():
-                if beside is not None:
-                    raise ValueError(
-                        f"Argument `{name}` must be left out where `covariance` is given, which "
-                        "holds all errors, but both are given."
-                    )
+            _check_alone("covariance", others)
             self.covariance = as_covariance(covariance, measured.shape)
-            variances = diagonal_blocks(self.covariance, 2 * measured.shape[1]).diagonal(
-                axis1=1, axis2=2
-            )
+            blocks = diagonal_blocks(self.covariance, 2 * measured.shape[1])
+            variances = blocks.diagonal(axis1=1, axis2=2)
             sigma_pre, sigma = np.split(np.sqrt(variances), 2, axis=1)
         self.sigma = _as_sigma("sigma", sigma, measured)
         self.resolution = _as_sigma("resolution", resolution, measured)
@@ -463,6 +457,16 @@ def possible_normals(scene: Scene) -> np.ndarray:
     """Normals (n, c) of the contacts that are closed, or have a gap that may close."""
     possible = scene.closed if scene.gaps is None else np.isfinite(scene.gaps)
     return np.asarray(scene.normals, float)[:, np.asarray(possible)]
+
+
+def _check_alone(given: str, others: dict[str, Any]) -> None:
+    """Raise a ValueError for other arguments beside one that holds all errors."""
+    for name, beside in others.items():
+        if beside is not None:
+            raise ValueError(
+                f"Argument `{name}` must be left out where `{given}` is given, which holds all "
+                "errors, but both are given."
+            )
 
 
 def _as_rows(name: str, value: Any) -> jax.Array:

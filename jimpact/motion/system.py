@@ -123,17 +123,7 @@ class System(eqx.Module):
         if gravity is not False:
             if potential is not None:
                 raise ValueError("Argument `potential` must not be given besides `gravity`.")
-            acceleration = as_float_array(
-                "gravity", STANDARD_GRAVITY if gravity is True else gravity
-            )
-            check_shape("gravity", acceleration, (), "the size of the acceleration")
-            if not is_traced(acceleration) and float(acceleration) < 0:
-                raise ValueError(
-                    "Argument `gravity` must be >= 0, the size of an acceleration that points "
-                    f"downwards, but has value {float(acceleration):g} m/s^2."
-                )
-            check_values("gravity", acceleration, low=0.0)
-            potential = self.body.gravity(acceleration)
+            potential = self.body.gravity(_acceleration_of(gravity))
         self.force, self.potential, self.base = force, potential, base
         self.friction = None if friction is None else as_float_array("friction", friction)
         check_values("friction", self.friction, low=0.0)
@@ -167,6 +157,19 @@ class System(eqx.Module):
     def mass(self) -> Any:
         """M of the body, or q -> M(q)."""
         return self.body.mass
+
+
+def _acceleration_of(gravity: Any) -> jax.Array:
+    """The size () [m/s^2] of an acceleration that points downwards; True: the standard one."""
+    acceleration = as_float_array("gravity", STANDARD_GRAVITY if gravity is True else gravity)
+    check_shape("gravity", acceleration, (), "the size of the acceleration")
+    if not is_traced(acceleration) and float(acceleration) < 0:
+        raise ValueError(
+            "Argument `gravity` must be >= 0, the size of an acceleration that points "
+            f"downwards, but has value {float(acceleration):g} m/s^2."
+        )
+    check_values("gravity", acceleration, low=0.0)
+    return acceleration
 
 
 def gravity(mass_along_up: Any, acceleration: Any = STANDARD_GRAVITY) -> Potential:
