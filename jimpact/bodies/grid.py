@@ -235,7 +235,8 @@ def active_pairs(bodies: Pile, q: jax.Array, later: jax.Array, below: jax.Array)
 
     Of all candidates the closed ones get the rows 0, 1, .. of arrays of fixed length, `bodies.room`
     rounded up to blocks, in the order of their numbers. Rows that are not used are 0, and have the
-    number `no_contact`. It overflows where there are more than `bodies.room`.
+    number `no_contact`. It overflows where there are more than `bodies.room`, or the grid has no
+    room for all pairs that are near.
     """
     numbers, closed, overflows = _closed(bodies, q, later, below)
     rows = -(-bodies.room // BLOCK) * BLOCK

@@ -201,7 +201,12 @@ class RigidBodies(Body):
 
     @full_precision
     def nearby(self, q: jax.Array, u: jax.Array) -> jax.Array:
-        """q after the displacement u, to second order in u: without sine and cosine."""
+        """q after a small displacement u, to second order in u: for derivatives at u = 0.
+
+        Equation: `x + u_x`, and the quaternion `(1 - |h|^2 / 2, h) e`, h half the turn in the axes
+        of the body. First and second derivatives at u = 0 are those of `moved`, without its
+        `sin|h| / |h|`, which is 0 / 0 there.
+        """
         if not self.quaternions:
             return q + u
         half = 0.5 * self.of_bodies(u)[:, 3:]

@@ -287,7 +287,11 @@ def _impact(
     given: _Given,
     traced: Traced,
 ) -> Impact:
-    """The outcome from the law's impulses: velocities, energy and status."""
+    """The outcome from the law's impulses p: velocities, energy and status.
+
+    Equation: `v+ = v- + M^-1 (N p + H p_t)`, `T+ - T- = (v+ - v-)^T M (v+ + v-) / 2`, which may
+    exceed the stored energy by the noise of the outcome only.
+    """
     if groups is None:
         contact = given.applied(law.contact(scene, v))
         happens = contact.happens
@@ -298,13 +302,14 @@ def _impact(
     p, tangential = outcome.normal, outcome.tangential
     jump = velocity_change(scene, p, tangential)
     v_plus = v + jump
-    # the work of the impulses, summed over bodies: next to a much lighter body terms of W p cancel
+    # over bodies, not as p . (gamma- + gamma+) / 2 over contacts: next to a much lighter body the
+    # terms of gamma+ = gamma- + W p cancel
     change = 0.5 * momentum(scene, jump) @ (v + v_plus)
     total = jnp.sum(stored)
     code = jnp.where(change > total + outcome.noise, CODE["energy_gain"], CODE["ok"])
     code = jnp.where(happens, jnp.maximum(code, outcome.status), CODE["ok"])
     finite = jnp.all(jnp.isfinite(v_plus)) & jnp.all(jnp.isfinite(p)) & jnp.isfinite(change)
-    size = jnp.where(happens, outcome.size, 1.0)
+    size = jnp.where(happens, outcome.size, 1.0)  # no scale can be out of range without an impact
     code = traced.status((law, scene, v, given), code, size, finite)
     return Impact(v_plus, p, tangential, change, total, code, outcome.accuracy)
 

@@ -647,11 +647,11 @@ def _check_directions(scene: Scene) -> None:
 def _is_oblique(mass: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Contacts (m,) whose directions (m, n, d) are not orthonormal in the bodies' positions.
 
-    A scene does not say which coordinates are positions. Of each value on the diagonal of M, take
-    the uncoupled coordinates of this mass, and D, the rows of the d directions for them. If they
-    are positions of b bodies, in each of which the normal has length 1, then its square is b, and
-    the contact moves d b of them. Where both hold they are taken for positions, and the directions
-    are oblique unless `D^T D = b I`. Rotations do not fit this but by chance.
+    A scene does not say which coordinates are positions. The candidates are the uncoupled
+    coordinates of one and the same mass. Let D be the rows of the d directions for them, b the
+    square of the normal in D, and k how many rows are not 0. Positions of b bodies (1 or 2) have a
+    unit normal each and d coordinates each: where `k = d b` they are taken for positions, and the
+    directions are oblique unless `D^T D = b I`. Rotations fit this by chance only.
     """
     masses, count = np.diag(mass), directions.shape[2]
     moves: np.ndarray = np.any(directions, axis=2)

@@ -286,13 +286,17 @@ def _shorter_half(values: np.ndarray) -> float:
 
 
 def _chance(excess: np.ndarray, shape: np.ndarray, gains: bool) -> float:
-    """How often noise alone follows a shape as much: Student's t; 1 where it cannot be judged."""
+    """p-value of the hypothesis that excesses (N,) hold no part of this shape (N,).
+
+    Equation: regression `excess = a shape + noise`, `t = a / error(a)`; P(T > t) of Student's t
+    with N - 1 degrees of freedom for `gains`, else P(|T| > |t|). 1 where it cannot be judged.
+    """
     squares, freedom = float(shape @ shape), len(excess) - 1
-    if freedom < 1 or squares == 0:
+    if freedom < 1 or squares == 0 or not excess.any():
         return 1.0
-    part = float(shape @ excess) / squares
-    rest = float(np.sum((excess - part * shape) ** 2))
-    error = np.sqrt(rest / freedom / squares)
-    t = part / error if error else np.inf * np.sign(part)
+    slope = float(shape @ excess) / squares
+    left = float(np.sum((excess - slope * shape) ** 2))
+    error = np.sqrt(left / freedom / squares)
+    t = slope / error if error else np.inf * np.sign(slope)
     above = float(stdtr(freedom, -t))
     return above if gains else 2 * min(above, 1 - above)

@@ -107,10 +107,15 @@ def _class_of(place: str) -> Any:
 
 
 def _grouped(fields: dict[str, Any]) -> dict[str, Any]:
-    """Fields of a `FitProblem` of files before November 2026, which held those of its parts."""
+    """Fields of a `FitProblem` as they are now, from those in older files.
+
+    These held the fields of `variables` and of `measurement` beside its own; here they come into
+    these parts, as `encoded` writes them.
+    """
     rest, parts = dict(fields), {}
     for name, part in (("variables", Variables), ("measurement", Measurement)):
         own = [field.name for field in dataclasses.fields(part)]
+        # `Measurement.value` was `FitProblem.measured`
         of_part = {key: rest.pop("measured" if key == "value" else key) for key in own}
         parts[name] = {"class": part.__name__, "fields": of_part}
     return rest | parts

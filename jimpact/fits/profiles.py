@@ -101,10 +101,16 @@ class Deviances:
         if self.in_a_valley:  # they are ends in it
             self.starts = [self.best]
 
-    def minimize(self, trials: Sequence[tuple[Index, Sequence[float], np.ndarray]]) -> Ends:
-        """Minima with some parameters fixed at values, from y (Q,) each, all side by side."""
+    def minimize(
+        self, trials: Sequence[tuple[tuple[int, ...], Sequence[float], np.ndarray]]
+    ) -> Ends:
+        """Minima over the other parameters, all side by side; `lowest` becomes the least of them.
+
+        A trial says which parameters are fixed, at which values, and from which y (Q,) it begins.
+        """
         points = np.array([y for _, _, y in trials])
-        fixed = np.arange(points.shape[1]) >= np.full((len(points), 1), len(self.fit.names))
+        # of the Q entries of y the first P are parameters, and the others stay
+        fixed = np.tile(np.arange(points.shape[1]) >= len(self.fit.names), (len(points), 1))
         for k, (which, values, _) in enumerate(trials):
             points[k, which], fixed[k, which] = values, True
         solver = Solver(max_steps=PASSES, show=self.show, damping=NEAR)

@@ -337,7 +337,12 @@ def impulse_euler(law: LZB, scene: Scene, velocity: Any, setting: Any) -> Soluti
 
 
 def _impulse_step(field: Field, dp: jax.Array, walk: ImpulseWalk) -> ImpulseWalk:
-    """One explicit step of `dp` in the primary impulse."""
+    """One explicit step of `dp` in the impulse of the primary contact i, that of the largest force.
+
+    Equation: `dp_j = F_j / F_i dp`, `F_j(E) = (eta + 1) / 2 omega (2 E)^(eta / (eta + 1))`, and
+    `E_j` falls by the work of dp_j. A contact with E_j = 0 that approaches at w_j has
+    `E_j = w_j dp_j` in this step, so that `dp_j = (dp / F_i F_j(w_j))^(eta + 1)`.
+    """
     gamma, energy = walk.gamma, walk.energy
     eta = jnp.asarray(field.exponent, gamma.dtype)
     approach = jnp.maximum(-gamma, 0.0)
@@ -353,9 +358,8 @@ def _impulse_step(field: Field, dp: jax.Array, walk: ImpulseWalk) -> ImpulseWalk
     f_start = jnp.where(jnp.any(energy > 0), f, force(approach * dp))
     primary = jnp.argmax(f_start)
     scale = dp / f_start[primary]
-    # implicit first step: dp_j = scale F_j(u_j dp_j)
-    first = (scale * force(approach)) * jnp.where(approach > 0, 1.0, 0.0)
-    increment = jnp.where(energy > 0, scale * f, power(first, eta + 1))
+    root_of_first = (scale * force(approach)) * jnp.where(approach > 0, 1.0, 0.0)
+    increment = jnp.where(energy > 0, scale * f, power(root_of_first, eta + 1))
     is_primary = jnp.arange(len(gamma)) == primary  # in batches faster than an index
     increment = jnp.where(is_primary, dp, increment)
     increment = increment * _emptying(field, walk, is_primary, increment)

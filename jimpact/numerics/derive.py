@@ -453,14 +453,19 @@ def _kinds_of_results(*arguments: Any, function: Function, results: Any) -> list
 _lanes_p.def_abstract_eval(_kinds_of_results)
 
 
-def _longer(
+def _batching_rule(
     arrays: Any, axes: Any, *, function: Function, results: Any
 ) -> tuple[Arrays, tuple[Any, ...]]:
-    """The batch of `vmap` becomes part of the last axis, or that of the directions."""
+    """Rule of `vmap` for `_lanes_p`: the results, and the axis of their batch (None: no batch).
+
+    `axes`: of the batch in each array, None where it has none. Arrays (.., B) with a batch of
+    `size` become (.., size B), and the results are split again. But a batch of tangents alone, at
+    values that have none, becomes the directions of `_WithTangents`, which computes values once.
+    """
     batched = [axis is not None for axis in axes]
     size = next(x.shape[axis] for x, axis in zip(arrays, axes) if axis is not None)
     arrays = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(arrays, axes)]
-    count = len(getattr(function, "marked", ()))
+    count = len(getattr(function, "marked", ()))  # of values, before their tangents
     if isinstance(function, _WithTangents) and not function.many and not any(batched[:count]):
         # many directions at one point: its steps are computed once
         along = [
@@ -484,7 +489,7 @@ def _longer(
     return tuple(jnp.moveaxis(x, -2, 0) for x in split), (0,) * len(split)
 
 
-batching.primitive_batchers[_lanes_p] = _longer
+batching.primitive_batchers[_lanes_p] = _batching_rule
 
 
 @full_precision

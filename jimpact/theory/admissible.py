@@ -74,9 +74,9 @@ class AdmissibleSet:
         """Whether a velocity v+ (n,), or each of (k, n), is admissible up to an error.
 
         Equation: with `v - centre = axes u + w`, `u = axes^T M (v - centre)`, the error is the
-        larger of `sqrt(w^T M w)`, which violates the balance of momentum, and the distance of u
-        from the convex set [sqrt(J)]. It may be `tolerance` times the size of the impact,
-        `sqrt(2 (T- - T(centre)))`, the largest |u|; None: that of `audit`.
+        larger of `sqrt(w^T M w)`, which violates the balance of momentum, and of how much u
+        violates a facet or the cap of the convex set [sqrt(J)]. It may be `tolerance` times the
+        size of the impact, `sqrt(2 (T- - T(centre)))`, the largest |u|; None: that of `audit`.
         """
         v = np.asarray(as_float_array("velocity", velocity), float)
         if v.ndim not in (1, 2) or v.shape[-1] != self.scene.size:

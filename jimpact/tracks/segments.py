@@ -171,8 +171,10 @@ def flights_and_acceleration(
     """Flights, their acceleration (n,) [m/s^2] and drag k [1/m].
 
     `known` None, or `drag` None: found, as one that is common to all flights. By turns, `ROUNDS`
-    times: `q - k s` is divided into flights, then the acceleration is fitted, then k. What a drag
-    of 1/m adds to the places is s; its effect is taken as proportional to k.
+    times: `q - k s` is divided into flights; where the acceleration is unknown, neighbours that one
+    flight of a better acceleration explains are joined, and it is fitted; then k. What a drag of
+    1/m adds to the places is s; its effect is taken as proportional to k. `shortest`: frames of a
+    flight.
     """
     acceleration = curvature(t, q, shortest) if known is None else known
     added_by_drag = q - straightened(t, q, 1.0) if drag != 0 else np.zeros_like(q)

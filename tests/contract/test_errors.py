@@ -465,6 +465,7 @@ def test_python_numpy_and_jax_inputs_agree():
         np.testing.assert_allclose(out.velocity, outs[0].velocity, atol=1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "function"),
     [

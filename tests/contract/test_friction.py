@@ -336,6 +336,7 @@ def test_given_slip_agrees_with_the_law():
     close(out.tangential_impulse, side, rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["moreau", "lzb"])
 def test_uneven_load_is_shared_as_friction_allows(name):
     """Corner A takes nothing, so that B alone holds the block: rolling over to B is Housner's."""

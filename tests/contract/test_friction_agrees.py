@@ -137,6 +137,7 @@ def same(after, expected):
     return (np.abs(after - expected).max(axis=1) < 1e-8).mean() > 0.95
 
 
+@pytest.mark.slow
 def test_outcomes_do_not_depend_on_the_description(scenes):
     """The order of the contacts, a mirror, millimetres and tonnes."""
     (mass, normals, tangents, v, e, mu), expected = scenes

@@ -336,6 +336,7 @@ def test_impulses_that_wedge_do_not_hide_their_errors():
     assert (rates[np.array([1, 4])] > 0.5).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", [ji.Disc(0.1).scene(), ji.Box((1.0, 1.0, 1.0)).scene()])
 def test_contacts_without_friction_do_not_stick(scene):
     """A friction of 0 holds nothing, also where nothing slips: the slope was that of sticking."""

@@ -427,6 +427,7 @@ def test_frames_lost_by_turns():
         assert abs(impact.time - 0.203) < 4 * impact.time_error < 1e-3
 
 
+@pytest.mark.slow
 def test_impacts_of_unknown_gravity_are_all_found():
     """Four bounces at 500 frames a second, one frame in fifteen lost."""
     t, speed, e = np.arange(618) / 500, 9.80665 * 0.38853, 0.558

@@ -76,6 +76,7 @@ def found(t, q, sigma=NOISE, order="wxyz", **options):
     return ji.tracks.find_impacts(t, q, sigma, acceleration=[0, 0, -G], quaternion=order, **options)
 
 
+@pytest.mark.slow
 def test_velocities_have_no_bias_and_the_stated_covariance():
     rng, (poses, after), errors, warned = np.random.default_rng(0), landed(CUBE), [], 0
     for _ in range(60):
