@@ -166,7 +166,8 @@ class MonteCarlo(Tabular):
         """Samples a second, and how many were read."""
         if self.resumed == self.samples:
             return "all read from the folder"
-        text = f"{self.rate:,.0f} samples/s"
+        rate = f"{self.rate:,.0f}"
+        text = f"{rate} {'sample' if rate == '1' else 'samples'}/s"
         return text + (f", {self.resumed:,} read from the folder" if self.resumed else "")
 
     def _tolerance_lines(self) -> list[str]:
