@@ -137,13 +137,15 @@ def impact(
         check_constrained(scene, v)
     law, scene, v = in_common_dtype(law, scene, v)
     check_law(law, scene, v.dtype)
-    check_values("rtol", rtol, low=0.0, high=1.0, open_low=True)
-    if rtol is not None and not is_traced(rtol):
-        check_rtol(float(np.max(rtol)), v.dtype)
-    for name, number in (("noise", noise), ("approach", approach), ("rtol", rtol)):
-        check_values(name, number, low=0.0)
-        if number is not None:
-            check_shape(name, number, (), "one number")
+    for name, speed in (("noise", noise), ("approach", approach)):
+        check_values(name, speed, low=0.0)
+        if speed is not None:
+            check_shape(name, speed, (), "one speed")
+    if rtol is not None:
+        check_values("rtol", rtol, low=0.0, high=1.0, open_low=True)
+        check_shape("rtol", rtol, (), "one tolerance")
+        if not is_traced(rtol):
+            check_rtol(float(rtol), v.dtype)
     given = _Given(
         *(None if x is None else jnp.asarray(x, v.dtype) for x in (noise, approach, rtol))
     )

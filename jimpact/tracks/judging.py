@@ -14,6 +14,7 @@ from jimpact.tracks.segments import (
     cost_of_flights,
     curvature,
     price,
+    without_polynomial,
 )
 
 # Chance that a good track has a warning: half by curvatures, half by sizes of residuals. Ten times
@@ -300,8 +301,7 @@ def _excess(
         for c, scale in enumerate(sigma):
             ok = frames[np.isfinite(rest[frames, c])]
             x = t[ok] - t[ok].mean()
-            line = np.linalg.qr(np.vander(x, 2))[0]
-            curve = x**2 / 2 - line @ (line.T @ (x**2 / 2))
+            curve = without_polynomial(x, x**2 / 2, 2)
             size = float(np.linalg.norm(curve))
             error[i, c] = scale / size if size > 0 else np.inf
             excess[i, c] = scale * float(curve @ rest[ok, c]) / size**2 if size else 0.0
@@ -312,13 +312,8 @@ def _of_bends(t: np.ndarray, q: np.ndarray, sigma: np.ndarray, arcs: Arcs) -> li
     """Impacts without which a parabola of another acceleration explains both flights as well."""
     doubtful = []
     for k, both in enumerate(map(np.concatenate, pairwise(arcs.members)), 1):
-        with_impact, without = np.nansum(arcs.residual[both] ** 2), 0.0
-        for c, scale in enumerate(sigma):
-            ok = both[np.isfinite(q[both, c])]
-            curve = np.linalg.qr(np.vander(t[ok] - t[ok].mean(), 3))[0]
-            rest = q[ok, c] - curve @ (curve.T @ q[ok, c])
-            without += float(rest @ rest) / scale**2
-        if without < with_impact + LEAST_GAIN:
+        with_impact = np.nansum(arcs.residual[both] ** 2)
+        if chi_squared(t, q, sigma, None, both) < with_impact + LEAST_GAIN:
             doubtful.append(str(k))
     if not doubtful:
         return []

@@ -146,17 +146,27 @@ def _joined(
     return joined
 
 
+def without_polynomial(x: np.ndarray, y: np.ndarray, terms: int) -> np.ndarray:
+    """What is left of y (F,) or (F, k) without the best polynomials of so many terms in x (F,)."""
+    basis = np.linalg.qr(np.vander(x, terms))[0]
+    return np.asarray(y - basis @ (basis.T @ y))
+
+
 def chi_squared(
-    t: np.ndarray, q: np.ndarray, sigma: np.ndarray, acceleration: np.ndarray, frames: np.ndarray
+    t: np.ndarray,
+    q: np.ndarray,
+    sigma: np.ndarray,
+    acceleration: np.ndarray | None,
+    frames: np.ndarray,
 ) -> float:
-    """chi^2 of one flight."""
+    """chi^2 of one flight; of acceleration None it has one of its own."""
     x, total = t[frames] - t[frames].mean(), 0.0
-    for c in range(q.shape[1]):
-        y = q[frames, c] - acceleration[c] * x**2 / 2
-        ok = np.isfinite(y)
-        line = np.vander(x[ok], 2)
-        rest = y[ok] - line @ np.linalg.lstsq(line, y[ok], rcond=None)[0]
-        total += float(rest @ rest) / sigma[c] ** 2
+    for c, scale in enumerate(sigma):
+        ok = np.isfinite(q[frames, c])
+        known = 0.0 if acceleration is None else acceleration[c]
+        y = q[frames[ok], c] - known * x[ok] ** 2 / 2
+        rest = without_polynomial(x[ok], y, 3 if acceleration is None else 2)
+        total += float(rest @ rest) / scale**2
     return total
 
 
@@ -210,8 +220,8 @@ def _common_drag(
             x, y = t[ok] - t[ok].mean(), q[ok, c]
             if acceleration is not None:
                 y = y - acceleration[c] * x**2 / 2
-            line = np.linalg.qr(np.vander(x, 2 if acceleration is not None else 3))[0]
-            drag = added_by_drag[ok, c] - line @ (line.T @ added_by_drag[ok, c])
+            terms = 2 if acceleration is not None else 3
+            drag = without_polynomial(x, added_by_drag[ok, c], terms)
             above, below = above + float(drag @ y) / scale**2, below + float(drag @ drag) / scale**2
     return above / below if below > 0 else 0.0
 
@@ -234,9 +244,9 @@ def _joined_at_any(
         x, sums = t[frames] - t[frames].mean(), np.zeros((q.shape[1], 3))
         for c in range(q.shape[1]):
             ok = np.isfinite(q[frames, c])
-            line = np.linalg.qr(np.vander(x[ok], 2))[0]
-            both = np.stack([q[frames[ok], c] - acceleration[c] * x[ok] ** 2 / 2, x[ok] ** 2 / 2])
-            rest, curve = (both - both @ line @ line.T) / sigma[c]
+            curve = x[ok] ** 2 / 2
+            both = np.stack([q[frames[ok], c] - acceleration[c] * curve, curve], axis=1)
+            rest, curve = without_polynomial(x[ok], both, 2).T / sigma[c]
             sums[c] = rest @ rest, rest @ curve, curve @ curve
         return sums
 
@@ -281,8 +291,7 @@ def common_acceleration(t: np.ndarray, q: np.ndarray, flights: list[np.ndarray])
         for frames in flights:
             ok = frames[np.isfinite(q[frames, c])]
             x = t[ok] - t[ok].mean()
-            line = np.linalg.qr(np.vander(x, 2))[0]
-            curve = x**2 / 2 - line @ (line.T @ (x**2 / 2))
+            curve = without_polynomial(x, x**2 / 2, 2)
             above, below = above + float(curve @ q[ok, c]), below + float(curve @ curve)
         found[c] = above / below if below > 0 else 0.0
     return found
