@@ -38,7 +38,7 @@ def with_turns(
                 "Argument `q` must have an orientation in 2 frames or more of each flight, but in "
                 f"flight {k} it has {len(some)}."
             )
-    turns = [Rotation.from_quat(np.roll(e[some], -1, axis=1)) for some in frames]
+    turns = [Rotation.from_quat(e[some], scalar_first=True) for some in frames]
     given, notes = np.ones(3) if sigma is None else sigma, []
     fitted = [fit_turning(track.t[f], r, given, inertia) for f, r in zip(frames, turns)]
     if sigma is None:  # each flight takes two values of each axis
@@ -143,7 +143,7 @@ def _with_velocities(
             omegas[k, side], gain[k, side, 3:, first : first + 6] = omega[0], slopes[0]
             gain[k, side, 3:, 4 * (k + 1) + 3] = flight.rate(omega[0])
             if side == 0:
-                quaternion = np.roll(turn[0].as_quat(), 1)
+                quaternion = turn[0].as_quat(scalar_first=True)
                 poses.append(np.concatenate([arcs.places[k + 1], quaternion]))
     flat = gain.reshape(12 * impacts, len(covariance))
     whole = flat @ covariance @ flat.T

@@ -53,7 +53,7 @@ def as_inertia(inertia: Any) -> np.ndarray | None:
 def turns_since_first(e: np.ndarray) -> np.ndarray:
     """Sums (T, 3) of the turns from frame to frame, about the axes of the body, NaN where lost."""
     seen, sums = np.isfinite(e).all(axis=1), np.full((len(e), 3), np.nan)
-    measured = Rotation.from_quat(np.roll(e[seen], -1, axis=1))
+    measured = Rotation.from_quat(e[seen], scalar_first=True)
     steps = (measured[:-1].inv() * measured[1:]).as_rotvec()
     sums[seen] = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
     return sums

@@ -161,9 +161,12 @@ class Track:
         if scene is not None:
             check_kind("scene", scene, Scene | Body)  # type: ignore[arg-type]
             check_values("near", np.asarray(near, float), low=0.0)
-            if isinstance(scene, Body) and scene.coordinates is not None:
-                self._check_in_space(scene, near)
+            body = scene if isinstance(scene, Body) and scene.coordinates is not None else None
+            if body is not None:  # in space
+                self._check_inertia(body, near)
             at = _scenes_of(scene, self.impacts, near)
+            if body is not None:
+                self._check_order(body, near, at)
             free = self._between_free_flights()
             kept = np.array([k for k, s in enumerate(at) if s is not None and free[k]], int)
             if not kept.size:
@@ -190,8 +193,8 @@ class Track:
         held = held_flights(self.t, places, sigma, self.acceleration, self.flights)
         return ~(held[:-1] | held[1:])
 
-    def _check_in_space(self, body: Body, near: float) -> None:
-        """Raise unless the poses are of this body: its inertia, and the order of quaternions."""
+    def _check_inertia(self, body: Body, near: float) -> None:
+        """Raise unless the track has poses, and turns with the inertia of this body."""
         if self.order is None:
             raise ValueError(
                 "Argument `scene` must not be a body in space, whose angular velocity is no rate "
@@ -203,15 +206,18 @@ class Track:
         apart = own / np.trace(own) - given / np.trace(given)
         if np.abs(apart).max() > INERTIA_WITHIN:
             raise ValueError(
-                "Argument `scene` must turn as the track was told, but has the moments of inertia "
-                f"{own.tolist()}, and `inertia` of `find_impacts` was "
+                "Argument `scene` must have the `inertia` of `find_impacts`, but has the moments "
+                f"of inertia {own.tolist()}, and `inertia` was "
                 f"{'None, as of a sphere' if self.inertia is None else given.tolist()}: give it "
                 "inertia=body.inertia."
             )
-        if all(_scenes_of(body, self.impacts, near)):
+
+    def _check_order(self, body: Body, near: float, scenes: Sequence[Scene | None]) -> None:
+        """Raise where the other order of quaternions explains more impacts than these scenes do."""
+        if all(scenes) or self.order is None:
             return
         turned = [each.not_in(self.order) for each in self.impacts]
-        here, other = (sum(map(bool, _scenes_of(body, x, near))) for x in (self.impacts, turned))
+        here, other = (sum(map(bool, x)) for x in (scenes, _scenes_of(body, turned, near)))
         # a few close a gap by chance, as a cube looks the same from many sides
         if other > 2 * here + 1 or other > here == 0:
             raise ValueError(
