@@ -6,7 +6,8 @@ import numpy as np
 import jimpact as ji
 from jimpact.fits.findings import Finding
 from jimpact.fits.report import Fit
-from jimpact.fits.search import FitMinimum
+from jimpact.fits.search import FitMinimum, Solution
+from jimpact.fits.uncertainty import Uncertainty
 from jimpact.laws.histories import History
 from jimpact.motion.record import KIND_CODE, Motion, no_events, with_row
 
@@ -23,27 +24,9 @@ def canned(shots, value=(0.6, 2.0), **change):
         "law": ji.LZB([0.6], [2.0]),
         "method": "levenberg-marquardt",
         "names": ("restitution[1]", "stiffness[1]"),
-        "standard_error": np.array([0.01, np.inf]),
-        "covariance": np.array([[1e-4, np.nan], [np.nan, np.inf]]),
-        "correlation": np.eye(2),
         "bounds": (np.zeros(2), np.array([1.0, np.inf])),
-        "at_bound": np.array([False, False]),
-        "predicted": predicted,
-        "residual": post - predicted,
-        "rms": 0.01,
-        "noise": 0.0101,
-        "degrees_of_freedom": 2 * shots - 2,
-        "rank": 1,
-        "singular_values": np.array([3.0, 0.0]),
-        "identifiability": (
-            "The data cannot see stiffness[1]: no measured velocity depends on it.",
-        ),
-        "starts": (start(value, 3), start((0.4, 2.0), 5)),
-        "status": np.zeros(shots, int),
-        "converged": True,
-        "steps": 17,
-        "lost_starts": 0,
-        "findings": (Finding("energy_gain", "The data gain energy."),),
+        "known_findings": (Finding("energy_gain", "The data gain energy."),),
+        "known_profiles": (),
         "problem": ji.FitProblem.from_shots(
             ji.LZB([0.6], [2.0], exponent=jnp.asarray(1.5)),
             ji.chain([1.0, 1.0]),
@@ -52,7 +35,32 @@ def canned(shots, value=(0.6, 2.0), **change):
         ),
         "jacobian": np.stack([[-0.5, 0.5] * pre[:, :1], np.zeros_like(pre)], axis=2),
     }
-    return Fit(**(given | change))
+    search = {
+        "starts": (start(value, 3), start((0.4, 2.0), 5)),
+        "predicted": predicted,
+        "status": np.zeros(shots, int),
+        "converged": True,
+        "at_bound": np.array([False, False]),
+        "steps": 17,
+        "lost_starts": 0,
+    }
+    errors = {
+        "rank": 1,
+        "singular_values": np.array([3.0, 0.0]),
+        "degrees_of_freedom": 2 * shots - 2,
+        "noise": 0.0101,
+        "covariance": np.array([[1e-4, np.nan], [np.nan, np.inf]]),
+        "correlation": np.eye(2),
+        "standard_error": np.array([0.01, np.inf]),
+        "identifiability": (
+            "The data cannot see stiffness[1]: no measured velocity depends on it.",
+        ),
+    }
+    change = {f"known_{x}" if x in ("findings", "profiles") else x: change[x] for x in change}
+    for part in (search, errors):
+        part |= {name: change.pop(name) for name in part if name in change}
+    parts = {"search": Solution(**search), "errors": Uncertainty(**errors)}
+    return Fit(**(given | parts | change))
 
 
 def start(value, count):

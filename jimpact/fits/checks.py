@@ -257,7 +257,7 @@ def _statuses(judged: Judged) -> Iterator[Finding]:
 def _matrix(judged: Judged) -> Iterator[Finding]:
     """Conditions on a restitution matrix that it ends at, or that it need not satisfy."""
     problem, law, data = judged.problem, judged.problem.law, judged.problem.experiments
-    if edges := boundary(problem.matrix, problem.point(judged.solution.value)):
+    if edges := boundary(problem.matrix, problem.variables.point(judged.solution.value)):
         yield Finding(
             "matrix_edge",
             f"The matrix ends at the edge of the admissible ones ({'; '.join(edges)}): the errors "

@@ -1,6 +1,6 @@
 """What is wrong with measured shots: tests, each with the sentence that the report has for it."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -89,21 +89,16 @@ class DataBalances:
         self, experiments: Experiments, scene: Scene | None, stored_energy: float, uses_gaps: bool
     ):
         self.experiments, self.scene = experiments, scene
+        self.stored_energy, self.uses_gaps = stored_energy, uses_gaps
         self.total = len(experiments.shots)
         self.momenta: dict[int, list[_Defect]] = {}  # by the momentum that is conserved
         self.energies: list[_Defect] = []
-        self.resting: list[int] = []  # shots in which no contact that takes part approaches
-        self.only_open = True  # whether open ones do in all of these
         count, n = experiments.pre.shape
         joint = np.tile(np.diag(np.repeat([0.0, 1.0], n)), (count, 1, 1))  # where nothing is known
         if experiments.joint is not None:
             joint = diagonal_blocks(experiments.joint, 2 * n)
-        each = (experiments.each(scene, f) for f in (closed_normals, possible_normals, dense_mass))
-        balances = zip(experiments.balances(scene), *each, joint)
-        for k, ((rows, pre, post), closed, possible, mass, covariance) in enumerate(balances):
-            if stored_energy == 0 and not _approaches(possible if uses_gaps else closed, pre):
-                self.resting.append(k)
-                self.only_open &= _approaches(possible, pre)
+        balances = zip(experiments.balances(scene), experiments.each(scene, dense_mass), joint)
+        for k, ((rows, pre, post), mass, covariance) in enumerate(balances):
             if np.isnan(post).any():
                 continue
             for j, row in enumerate(rows):
@@ -117,6 +112,11 @@ class DataBalances:
             gain, ratio = t_plus - t_minus - stored_energy, t_plus / t_minus if t_minus else np.nan
             error = _error(np.append(-mass @ pre, mass @ post), covariance)
             self.energies.append(_Defect(k, gain, t_minus, t_minus, ratio, error))
+
+    def approaching(self, normals_of: Callable[[Scene], np.ndarray]) -> np.ndarray:
+        """Shots (K,) in which one of the contacts with these normals approaches."""
+        pairs = zip(self.experiments.each(self.scene, normals_of), np.asarray(self.experiments.pre))
+        return np.array([_approaches(normals, pre) for normals, pre in pairs])
 
     def labels(self, shots: Iterable[int]) -> tuple[str, ...]:
         """Of these shots."""
@@ -234,10 +234,14 @@ def _energy(data: DataBalances) -> Iterator[Finding]:
 
 def _resting(data: DataBalances) -> Iterator[Finding]:
     """Shots in which no contact approaches."""
-    if count := len(data.resting):
-        labels = data.labels(data.resting)
+    if data.stored_energy:
+        return
+    closed, possible = map(data.approaching, (closed_normals, possible_normals))
+    resting = np.flatnonzero(~(possible if data.uses_gaps else closed))
+    if count := len(resting):
+        labels = data.labels(resting)
         why = "are pre and post swapped, or is a sign wrong?"
-        if data.only_open:
+        if possible[resting].all():
             why = "only open ones do, which take part in `Compliant` and `Binary` alone."
         yield Finding(
             "no_approach",

@@ -15,14 +15,15 @@ import jimpact
 from jimpact.core.law import StaticNumber, StaticNumbers
 from jimpact.core.scene import PairNormals
 from jimpact.fits.findings import Finding
+from jimpact.fits.intervals import Profile
 from jimpact.fits.matrices import AdmissibleMatrices
 from jimpact.fits.measurement import Measurement
 from jimpact.fits.observables import Shots
 from jimpact.fits.parameters import LawInScene, Parameters, Prior
 from jimpact.fits.parts_of_motion import LawInMotion
 from jimpact.fits.problem import FitProblem
-from jimpact.fits.search import FitMinimum
-from jimpact.fits.uncertainty import Profile
+from jimpact.fits.search import FitMinimum, Solution
+from jimpact.fits.uncertainty import Uncertainty
 from jimpact.fits.variables import Variables
 from jimpact.numerics.sparse import Neighbours
 
@@ -37,7 +38,8 @@ _PARTS = {
     kind.__name__: kind
     for kind in (
         *(AdmissibleMatrices, Finding, FitMinimum, FitProblem, LawInMotion, LawInScene),
-        *(Measurement, Neighbours, PairNormals, Parameters, Profile, Shots, Variables),
+        *(Measurement, Neighbours, PairNormals, Parameters, Profile, Shots, Solution),
+        *(Uncertainty, Variables),
     )
 }
 
@@ -61,7 +63,7 @@ def encoded(value: Any) -> Any:
         kind = {"dtype": str(array.dtype), "device": isinstance(value, jax.Array)}
         return {"array": entries, "shape": list(array.shape), **kind}
     if dataclasses.is_dataclass(value):
-        fields = {f.name: encoded(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        fields = {name: encoded(getattr(value, name)) for name in _saved_fields(type(value))}
         return {"class": _name_of(type(value)), "fields": fields}
     if isinstance(value, Mapping):
         return {"dict": {key: encoded(each) for key, each in value.items()}}
@@ -106,29 +108,32 @@ def _class_of(place: str) -> Any:
     return getattr(jimpact, name)
 
 
-def _grouped(fields: dict[str, Any]) -> dict[str, Any]:
-    """Fields of a `FitProblem` as they are now, from those in older files.
+def _saved_fields(cls: Any) -> list[str]:
+    """Names of the fields of a class that a file holds."""
+    return [field.name for field in dataclasses.fields(cls) if field.metadata.get("saved", True)]
 
-    These held the fields of `variables` and of `measurement` beside its own; here they come into
-    these parts, as `encoded` writes them.
+
+def grouped(fields: dict[str, Any], parts: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields, encoded, in which those of its parts, by name, stand in these parts.
+
+    Older files hold them beside the others.
     """
-    rest, parts = dict(fields), {}
-    for name, part in (("variables", Variables), ("measurement", Measurement)):
-        own = [field.name for field in dataclasses.fields(part)]
-        # `Measurement.value` was `FitProblem.measured`
-        of_part = {key: rest.pop("measured" if key == "value" else key) for key in own}
-        parts[name] = {"class": part.__name__, "fields": of_part}
-    return rest | parts
+    rest, groups = dict(fields), {}
+    for name, part in parts.items():
+        of_part = {key: rest.pop(key) for key in _saved_fields(part)}
+        groups[name] = {"class": part.__name__, "fields": of_part}
+    return rest | groups
 
 
 def instance_of(cls: Any, fields: dict[str, Any]) -> Any:
     """An instance of a class with these fields, which are all that it has."""
     if not dataclasses.is_dataclass(cls):
         raise TypeError(f"{cls!r} is no class of a law, scene or result")
-    known = {field.name for field in dataclasses.fields(cls)}
+    known = set(_saved_fields(cls))
     fields = dict.fromkeys(known & _LATER) | fields
     if cls is FitProblem and "owner" in fields:
-        fields = _grouped(fields)
+        fields["value"] = fields.pop("measured")  # its older name
+        fields = grouped(fields, {"variables": Variables, "measurement": Measurement})
     if known != set(fields):
         name = getattr(cls, "__name__", cls)
         raise TypeError(f"{name} has the fields {sorted(known)}, the file {sorted(fields)}")

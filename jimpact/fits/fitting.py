@@ -12,14 +12,13 @@ import numpy as np
 
 from jimpact.core.law import AnyLaw
 from jimpact.core.scene import Scene
-from jimpact.fits.checks import Judged, fit_findings, unusable
+from jimpact.fits.checks import Judged, unusable
 from jimpact.fits.data import Experiments
 from jimpact.fits.data_checks import wrong_unit
-from jimpact.fits.findings import Finding
+from jimpact.fits.intervals import check_level
 from jimpact.fits.observables import COARSE_RTOL
 from jimpact.fits.parameters import DEFAULT_FREE
 from jimpact.fits.problem import FitProblem, of_shots
-from jimpact.fits.profiles import LEVEL, PROFILE_STARTS, needs_profiles, profiles_of
 from jimpact.fits.report import Fit, check_squares
 from jimpact.fits.search import (
     DEFAULT_SEARCH,
@@ -37,11 +36,10 @@ from jimpact.fits.solve import (
     FINE_OF_MANY,
     HARDLY_WORSE,
     Ends,
-    Method,
     Solver,
     step_limit,
 )
-from jimpact.fits.uncertainty import Profile, check_level, uncertainty
+from jimpact.fits.uncertainty import uncertainty
 from jimpact.tools.checks import as_whole, check_kind
 from jimpact.tools.progress import progress_bar
 from jimpact.tools.records import listed
@@ -98,7 +96,8 @@ def fit(
         profiles: whether intervals are those of `profile`; None: where standard errors cannot be
             trusted (at a bound, in a valley, with several minima, or for weakly determined
             parameters) and the law fits, of up to 3 parameters and 256 shots (64 with one start);
-            else the report says how to get them.
+            else the report says how to get them. True computes them at once, None when the fit
+            is printed or asked for intervals.
         search: method, loss, limits and progress, see `Search`.
 
     Returns:
@@ -148,7 +147,8 @@ def fit(
             solution = find_minima(problem, starts, seed, solver)
         _check_derivatives(problem, solution)
         if solution.slopes is not None:
-            points = problem.point(np.array([minimum.value for minimum in solution.starts]))
+            values = np.array([minimum.value for minimum in solution.starts])
+            points = problem.variables.point(values)
             problem = problem.with_errors_before(solution.slopes)
             (problem,), ends = settled([problem], points, solver)
             counts = np.array([minimum.count for minimum in solution.starts])
@@ -156,22 +156,10 @@ def fit(
         robust = None
         if search.loss != "squares":
             problem, solution, robust = robust_minimum(problem, solution, search.loss, solver)
-    result = replace(as_fit(problem, solution, method, robust), loss=search.loss, seed=seed)
-    if profiles or (profiles is None and needs_profiles(result)):
-        more = PROFILE_STARTS if profiles else 0
-        every = range(len(result.names))
-        return _with_profiles(result, profiles_of(result, every, LEVEL, more, search.progress))
+    result = replace(as_fit(problem, solution, search, robust), wants_profiles=profiles)
+    if profiles:
+        _ = result.profiles  # asked for: computed here
     return result
-
-
-def _with_profiles(result: Fit[AnyLaw], profiles: tuple[Profile, ...]) -> Fit[AnyLaw]:
-    """The fit with its profiles, and a warning if they found a lower minimum."""
-    if (better := profiles[0].better) is not None:
-        values = ", ".join(f"{name} {x:.4g}" for name, x in zip(result.names, better))
-        line = f"A profile found a lower minimum than the fit ({values}): allow more `starts`."
-        finding = Finding("lower_minimum", line, "a profile found a lower minimum")
-        result = replace(result, findings=(*result.findings, finding))
-    return replace(result, profiles=profiles)
 
 
 def _check_derivatives(problem: FitProblem, solution: Solution) -> None:
@@ -186,14 +174,6 @@ def _check_derivatives(problem: FitProblem, solution: Solution) -> None:
         )
 
 
-def rms(problem: FitProblem, residual: np.ndarray) -> float:
-    """The root mean square of residuals, those in rad/s by kinetic energy [m/s]."""
-    data = problem.experiments
-    natural_error = 1.0 if data is None else data.natural_errors(problem.scene)
-    known = (residual / natural_error)[np.isfinite(residual)]
-    return float(np.sqrt(np.mean(known**2))) if known.size else np.nan
-
-
 def _without(problem: FitProblem, lost: np.ndarray) -> FitProblem:
     """The problem without these shots (K,), which it names."""
     assert problem.experiments is not None
@@ -203,15 +183,14 @@ def _without(problem: FitProblem, lost: np.ndarray) -> FitProblem:
 
 
 def as_fit(
-    problem: FitProblem, solution: Solution, method: Method, robust: float | None = None
+    problem: FitProblem, solution: Solution, search: Search, robust: float | None = None
 ) -> Fit[Any]:
-    """The fit at the end of a search: errors, rank and warnings.
+    """The fit at the end of a search, with its errors.
 
     `robust`: noise times the root of the degrees of freedom, of a loss that outliers move little.
     """
     judged = Judged(replace(problem, scene=problem.to_scene(solution.value)), solution, robust)
     errors = judged.errors
-    residual = np.asarray(problem.measured, float) - solution.predicted
     starts, limit = [], solution.starts[0].sum_of_squares + HARDLY_WORSE * errors.noise**2
     for end in solution.starts:
         matters = not end.sum_of_squares > limit  # also where the noise is not known
@@ -219,16 +198,17 @@ def as_fit(
         starts.append(FitMinimum(end.sum_of_squares, end.value, end.count, error))
     return Fit(
         law=problem.to_law(solution.value),
-        method=method if isinstance(method, str) else "optax",
+        method=search.method if isinstance(search.method, str) else "optax",
         names=problem.names,
         bounds=(problem.domains[:, 0], problem.domains[:, 1]),
-        residual=residual,
-        rms=rms(problem, residual),
-        **vars(errors),
-        **vars(replace(solution, starts=tuple(starts))),
-        findings=tuple(fit_findings(judged)),
         problem=problem,
         jacobian=problem.derivatives(solution.starts[0]),
+        search=replace(solution, starts=tuple(starts)),
+        errors=errors,
+        loss=search.loss,
+        seed=search.seed,
+        judged=judged,
+        progress=search.progress,
     )
 
 
@@ -313,10 +293,10 @@ def fit_many(
     def made(k: int) -> Fit[AnyLaw]:
         """The fit of one; shots that cannot be used are left out in a new one."""
         solution = solution_of(problems[k], each[k])
+        search = Search(seed=seed, max_steps=max_steps, progress=False)
         if unusable(problems[k], solution).any():
-            search = Search(seed=seed, max_steps=max_steps, progress=False)
             return fit(problems[k], starts=starts, profiles=False, search=search)
-        return as_fit(problems[k], solution, "levenberg-marquardt")
+        return as_fit(problems[k], solution, search)
 
     best = [each[k].rows(np.nanargmin(each[k].squares)) for k in range(len(many))]
     value = problems[0].values_at(np.array([end.y for end in best]))
@@ -466,7 +446,7 @@ def _refits(
     fit: Fit, problems: list[FitProblem], workers: int | None, progress: float | None
 ) -> Refits:
     """Minima of these problems next to a fit."""
-    points = np.tile(fit.problem.point(fit.value), (len(problems), 1))
+    points = np.tile(fit.problem.variables.point(fit.value), (len(problems), 1))
     with progress_bar(progress) as show:
         solver = Solver(show=show, workers=workers)
         _, ends = settled(problems, points, solver, FINE_OF_MANY)

@@ -175,7 +175,7 @@ class _Inner:
 
     def free(self, start: np.ndarray) -> jax.Array:
         """z of values x, a little inside."""
-        move = (jnp.asarray(self.problem.point(start)) - self.region.center)[: self.count]
+        move = (jnp.asarray(self.problem.variables.point(start)) - self.region.center)[: self.count]
         size = jnp.linalg.norm(move)
         if size == 0:
             return move

@@ -8,6 +8,7 @@ first P count, so that a compiled program does not depend on which entries are f
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from operator import attrgetter
 from typing import Any
 
 import equinox as eqx
@@ -45,6 +46,7 @@ from jimpact.fits.parameters import (
 )
 from jimpact.fits.solve import EXACT, Ends, LeastSquares, Solver, minimize
 from jimpact.fits.variables import Variables
+from jimpact.laws.kinematic import RestitutionMatrix
 from jimpact.tools.checks import (
     as_float_array,
     check_concrete,
@@ -307,10 +309,9 @@ class FitProblem:
 
     # ------------------------------------------------------------------ functions of x
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Of the parameters x; contacts are numbered from 1."""
-        return self.parameters.names
+    names = property(
+        attrgetter("parameters.names"), doc="Of the parameters x; contacts are numbered from 1."
+    )
 
     @property
     def start(self) -> np.ndarray:
@@ -420,10 +421,6 @@ class FitProblem:
         residual = jnp.concatenate([self.measurement.residual(prediction), of_priors])
         return residual / self.measurement.size, prediction
 
-    def point(self, x: np.ndarray) -> np.ndarray:
-        """y (..., Q) of x (..., P), on the host."""
-        return self.variables.point(x)
-
     def values_at(self, y: np.ndarray) -> np.ndarray:
         """x (..., P) of y (..., Q), on the host."""
         return self.variables.values_at(y)[..., : len(self.names)]
@@ -434,15 +431,12 @@ class FitProblem:
 
     # ------------------------------------------------------------------ for judging a fit
 
-    @property
-    def measured(self) -> Any:
-        """What was measured; NaN where no value was."""
-        return self.measurement.value
-
-    @property
-    def sigma(self) -> Any:
-        """Standard errors of what was measured, or None."""
-        return self.measurement.sigma
+    measured = property(
+        attrgetter("measurement.value"), doc="What was measured; NaN where no value was."
+    )
+    sigma = property(
+        attrgetter("measurement.sigma"), doc="Standard errors of what was measured, or None."
+    )
 
     @property
     def values(self) -> int:
@@ -472,15 +466,19 @@ class FitProblem:
         slope = self.of_data(minimum.jacobian) / self.steps_at(minimum.value)
         return self.measurement.errors_of(slope)
 
+    def rms(self, errors: np.ndarray) -> float:
+        """The root mean square of errors of what was measured, of rad/s by kinetic energy [m/s]."""
+        data = self.experiments
+        natural_error = 1.0 if data is None else data.natural_errors(self.scene)
+        known = (errors / natural_error)[np.isfinite(errors)]
+        return float(np.sqrt(np.mean(known**2))) if known.size else np.nan
+
     @property
     def precision(self) -> str:
         """'float64' or 'float32', in which all is computed."""
         return str(self.dtype)
 
-    @property
-    def dtype(self) -> Any:
-        """Floating type of all numbers."""
-        return self.variables.low.dtype
+    dtype = property(attrgetter("variables.low.dtype"), doc="Floating type of all numbers.")
 
     @property
     def exact_squares(self) -> float:
@@ -490,7 +488,7 @@ class FitProblem:
 
 def outcome_at(problem: FitProblem, x: Any) -> Ends:
     """Residual, derivatives and predictions at x (P,), by the program that searches."""
-    point = problem.point(np.asarray(x))[None]
+    point = problem.variables.point(np.asarray(x))[None]
     once, every = Solver(max_steps=1), np.ones(point.shape, bool)
     return minimize([problem.least_squares()], point, once, fixed=every)
 
@@ -519,8 +517,12 @@ def of_shots(
         notes=(*problem.notes, *of_tolerance),
         experiments=experiments,
         scene=scene,
-        matrix=matrix_region(problem.law, alike, problem.variables, problem.start, problem.ties),
     )
+    if isinstance(problem.law, RestitutionMatrix):
+        parts = problem.variables, problem.start, problem.ties
+        problem = replace(problem, matrix=matrix_region(problem.law, alike, *parts))
+    if experiments.sigma_pre is None:
+        return problem
     count, n = experiments.pre.shape
     return problem.with_errors_before(np.tile(np.eye(n), (count, 1, 1)))
 

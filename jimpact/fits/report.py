@@ -11,9 +11,12 @@ import numpy as np
 
 import jimpact
 from jimpact.core.law import AnyLaw, value_of
-from jimpact.fits.encoding import decoded, encoded, instance_of, versions
+from jimpact.fits.encoding import decoded, encoded, grouped, instance_of, versions
 from jimpact.fits.findings import of_sentences
-from jimpact.fits.uncertainty import FitResult, pieces_in_words
+from jimpact.fits.intervals import pieces_in_words
+from jimpact.fits.result import FitResult
+from jimpact.fits.search import Solution
+from jimpact.fits.uncertainty import Uncertainty
 from jimpact.tools.checks import check_kind
 from jimpact.tools.records import as_data, counted, degrees, formatted, with_error
 from jimpact.tools.status import STATUS
@@ -189,7 +192,7 @@ def _parameters(fit: "Fit") -> list[str]:
             f"With {degrees(freedom)}, a 95 % interval is {fit.quantile(0.95):.2g} standard errors "
             "to each side (Student's t), not 1.96."
         )
-    if fit.linearization_misleads:
+    if fit.linearization_misleads and not fit.profiles:
         lines.append(
             "These intervals take the sum of squares for a parabola, which may mislead here: "
             "`ji.profile(fit)` does not."
@@ -385,7 +388,8 @@ def save_fit(fit: "Fit", path: str | Path) -> Path:
         raise ValueError("Argument `fit` must be to shots to be saved: functions cannot be.")
     if fit.problem.ties:
         raise ValueError("Argument `fit` must have no ties to be saved: functions cannot be.")
-    record = {"format": FORMAT, "versions": versions(), "result": encoded(fit)["fields"]}
+    known = dataclasses.replace(fit, known_findings=fit.findings, known_profiles=fit.profiles)
+    record = {"format": FORMAT, "versions": versions(), "result": encoded(known)["fields"]}
     path = Path(path)
     path.write_text(json.dumps(record, allow_nan=False, indent=1) + "\n", encoding="utf-8")
     return path
@@ -427,7 +431,7 @@ def load_fit(path: str | Path) -> "Fit":
             f"{record['format']} (written by jimpact {writer}; this is {jimpact.__version__})."
         )
     try:
-        return instance_of(Fit, _with_findings(record["result"]))
+        return instance_of(Fit, _of_this_build(record["result"]))
     except (KeyError, AttributeError, ImportError, TypeError) as error:
         raise ValueError(
             f"{path}: the fit, saved by jimpact {writer}, cannot be read: {error!r}. A law of your "
@@ -435,15 +439,25 @@ def load_fit(path: str | Path) -> "Fit":
         ) from error
 
 
-def _with_findings(result: dict[str, Any]) -> dict[str, Any]:
-    """The fields of a fit; those that a build before 0.2 saved had sentences in their place."""
-    if "findings" in result:
-        return result
-    lines, reservations = (decoded(result.pop(name)) for name in ("warnings", "reservations"))
-    problem = result["problem"]["fields"]
-    fixed = any(note.startswith("stiffness[1] is fixed") for note in decoded(problem["notes"]))
-    problem["parameters"]["fields"]["ratios"] = fixed
-    return result | {"findings": encoded(of_sentences(lines, reservations))}
+def _of_this_build(result: dict[str, Any]) -> dict[str, Any]:
+    """The fields of a fit, encoded, from those that an older build saved.
+
+    Before 0.2 there were sentences in the place of findings; then fields of `search` and `errors`
+    stood beside the others.
+    """
+    if "warnings" in result:
+        lines, reservations = (decoded(result.pop(name)) for name in ("warnings", "reservations"))
+        problem = result["problem"]["fields"]
+        fixed = any(note.startswith("stiffness[1] is fixed") for note in decoded(problem["notes"]))
+        problem["parameters"]["fields"]["ratios"] = fixed
+        result = result | {"findings": encoded(of_sentences(lines, reservations))}
+    if "search" not in result:
+        result = grouped(result, {"search": Solution, "errors": Uncertainty})
+        for name in ("findings", "profiles"):
+            result[f"known_{name}"] = result.pop(name)
+        for name in ("residual", "rms"):  # which follow from the others
+            del result[name]
+    return result
 
 
 # ---------------------------------------------------------------------------- the result
@@ -483,15 +497,23 @@ class Fit(FitResult[AnyLaw], Generic[AnyLaw]):
         lost_starts: how many were given up far above the best, or did not converge.
         stuck: whether no step lowers the sum of squares, although derivatives promise it.
         slopes: `dv+/dv-` (K, n, n) of the shots, where errors of v- are passed on, else None.
-        findings: what is wrong with data or fit, by kind, shots and numbers.
+        findings: what is wrong with data or fit, by kind, shots and numbers; computed when it is
+            asked for, as profiles are.
         warnings: the same in words.
         problem: what was solved.
         jacobian: derivatives of what was measured in the parameters (K, n, P), NaN where no
             value was measured.
         loss: see `fit`.
         seed: of the random starts.
-        profiles: if `fit` computed them.
+        profiles: of all parameters, where intervals are theirs, see `fit`; else none.
+        search: where it ended: `value`, `starts`, `predicted`, .. are its fields.
+        errors: linearized: `standard_error`, `covariance`, `rank`, .. are its fields.
         reservations: in words, what has to be said where a value is quoted.
+        judged: what the tests behind `findings` need; None of a fit that was read from a file.
+        wants_profiles: the argument `profiles` of `fit`.
+        progress: of profiles, see `Search`.
+        known_findings: those that a file holds; None: computed when asked for.
+        known_profiles: those that a file holds; None: computed when asked for.
     """
 
     def __str__(self) -> str:

@@ -291,7 +291,7 @@ def _extended(
 def _box(problem: FitProblem) -> np.ndarray:
     """Ends (2, P) of y between which starts lie."""
     log, count = problem.parameters.log, len(problem.names)
-    own = problem.point(problem.start)[:count]
+    own = problem.variables.point(problem.start)[:count]
     low, high = (
         np.array(end, float)[:count] for end in (problem.variables.low, problem.variables.high)
     )
@@ -307,7 +307,7 @@ def start_points(problem: FitProblem, starts: int, rng: np.random.Generator) -> 
     """Starts y (S, Q): the law's own values, then a Latin hypercube inside the bounds."""
     low, high = _box(problem)
     slices = rng.permuted(np.tile(np.arange(starts), (len(low), 1)), axis=1).T
-    points = np.tile(problem.point(problem.start), (starts, 1))
+    points = np.tile(problem.variables.point(problem.start), (starts, 1))
     points[1:, : len(low)] = (low + (high - low) * (slices + rng.random(slices.shape)) / starts)[1:]
     return points
 
@@ -460,10 +460,10 @@ def robust_minimum(
         if problem.sigma is None:
             scale = max(MEDIAN * float(np.median(np.abs(error[here]))), np.finfo(float).tiny)
         share, slope = LOSSES[loss](error / scale)
-        factor, before = np.sqrt(share), problem.point(solution.value)
+        factor, before = np.sqrt(share), problem.variables.point(solution.value)
         weighed = problem.weighed(factor)
         solution = solution_of(weighed, minimize([weighed.least_squares()], before[None], solver))
-        if np.abs(problem.point(solution.value) - before).max() <= SETTLED:
+        if np.abs(problem.variables.point(solution.value) - before).max() <= SETTLED:
             break
     else:
         solution = replace(solution, converged=False)

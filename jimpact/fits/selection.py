@@ -12,11 +12,10 @@ from jimpact.core.law import Law, free_parameters_of, with_parameter
 from jimpact.core.registry import REGISTRY, registered_laws, simplest_first
 from jimpact.core.scene import Scene
 from jimpact.fits.data import Experiments
-from jimpact.fits.fitting import fit, leave_one_out, rms
+from jimpact.fits.fitting import fit, leave_one_out
 from jimpact.fits.matrices import admissible_start
 from jimpact.fits.parameters import OF_SPEED, default_free
 from jimpact.fits.problem import FEW
-from jimpact.fits.profiles import needs_profiles, profile
 from jimpact.fits.report import Fit, check_squares, named_values
 from jimpact.fits.search import Search
 from jimpact.laws.velocity_dependent import VelocityDependent
@@ -301,9 +300,8 @@ def fit_laws(
             raise ValueError(f"Argument `laws` must hold a law that can be fitted, but: {why}")
         entries = _judged(fits)
         best = next(iter(entries))
-        if needs_profiles(fits[best]):
-            fits[best] = replace(fits[best], profiles=profile(fits[best], progress=False))
-            entries[best] = replace(entries[best], fit=fits[best])
+        fits[best] = replace(fits[best], wants_profiles=None)
+        entries[best] = replace(entries[best], fit=fits[best])
         test = of_speed = None
         if speed:
             show(f"fit_laws: {best}, dependence on the speed", len(candidates), len(candidates))
@@ -418,7 +416,7 @@ def _judged(fits: dict[str, Fit]) -> dict[str, LawFit]:
         if tier != "fails" and chance < level:
             worse = f"{worse} than {best} (p-value {chance:.1g})"
             tier, verdict = "worse", f"{verdict}, {worse}" if tier != "fits" else worse
-        error = rms(each.problem, errors[name])
+        error = each.problem.rms(errors[name])
         entries.append(LawFit(name, each, error, _aicc(each), verdict, tier))
     return {x.name: x for x in sorted(entries, key=_order)}
 

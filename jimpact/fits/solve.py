@@ -177,19 +177,15 @@ def step_limit(method: Any, stated: int | None) -> int:
 
 def begin(problems: Any, y: Any, solver: "Solver") -> SolverState:
     """States before the first pass of S problems from y (S, Q), on the host."""
-    count, dtype = len(y), y.dtype
-
-    def all_are(value: Any, dtype: Any = dtype) -> Any:
-        """The value of every state."""
-        return np.full(count, value, dtype)
-
+    count = len(y)
+    all_are: Any = partial(np.full, count, dtype=y.dtype)
     if solver.method == "levenberg-marquardt":
         memory: Any = Damping(*map(all_are, (solver.damping, _FIRST_GROWTH, np.inf)))
     else:
         init = _transformation(solver.method, solver.max_steps).init
         memory = jax.device_get(jax.vmap(init)(y))
     costs = all_are(np.inf), all_are(np.inf)
-    ends = all_are(0, int), all_are(False, bool), all_are(False, bool)
+    ends: Any = np.zeros(count, int), np.zeros(count, bool), np.zeros(count, bool)
     trial = np.clip(y, problems.low, problems.high)
     residual, jacobian, aux = problems.zeros
     state = SolverState(y, residual, jacobian, aux, *costs, trial, memory, *ends)

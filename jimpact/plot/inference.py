@@ -9,8 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.special import chdtri, ndtri
 
+from jimpact.fits.intervals import Profile
 from jimpact.fits.report import Fit
-from jimpact.fits.uncertainty import Profile
 from jimpact.plot.style import COLOURS, GREY, SMALL, new_figure, new_panels, styled, write
 from jimpact.tools.checks import check_choice, check_kind
 

@@ -90,7 +90,7 @@ def by_scipy(start, scene, data, free, truth):
         return known[y.tobytes()]
 
     own = ji.FitProblem.from_shots(truth, scene, data, free)
-    first = np.clip(fitted.point(own.start)[: len(low)], low, high)
+    first = np.clip(fitted.variables.point(own.start)[: len(low)], low, high)
     at(first)
     began = time.process_time()
     scale = "jac" if fitted.matrix is None else 1.0

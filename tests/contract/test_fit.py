@@ -516,7 +516,7 @@ def test_all_stiffness_ratios_that_fit_are_found():
     found = ji.fit(ji.LZB([0.9, 0.9], [1.0, 1.0]), BALLS, data, free)
     ratios = sorted(start.value[1] for start in found.starts)
     np.testing.assert_allclose(ratios, [11.531, 31.732, 40.0], rtol=1e-3)
-    for reported in (found, replace(found, profiles=())):  # by profiles, by parabolas
+    for reported in (found, replace(found, known_profiles=())):  # by profiles, by parabolas
         pieces = reported.intervals()[1]
         assert len(pieces) in (2, 3)
         assert any(low <= 40.0 <= high for low, high in pieces)
@@ -592,7 +592,8 @@ def test_further_shots_are_predicted_with_errors():
     np.testing.assert_allclose(own.noise, 0.1)
     unknown = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post))
     np.testing.assert_allclose(unknown.predict(further).noise, unknown.noise)
-    unseen = replace(found, standard_error=np.array([np.inf]))
+    errors = replace(found.errors, standard_error=np.array([np.inf]))
+    unseen = replace(found, errors=errors)
     assert np.isinf(unseen.predict(further).standard_error).all()
     each = replace(found, law=ji.Newton([0.6]))
     for fit, shots, scene, message in (

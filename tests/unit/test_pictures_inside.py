@@ -17,8 +17,8 @@ from pictures_cases import BALLS, STRIKE, force_chains, samples
 
 import jimpact as ji
 from jimpact.core.audits import Audit
+from jimpact.fits.intervals import Profile
 from jimpact.fits.profiles import Contour
-from jimpact.fits.uncertainty import Profile
 from jimpact.methods.advice_report import Advice, Candidate
 from jimpact.methods.chart import Point, Reference, Timing, WorkPrecision
 from jimpact.methods.comparison import Comparison, Entry

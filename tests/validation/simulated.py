@@ -199,10 +199,10 @@ def covered(row, fits):
     if row.loss != "squares":  # has no profiles
         return linear.mean(axis=0), []
     problems, inside = [f.problem for f in fits], []
-    best = np.array([f.problem.point(f.value) for f in fits])
+    best = np.array([f.problem.variables.point(f.value) for f in fits])
     for i in range(len(truth)):
         y = best.copy()
-        y[:, i] = [f.problem.point(truth)[i] for f in fits]
+        y[:, i] = [f.problem.variables.point(truth)[i] for f in fits]
         fixed = np.broadcast_to(np.arange(y.shape[1]) == i, y.shape)
         squares = minimize([p.least_squares() for p in problems], y, Solver(), fixed=fixed).squares
         more = squares - [f.starts[0].sum_of_squares for f in fits]

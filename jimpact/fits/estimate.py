@@ -1,0 +1,155 @@
+"""Parameters where a search has ended, with the errors of a linearized law."""
+
+from dataclasses import dataclass
+from operator import attrgetter
+from typing import Generic
+
+import numpy as np
+from scipy.special import ndtri, stdtrit
+
+from jimpact.core.law import AnyLaw
+from jimpact.fits.data import Experiments
+from jimpact.fits.intervals import check_level, joined
+from jimpact.fits.problem import FitProblem
+from jimpact.fits.search import Solution
+from jimpact.fits.uncertainty import Uncertainty
+
+# Relative standard error of a stiffness beyond which its linearized interval is not believed.
+HARDLY_SEEN = 0.2
+LEVEL = 0.95  # of confidence intervals, where none is asked for
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Estimate(Generic[AnyLaw]):
+    """P parameters of a law, the minima that were found, and the linearized errors; see `Fit`."""
+
+    law: AnyLaw
+    method: str
+    names: tuple[str, ...]
+    bounds: tuple[np.ndarray, np.ndarray]
+    problem: FitProblem
+    jacobian: np.ndarray
+    search: Solution
+    errors: Uncertainty
+    loss: str = "squares"
+    seed: int = 0
+
+    # of the search
+    value = property(attrgetter("search.value"))
+    starts = property(attrgetter("search.starts"))
+    predicted = property(attrgetter("search.predicted"))
+    status = property(attrgetter("search.status"))
+    slopes = property(attrgetter("search.slopes"))
+    converged = property(attrgetter("search.converged"))
+    stuck = property(attrgetter("search.stuck"))
+    at_bound = property(attrgetter("search.at_bound"))
+    steps = property(attrgetter("search.steps"))
+    lost_starts = property(attrgetter("search.lost_starts"))
+    # of the errors
+    rank = property(attrgetter("errors.rank"))
+    singular_values = property(attrgetter("errors.singular_values"))
+    degrees_of_freedom = property(attrgetter("errors.degrees_of_freedom"))
+    noise = property(attrgetter("errors.noise"))
+    covariance = property(attrgetter("errors.covariance"))
+    correlation = property(attrgetter("errors.correlation"))
+    standard_error = property(attrgetter("errors.standard_error"))
+    identifiability = property(attrgetter("errors.identifiability"))
+
+    @property
+    def residual(self) -> np.ndarray:
+        """Measured less predicted, shaped like what was measured; NaN where no value was."""
+        return np.asarray(self.problem.measured, float) - self.predicted
+
+    @property
+    def rms(self) -> float:
+        """Of the residual."""
+        return self.problem.rms(self.residual)
+
+    @property
+    def experiments(self) -> Experiments | None:
+        """The shots; None where something else was fitted."""
+        return self.problem.experiments
+
+    @property
+    def shot_count(self) -> int:
+        """Shots (or rows of what was measured) with at least one value that was used."""
+        measured = np.isfinite(self.problem.measured)
+        return int(measured.any(axis=tuple(range(1, measured.ndim))).sum())
+
+    @property
+    def start_count(self) -> int:
+        """Starts, those that were given up included."""
+        return sum(minimum.count for minimum in self.starts) + self.lost_starts
+
+    @property
+    def chi_squared(self) -> float:
+        """The sum of squared residuals in units of sigma, those of priors included; NaN where sigma
+        is unknown."""
+        return np.nan if self.problem.sigma is None else self.starts[0].sum_of_squares
+
+    @property
+    def aic(self) -> float:
+        """Akaike's criterion of a fit by least squares; NaN of other losses and of exact data.
+
+        Equation: `chi^2 + 2 P`; where sigma is unknown `n log(|r|^2 / n) + 2 (P + 1)`, n values.
+        """
+        squares, values = self.starts[0].sum_of_squares, self.problem.values
+        if self.loss != "squares":
+            return np.nan
+        if self.problem.sigma is not None:
+            return squares + 2 * len(self.names)
+        if squares <= self.problem.exact_squares:
+            return np.nan
+        return float(values * np.log(squares / values) + 2 * (len(self.names) + 1))
+
+    def quantile(self, level: float) -> float:
+        """Half-width of an interval of this `level` in standard errors."""
+        check_level(level)
+        freedom, tail = self.degrees_of_freedom, 0.5 + 0.5 * level
+        noise_is_known = self.problem.sigma is not None or freedom < 1
+        return float(ndtri(tail) if noise_is_known else stdtrit(freedom, tail))
+
+    def linearized_interval(self, i: int, q: float) -> tuple[tuple[float, float], ...]:
+        """Where parabolas at all minima let parameter `i` lie within `q` standard errors."""
+        low, high = self.bounds[0][i], self.bounds[1][i]
+        minima = [(self.value[i], self.standard_error[i], 0.0)]
+        for minimum in self.starts[1:]:
+            more = minimum.sum_of_squares - self.starts[0].sum_of_squares
+            if minimum.standard_error is not None and more < (q * self.noise) ** 2:
+                minima.append((minimum.value[i], minimum.standard_error[i], more))
+        pieces = []
+        for value, error, more in minima:
+            half = error * np.sqrt(q**2 - (more / self.noise**2 if more else 0.0))
+            ends = value + np.array([-half, half])
+            if self.problem.parameters.log[i]:
+                ends = value * np.exp(np.array([-half, half]) / value)
+            pieces.append(tuple(np.clip(ends, low, high)))
+        return joined(pieces)
+
+    def linearized_intervals(self, level: float) -> tuple[tuple[tuple[float, float], ...], ...]:
+        """The pieces of `linearized_interval` of each of the P parameters."""
+        q = self.quantile(level)
+        return tuple(self.linearized_interval(i, q) for i in range(len(self.names)))
+
+    @property
+    def can_be_profiled(self) -> bool:
+        """Whether parameters can be fixed: least squares in a box, not of an admissible matrix."""
+        return self.loss == "squares" and self.problem.matrix is None
+
+    @property
+    def linearization_misleads(self) -> bool:
+        """True where the sum of squares is visibly no parabola: standard errors may mislead.
+
+        That is in a valley, at a bound, with several minima, of a stiffness that is hardly seen.
+        """
+        if not self.can_be_profiled or not self.converged:
+            return False
+        if self.rank < len(self.names):
+            return True
+        if not np.isfinite(self.noise):
+            return False  # the errors are unknown
+        wide = self.problem.parameters.log & (self.standard_error > HARDLY_SEEN * self.value)
+        pieces = self.linearized_intervals(LEVEL)
+        low, high = np.array([(each[0][0], each[-1][1]) for each in pieces]).T
+        at_end = (low <= self.bounds[0]) | (high >= self.bounds[1])
+        return bool((wide | at_end).any()) or max(map(len, pieces)) > 1

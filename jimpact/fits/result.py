@@ -1,0 +1,310 @@
+"""`FitResult`: what a fit finds, in numbers; findings and profiles when they are asked for."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from types import MappingProxyType
+from typing import Any, Generic, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact.core.law import AnyLaw, parameters_of
+from jimpact.core.scene import Scene
+from jimpact.fits.checks import Judged, fit_findings
+from jimpact.fits.data import Experiments
+from jimpact.fits.deviances import PROFILE_STARTS, lower_minimum, profiles_of
+from jimpact.fits.estimate import LEVEL, Estimate
+from jimpact.fits.findings import Finding
+from jimpact.fits.intervals import Profile
+from jimpact.fits.parameters import LawInScene, tied_names, tied_value
+from jimpact.fits.problem import outcome_at
+from jimpact.fits.search import solution_of
+from jimpact.tools.checks import check_choice, check_kind, check_values
+from jimpact.tools.records import Column, Table, Tabular, counted, plain
+from jimpact.tools.status import STATUS
+
+_PRINTED_SHOTS = 12  # of predictions; ten times more fill pages
+# Share of a prior's standard deviation from which on a standard error is the prior's: the data have
+# then less than a tenth of the information. Ten times as much would call priors of half of it so.
+PRIOR_ALONE = 0.95
+# Shots up to which a fit profiles of itself, with one start and with several: as long as half of
+# the fit. Parameters: with four of LZB it takes longer than the search.
+FEW_SHOTS, MANY_SHOTS, MOST_PARAMETERS = 64, 256, 3
+NOT_SAVED: Mapping[str, bool] = MappingProxyType({"saved": False})  # of fields that no file holds
+
+
+class FittedParameter(NamedTuple):
+    """A parameter of a fit: its value, standard error, 95 % interval in pieces, and whether the
+    data determine it."""
+
+    value: float
+    standard_error: float
+    intervals: tuple[tuple[float, float], ...]
+    determined: bool
+
+
+class Predicted(NamedTuple):
+    """Velocities after each shot (K, n) [m/s], their standard errors (K, n), status codes (K,).
+
+    `noise` (K, n) is the standard error of a measurement of them. `low` and `high` (K, n) are the
+    ends of the band in which such a measurement lies. `units` (n,): of the velocities.
+    """
+
+    velocity: np.ndarray
+    standard_error: np.ndarray
+    status: np.ndarray
+    noise: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    units: tuple[str, ...]
+
+    def __str__(self) -> str:
+        """A row for each velocity; a status where it is not ok."""
+        columns = (
+            *(Column("shot"), Column("coordinate"), Column("velocity", ".5g")),
+            *(Column("standard_error", ".2g", "std. error"), Column("low", ".5g")),
+            *(Column("high", ".5g"), Column("unit"), Column("status")),
+        )
+        rows = [
+            [
+                *(k + 1, i + 1, plain(float(self.velocity[k, i])), self.standard_error[k, i]),
+                *(self.low[k, i], self.high[k, i], self.units[i]),
+                STATUS[int(self.status[k])].name if self.status[k] else None,
+            ]
+            for k, i in np.ndindex(*self.velocity[:_PRINTED_SHOTS].shape)
+        ]
+        more = len(self.velocity) - _PRINTED_SHOTS
+        notes = [f"... and {counted(more, 'more shot')}"] if more > 0 else []
+        return str(Table(columns, rows, notes=[*notes, "low to high: of a measurement."], keys=2))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
+    """What `fit` finds, in numbers: see `Fit`, which can be printed and saved.
+
+    Findings and profiles are computed when they are asked for.
+    """
+
+    judged: Judged | None = field(default=None, repr=False, metadata=NOT_SAVED)
+    wants_profiles: bool | None = field(default=False, metadata=NOT_SAVED)
+    progress: float | None = field(default=None, metadata=NOT_SAVED)
+    known_findings: tuple[Finding, ...] | None = None
+    known_profiles: tuple[Profile, ...] | None = None
+    picture = "fit"
+
+    @cached_property
+    def findings(self) -> tuple[Finding, ...]:
+        """What is wrong with data or fit, by kind, shots and numbers."""
+        if self.known_findings is not None:
+            return self.known_findings
+        return (*self._findings_of_search, *lower_minimum(self.names, self.profiles))
+
+    @cached_property
+    def _findings_of_search(self) -> tuple[Finding, ...]:
+        """The findings without what profiles find."""
+        if self.known_findings is not None:
+            return self.known_findings
+        assert self.judged is not None
+        return tuple(fit_findings(self.judged))
+
+    @cached_property
+    def profiles(self) -> tuple[Profile, ...]:
+        """Of all parameters, where intervals are theirs; else none."""
+        if self.known_profiles is not None:
+            return self.known_profiles
+        if not (self._needs_profiles if self.wants_profiles is None else self.wants_profiles):
+            return ()
+        points = PROFILE_STARTS if self.wants_profiles else 0
+        return profiles_of(self, range(len(self.names)), LEVEL, points, self.progress)
+
+    @property
+    def _needs_profiles(self) -> bool:
+        """True where standard errors may mislead, and profiles cost no more than the fit did.
+
+        Not after lack of fit: no interval of such a law means anything, and its valleys are rough.
+        """
+        most = FEW_SHOTS if self.start_count == 1 else MANY_SHOTS
+        few = self.experiments is not None and len(self.predicted) <= most
+        few &= len(self.names) <= MOST_PARAMETERS
+        rejected = any(each.kind == "lack_of_fit" for each in self._findings_of_search)
+        return few and self.linearization_misleads and not rejected
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is wrong with data or fit, in words."""
+        return tuple(each.line for each in self.findings if each.line)
+
+    @property
+    def reservations(self) -> tuple[str, ...]:
+        """In words, what has to be said where a value is quoted."""
+        return tuple(each.reservation for each in self.findings if each.reservation)
+
+    def found(self, kind: str) -> bool:
+        """Whether there is a finding of this kind, one of `jimpact.fits.findings.KINDS`."""
+        return any(each.kind == kind for each in self.findings)
+
+    @property
+    def table(self) -> Table:
+        """A row a parameter: value, standard error, ends of its 95 % interval, whether seen."""
+        names = ("value", "standard_error", "low_95", "high_95", "at_bound", "determined")
+        ends = self.confidence_interval().T
+        columns = (self.value, self.standard_error, *ends, self.at_bound, self.determined)
+        rows = list(zip(self.names, *(column.tolist() for column in columns)))
+        return Table([Column(name) for name in ("parameter", *names)], rows)
+
+    @property
+    def scene(self) -> Scene | None:
+        """The scene of all shots, with what was fitted of it; None: the shots have their own."""
+        return self.problem.to_scene(self.value)
+
+    @property
+    def determined(self) -> np.ndarray:
+        """(P,) which parameters the data say anything about; the values of others are starts."""
+        seen = ~np.isinf(self.standard_error)
+        for i, each in enumerate(self.profiles):
+            seen[i] &= each.determines
+        return seen
+
+    @property
+    def from_prior(self) -> np.ndarray:
+        """(P,) which parameters are known from their priors alone: the data add hardly anything."""
+        std = np.full(len(self.names), np.inf)
+        for prior in self.problem.priors:
+            std[prior.parameter] = prior.std
+        return self.standard_error > PRIOR_ALONE * self.noise * std
+
+    @property
+    def tied(self) -> dict[str, tuple[float, float]]:
+        """What is tied to parameters, by name: values with their standard errors."""
+        problem, ties = self.problem, self.problem.ties
+        if not ties:
+            return {}
+
+        def values(x: jax.Array) -> jax.Array:
+            """The tied entries of parameters x."""
+            law = problem.law_in_scene(x)
+            return jnp.concatenate([tied_value(law, tie) for tie in ties])
+
+        x, names = jnp.asarray(self.value, problem.precision), tied_names(problem.law, ties)
+        errors = self.errors_of(np.asarray(jax.jacfwd(values)(x), float))
+        return dict(zip(names, zip(np.asarray(values(x), float).tolist(), errors.tolist())))
+
+    def errors_of(self, slope: np.ndarray) -> np.ndarray:
+        """Standard errors of what depends on the parameters.
+
+        Equation: `sqrt(J C J^T)`; inf where it depends on what the data do not determine.
+
+        Args:
+            slope: its derivatives (..., P) in the parameters.
+        """
+        seen = self.determined
+        known = slope[..., seen]
+        covariance = self.covariance[np.ix_(seen, seen)]
+        variance = np.einsum("...p,pq,...q->...", known, covariance, known)
+        blind = (np.abs(slope[..., ~seen]) > 0).any(axis=-1)
+        return np.where(blind, np.inf, np.sqrt(variance))
+
+    def predict(self, shots: Any, scene: Scene | None = None, level: float = 0.95) -> Predicted:
+        """Velocities after further shots, with the errors that the parameters leave in them.
+
+        Equation: `sqrt(J C J^T)`, J derivatives in the parameters, C their covariance; a
+        measurement, with its own standard error s, lies within `q sqrt(J C J^T + s^2)`, q the
+        quantile as in `intervals`.
+
+        Args:
+            shots: v- (K, n) [m/s], or `Experiments`, of which v- and scenes count.
+            scene: of all shots; None: that of the fit, or those of the shots.
+            level: of the band.
+
+        Returns:
+            `velocity` (K, n) [m/s], `standard_error` (K, n): inf where it depends on what the data
+            do not determine, NaN where the errors are unknown; `status` (K,); `noise` (K, n) of a
+            measurement: the `sigma` of the shots if they have one, else as in the fit; `low` and
+            `high` (K, n), the band of a measurement.
+
+        Raises:
+            ValueError: a fit of something else than shots; velocities that do not fit the scene, a
+                scene that does not fit the law; a level outside (0, 1).
+        """
+        quantile = self.quantile(level)
+        if self.experiments is None:
+            raise ValueError("Argument `fit` must be to shots.")
+        data, scenes, units, sigma = shots, None, self.experiments.units, None
+        if isinstance(shots, Experiments):
+            data, scenes, units, sigma = shots.pre, shots.scenes, shots.units, shots.sigma
+        if np.ndim(data) != 2 or np.shape(data)[1] != len(units):
+            raise ValueError(
+                f"Argument `shots` must have shape (K, {len(units)}), velocities of the bodies of "
+                f"the fit, but has shape {np.shape(data)}."
+            )
+        check_values("shots", data)
+        data = Experiments(data, np.zeros_like(np.asarray(data, float)), scenes=scenes, units=units)
+        if isinstance(self.problem.law, LawInScene) and scene is not None:
+            raise ValueError(
+                "Argument `scene` must be left out where parts of the scene were fitted: they hold "
+                "for that of the fit only."
+            )
+        own = self.problem.scene if scene is None else scene
+        largest = own if scenes is None else max(scenes, key=lambda each: each.contacts)
+        self._check_scene(largest, len(units))
+        problem = self.problem.of_other(data, own)
+        there = solution_of(problem, outcome_at(problem, self.value))
+        error = self.errors_of(problem.derivatives(there.starts[0]))
+        value, noise = there.predicted, np.broadcast_to(self._noise_of(sigma), data.pre.shape)
+        half = quantile * np.hypot(error, noise)
+        band, status = (value - half, value + half), np.asarray(there.status)
+        return Predicted(value, error, status, noise, *band, tuple(units))
+
+    def _check_scene(self, scene: Any, size: int) -> None:
+        """Raise unless this is a scene for the law that was fitted and velocities of this size."""
+        check_kind("scene", scene, Scene)
+        values = [x.value for x in parameters_of(self.law).values() if x.domain.per_contact]
+        counts = {np.shape(value)[0] for value in values if np.ndim(value) == 1}
+        if scene.size != size or counts - {scene.contacts}:
+            also = f" and {min(counts)} contacts, one for each value of the law" if counts else ""
+            raise ValueError(
+                f"Argument `scene` must have {size} velocities as the fit{also}, but has "
+                f"{scene.size} and {scene.contacts}."
+            )
+
+    def _noise_of(self, sigma: Any) -> np.ndarray:
+        """Standard errors of measured velocities: of these, or as in the fit (rms)."""
+        if sigma is not None:
+            stretched = 1.0 if self.problem.sigma is None else self.noise
+            return stretched * np.asarray(sigma, float)
+        weight = np.ma.masked_equal(np.asarray(self.problem.measurement.weight, float), 0.0)
+        # NaN: never measured
+        return self.noise * np.sqrt((1 / weight**2).mean(axis=0)).filled(np.nan)
+
+    def __getitem__(self, name: str) -> FittedParameter:
+        """The parameter of this name, as in `names`."""
+        check_choice("name", name, self.names)
+        i = self.names.index(name)
+        value, error = float(self.value[i]), float(self.standard_error[i])
+        return FittedParameter(value, error, self.intervals()[i], bool(self.determined[i]))
+
+    def intervals(self, level: float = LEVEL) -> tuple[tuple[tuple[float, float], ...], ...]:
+        """The pieces, in order, of the confidence interval of each of the P parameters.
+
+        Those of `profiles`, if there are some of this level. Else linearized, cut at the bounds, a
+        piece for every minimum that fits well enough.
+
+        Equation: `value -+ q standard_error`, q the quantile of Student's t with the degrees of
+        freedom that are left, or of the normal law if `sigma` is known; of what is fitted in
+        its logarithm `value exp(-+ q standard_error / value)`; at a minimum whose sum of squares
+        is higher by d, q^2 - d / noise^2 in place of q^2.
+        """
+        if self.profiles and self.profiles[0].level == level:
+            return tuple(profile.intervals for profile in self.profiles)
+        return self.linearized_intervals(level)
+
+    def confidence_interval(self, level: float = LEVEL) -> np.ndarray:
+        """The outermost ends (P, 2) of `intervals` at a level in (0, 1)."""
+        return np.array([(pieces[0][0], pieces[-1][1]) for pieces in self.intervals(level)])
+
+    @property
+    def shows_lack_of_fit(self) -> bool:
+        """Whether a test rejects the law."""
+        return self.found("lack_of_fit")
