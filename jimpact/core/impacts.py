@@ -178,14 +178,14 @@ def _warn_of_unused_gaps(law: Law, scene: Scene, v: jax.Array) -> None:
 
 
 class _Given(NamedTuple):
-    """`noise` and `approach` of `impact` [m/s], and its `rtol`."""
+    """The arguments `noise` [m/s], `approach` [m/s] and `rtol` of `impact`; None: its default."""
 
     noise: jax.Array | None = None
     approach: jax.Array | None = None
     rtol: jax.Array | None = None
 
     def applied(self, contact: Contact) -> Contact:
-        """The contacts with gap velocities within the noise set to 0, and the others applied."""
+        """The contacts with gamma 0 within `noise`, then less `approach`, integrated to `rtol`."""
         contact = contact if self.noise is None else contact.within(self.noise)
         contact = contact if self.rtol is None else contact.integrated_to(self.rtol)
         return contact if self.approach is None else contact.approaching(self.approach)
@@ -195,16 +195,16 @@ NOTHING_GIVEN = _Given()
 
 
 class Traced(NamedTuple):
-    """Which arguments the host could not check, because they are traced."""
+    """True for each argument of `impact` that is traced, so that the host could not check it."""
 
     law: bool = False
     scene: bool = False
-    constrained: bool = False  # whether the velocity keeps the bilateral constraints
+    constrained: bool = False  # that the velocity satisfies the bilateral constraints
     given: bool = False
 
     @classmethod
     def of(cls, law: Law, scene: Scene, v: jax.Array, given: _Given = NOTHING_GIVEN) -> "Traced":
-        """Those of an impact."""
+        """The flags of these arguments; the constraints are checked with the velocity."""
         constrained = scene.constraints is not None and is_traced((scene.constraints, v))
         return cls(is_traced(law), is_traced(scene), constrained, is_traced(given))
 
@@ -215,9 +215,10 @@ class Traced(NamedTuple):
         size: jax.Array,
         finite: jax.Array,
     ) -> jax.Array:
-        """Status () of an impact with these `arguments`: `code`, or why it has no outcome.
+        """Status code () of an impact: `code`, or the reason why it has no outcome.
 
-        `size` () is the root of its energy [sqrt(J)]; `finite` (): whether its results are.
+        `arguments` are its law, scene, v- and given values; `size` () [sqrt(J)] is the root of its
+        energy `sum gamma-^2 / W_jj`; `finite` () is True where its results are finite.
         """
         code = jnp.where(finite, code, CODE["not_finite"])
         code = jnp.where(_has_scale(size, arguments[2]), code, CODE["out_of_range"])
@@ -275,7 +276,7 @@ def check_constrained(scene: Scene, velocity: jax.Array) -> None:
 
 
 def _keeps_constraints(constraints: Any, velocity: Any) -> Any:
-    """Whether (b,) a velocity satisfies each bilateral constraint within its tolerance."""
+    """True (b,) where `|h^T v| <= tolerance |h|^T |v|`, h (n, b): gradients of constraints."""
     size = abs(constraints).T @ abs(velocity)
     return abs(constraints.T @ velocity) <= sign_tolerance(velocity.dtype) * size
 
@@ -317,9 +318,9 @@ def _impact(
 
 
 def _has_scale(size: jax.Array, v: jax.Array) -> jax.Array:
-    """Whether () the energy size^2 of an impact is neither 0 nor infinite to the precision.
+    """True () where the energy `size^2` of an impact is neither 0 nor infinite to the precision.
 
-    True as well where the velocity (n,) is not finite, and the energy can have no value.
+    True as well where the velocity v (n,) is not finite, and the energy can have no value.
     """
     tiny = precision(size.dtype).tiny
     inside = (size**2 >= tiny) & (size**2 < jnp.inf)
@@ -338,7 +339,10 @@ class _Resolved(NamedTuple):
 
 
 def judged_beyond(dtype: Any, accuracy: Any) -> Any:
-    """Part of the impact's size beyond which signs and gains of energy are violated."""
+    """Share of the impact's size beyond which a wrong sign or a gain of energy is a violation.
+
+    Equation: `max(rounding of the type, ACCURACIES accuracy)`.
+    """
     return jnp.maximum(sign_tolerance(dtype), ACCURACIES * accuracy)
 
 
@@ -365,7 +369,10 @@ def _resolved(law: Law, contact: Contact, happens: jax.Array) -> _Resolved:
 
 
 def _impulses_of(law: Law, returned: Any, contact: Contact) -> Impulses:
-    """What a law's `impulses` returned; raises unless they are impulses of these contacts."""
+    """The impulses that `law.impulses` returned, or an error unless they fit these contacts.
+
+    These are `normal` (m,), `tangential` (t,) or None, and a `status` of `ji.STATUS`.
+    """
     name = f"`{type(law).__name__}.impulses`"
     if not isinstance(returned, tuple):  # an array would pass for its entries
         raise TypeError(f"{name} must return `ji.Impulses`, but returns {type(returned).__name__}.")
@@ -389,10 +396,14 @@ def _impulses_of(law: Law, returned: Any, contact: Contact) -> Impulses:
 def _in_groups(
     law: Law, scene: Scene, v: jax.Array, groups: Groups, given: _Given
 ) -> tuple[_Resolved, jax.Array, jax.Array]:
-    """All groups solved side by side; whether there is an impact, and the stored energy (m,).
+    """Impulses of groups of contacts that W does not couple, each group solved by itself.
 
     Signs are judged on the scale of their group. A group without an impact gets p = 0, unless the
     law also pulls at separating contacts.
+
+    Returns:
+        The impulses of all contacts, `happens` () True if there is an impact in any group, and the
+        stored energy (m,) [J].
     """
     m = scene.contacts
     stored = jnp.where(scene.closed, jnp.broadcast_to(law.stored, (m,)).astype(v.dtype), 0.0)
@@ -431,7 +442,11 @@ def _in_groups(
 def _signs(
     contact: Contact, p: jax.Array, tangential: jax.Array, tolerance: jax.Array
 ) -> jax.Array:
-    """negative_impulse or inadmissible_velocity beyond `tolerance`; 0 if neither."""
+    """Status code () `negative_impulse` or `inadmissible_velocity`, else `ok`.
+
+    Equation: `p_j sqrt(W_jj) < -tolerance` (the impulse pulls), or
+    `gamma+_j / sqrt(W_jj) < -tolerance` at a closed contact (it still approaches) [sqrt(J)].
+    """
     root = jnp.sqrt(diagonal(contact.delassus))
     # the sign of an impulse that only undoes the rounding of v- is not judged
     floor = tolerance + jnp.sqrt(jnp.sum((ROUNDING_PUSHES * contact.noise / root) ** 2))
@@ -443,7 +458,7 @@ def _signs(
 
 
 class _Outcome(Protocol):
-    """What has a status: an `Impact` or a `Motion`, one or a batch."""
+    """A result with a status: an `Impact` or a `Motion`, one or a batch."""
 
     @property
     def status(self) -> Any:

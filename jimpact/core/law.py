@@ -1,4 +1,4 @@
-"""What a law is: one method from `Contact` to impulses, declared parameters."""
+"""The base of all laws: one method from `Contact` to impulses, and declared parameters."""
 
 import abc
 import dataclasses
@@ -59,7 +59,7 @@ if TYPE_CHECKING:
         @overload
         def __get__(self, module: object, owner: type) -> Read: ...
         def __get__(self, module: object | None, owner: type) -> Any:
-            """What it is read as."""
+            """The value as it is read."""
 
         def __set__(self, module: object, value: Taken) -> None: ...
 
@@ -112,7 +112,7 @@ class Domain:
             check_values(self.name, value, low=self.low, high=self.high, open_low=self.open_low)
 
     def holds(self, value: Any) -> Any:
-        """Whether all entries are finite and inside, on the device."""
+        """True () where all entries are finite and in [low, high] or (low, high], on the device."""
         low, high = (-np.inf, np.inf) if self.matrix and np.ndim(value) >= 2 else self.bounds
         above = value > low if self.open_low else value >= low
         return jnp.all(jnp.isfinite(value) & above & (value <= high))
@@ -367,12 +367,12 @@ def value_of(law: "Law", field: str) -> Any:
 
 
 def entries(law: "Law", fields: tuple[str, ...]) -> np.ndarray:
-    """All entries (Q,) of these fields of a law."""
+    """All entries (Q,) of these fields of a law, one field after the other."""
     return np.concatenate([np.ravel(np.asarray(value_of(law, f), float)) for f in fields])
 
 
 def with_entries(law: AnyLaw, fields: tuple[str, ...], values: Any) -> AnyLaw:
-    """The law with these entries (Q,)."""
+    """The law with `values` (Q,) as the entries of these fields, one field after the other."""
     start = 0
     for field in fields:
         old = value_of(law, field)
@@ -383,13 +383,13 @@ def with_entries(law: AnyLaw, fields: tuple[str, ...], values: Any) -> AnyLaw:
 
 
 def within_domains(law: eqx.Module) -> jax.Array:
-    """Whether () all parameters are finite and in their domains, on the device."""
+    """True () where all parameters are finite and in their domains, on the device."""
     holds = [x.domain.holds(x.value) for x in free_parameters_of(law).values()]
     return jnp.all(jnp.asarray(holds, bool))
 
 
 def declarations_of(kind: type[eqx.Module]) -> dict[str, Domain | Option]:
-    """What the fields of a class declare, by name."""
+    """The `Domain` or `Option` that each field of a class declares, by name."""
     return {f.name: f.metadata[_KEY] for f in dataclasses.fields(kind) if _KEY in f.metadata}
 
 
@@ -399,7 +399,7 @@ def options_of(kind: type[eqx.Module]) -> tuple[str, ...]:
 
 
 class Impulses(NamedTuple):
-    """What `Law.impulses` returns.
+    """Impulses of m contacts, as `Law.impulses` returns them.
 
     Args:
         normal: p (m,) [N s], >= 0 pushes.
@@ -475,7 +475,10 @@ class Law(Declared):
         return " A law is an object, as ji.LZB(0.9)." if isinstance(value, str) else ""
 
     def contact(self, scene: Scene, velocity: jax.Array) -> Contact:
-        """What `impulses` gets of a scene at a velocity v- (n,); to override to add to it."""
+        """The argument of `impulses`: contacts of a scene at the velocity v- (n,).
+
+        To override by a law that needs more.
+        """
         return contact_of(scene, velocity, self.stored, self.uses_gaps)
 
     def check(self, scene: Scene, dtype: jnp.dtype) -> None:
@@ -551,7 +554,10 @@ def check_law(law: Law, scene: Scene, dtype: jnp.dtype) -> None:
 
 
 def is_separable(law: Law) -> bool:
-    """Whether contacts that W does not couple may be solved separately."""
+    """True where contacts that W does not couple may be solved separately.
+
+    The law says so, its parameters are scalars or (m,), and open contacts take no part.
+    """
     known = all(
         x.domain.per_contact and np.ndim(x.value) < 2 and not isinstance(x.value, tuple)
         for x in parameters_of(law).values()

@@ -28,7 +28,7 @@ def needed(module: str, how: str) -> ModuleType:
 
 
 def is_traced(value: Any) -> bool:
-    """Whether `value` is (or holds) an abstract value inside a JAX transformation."""
+    """True where `value` is (or holds) an abstract value inside a JAX transformation."""
     if "jax" not in sys.modules:
         return False
     import jax
@@ -37,7 +37,7 @@ def is_traced(value: Any) -> bool:
 
 
 def _not_numeric(name: str, value: Any, kind: str = "") -> TypeError:
-    """The error for what is no array of numbers; `kind`: of its dtype."""
+    """The TypeError for a value that is no array of real numbers; `kind`: letter of its dtype."""
     what = {
         "c": "must be real, but is complex",
         "M": "must be numbers, but holds dates: give seconds, (t - t[0]) / np.timedelta64(1, 's')",
@@ -281,7 +281,7 @@ def check_per_contact(name: str, value: Any, contacts: int) -> None:
 
 
 def in_common_dtype(*trees: Any) -> Any:
-    """All of them in the widest floating type among them (Python numbers follow the arrays)."""
+    """Pytrees with all floating arrays in the widest floating type among them."""
     import equinox as eqx
     import jax
     import jax.numpy as jnp

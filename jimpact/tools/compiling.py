@@ -1,4 +1,4 @@
-"""How the library compiles its programs: in full precision, and quickly.
+"""Compiling: `jax.jit` in full precision, and with options that shorten compiling.
 
 Programs that compile in half of the time run a few percent slower.
 """
@@ -58,7 +58,7 @@ def _probe() -> Callable[..., Any]:
 
 
 def is_top_level_call(*args: Any) -> bool:
-    """Whether a program called with these arguments now is compiled and run by itself.
+    """True where a program called with these arguments now is compiled and run by itself.
 
     It is not where it becomes part of another program: under jit, in loops, in reverse mode.
     Forward mode and vmap run it at once. JAX has no public question for it, but it refuses
@@ -82,7 +82,7 @@ def quick_jit(function: Function) -> Function:
         """The compiled function of (structure, other leaves), arrays."""
 
         def of_arrays(rest: Any, arrays: list[Any]) -> Any:
-            """`function` of its arguments taken apart."""
+            """`function` of flattened arguments: `rest` is (structure, other leaves)."""
             tree, fixed = rest
             values = iter(arrays)
             leaves = [next(values) if x is None else x[0] for x in fixed]
