@@ -65,16 +65,16 @@ class PendulumCradle(Body):
         return jnp.zeros_like(self.masses)
 
     def gap_function(self, q: jax.Array) -> jax.Array:
-        """Distances between neighbouring balls."""
+        """Gaps f (n - 1,) [m] between neighbouring balls, see the class."""
         touching = self.radius[:-1] + self.radius[1:]
         right = touching + self.gaps + self.length * jnp.diff(jnp.sin(q))
         up = self.length * jnp.diff(jnp.cos(q))
-        # |c| - d as (|c|^2 - d^2) / (|c| + d): exactly 0 at rest
+        # |c| - d as (|c|^2 - d^2) / (|c| + d), d the sum of the radii: exactly 0 at rest
         across = (right - touching) * (right + touching) + up**2
         return across / (jnp.sqrt(right**2 + up**2) + touching)
 
     def valid(self, q: jax.Array) -> jax.Array:
-        """The least distance () of balls that are no neighbours, which have no contact [m]."""
+        """The least gap () [m] between balls that are no neighbours: they have no contact."""
         i, j = np.triu_indices(self.masses.shape[0], 2)
         if not len(i):
             return super().valid(q)
@@ -99,7 +99,7 @@ class PendulumCradle(Body):
         return [curve for curves in self.outlines_by_body(q, point) for curve in curves]
 
     def outlines_by_body(self, q: np.ndarray, point: float) -> list[list[np.ndarray]]:
-        """String and ball of each."""
+        """Curves (k, 2) [m] by body: the string and the circle of each ball at angles q (n,)."""
         length, radius = float(self.length), np.asarray(self.radius)
         between = radius[:-1] + radius[1:] + np.asarray(self.gaps)
         curves = []
