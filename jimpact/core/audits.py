@@ -28,7 +28,7 @@ CONSISTENCIES = ("kinematic", "kinetic", "energetic", "momentum")
 
 
 class Audit(eqx.Module):
-    """Whether four conditions hold, and the numbers behind them, scaled by the impact's size.
+    """Four conditions on an outcome, and the numbers behind them, scaled by the impact's size.
 
     Attributes:
         kinematic: whether gamma+ >= 0 at closed contacts ().
@@ -52,7 +52,7 @@ class Audit(eqx.Module):
 
     @property
     def consistent(self) -> jax.Array:
-        """Whether all four hold."""
+        """True () if all four conditions hold."""
         return self.kinematic & self.kinetic & self.energetic & self.momentum
 
     @property
@@ -92,7 +92,7 @@ def audit(scene: Scene, velocity: Any, out: Impact) -> Audit:
     gamma = jnp.where(scene.closed, contact.gap_velocity, 0.0)
     gamma_plus = gap_velocity(scene, out.velocity)
     approach = jnp.sum((jnp.minimum(gamma, 0.0) / root) ** 2)
-    size = jnp.sqrt(approach + 2 * out.initial_energy)
+    size = jnp.sqrt(approach + 2 * out.initial_energy)  # scale of the impact [sqrt(J)]
     size = jnp.where(size > 0, size, 1.0)
     jump = momentum(scene, out.velocity - v)
     change = 0.5 * jump @ (out.velocity + v)  # T+ - T- without their cancellation
@@ -189,11 +189,12 @@ def summary(out: Impact, scene: Scene, velocity: Any, names: Sequence[str] = ())
         numbers = f"{formatted(a, '14.6g')} {formatted(b, '14.6g')}"
         lines.append(f"{i + 1:10d} {numbers}{f'   {names[i]}' if names else ''}")
     lines.append("contact          gamma-         gamma+   [m/s]     impulse [N s]")
-    g0, g1 = (
+    gamma, gamma_plus = (
         np.asarray(gap_velocity(scene, velocity)),
         np.asarray(gap_velocity(scene, out.velocity)),
     )
-    for j, (a, b, p, closed) in enumerate(zip(g0, g1, np.asarray(out.impulse), scene.closed)):
+    contacts = zip(gamma, gamma_plus, np.asarray(out.impulse), scene.closed)
+    for j, (a, b, p, closed) in enumerate(contacts):
         note = "" if closed else "   open: takes no part" if p == 0 else "   open before"
         numbers = f"{formatted(a, '15.6g')} {formatted(b, '14.6g')} {formatted(p, '21.6g')}"
         lines.append(f"{j + 1:7d} {numbers}{note}")

@@ -1,4 +1,4 @@
-"""What a sample is drawn from: uniform, normal, rows of an array, the user's own function."""
+"""Distributions that samples are drawn from: uniform, normal, rows of an array, own functions."""
 
 import abc
 import operator
@@ -39,7 +39,10 @@ class Distribution(eqx.Module):
         """One draw (size,); with `non_negative` truncated at 0."""
 
     def check(self, name: str, size: int, non_negative: bool) -> None:
-        """Raise where the parameters do not fit."""
+        """Raise a ValueError unless each parameter is a scalar or has `size` values.
+
+        `non_negative`: raise also where draws of the argument `name` could be negative.
+        """
         for field, value in vars(self).items():
             if np.shape(value) not in ((), (size,)):
                 raise ValueError(
@@ -136,7 +139,7 @@ class GivenRows(eqx.Module):
     count: int
 
     def __repr__(self) -> str:
-        """How many rows they are."""
+        """The number of rows."""
         return f"{self.count} given rows"
 
 
@@ -197,7 +200,7 @@ class RandomLaw(eqx.Module):
         return f"{type(self.law).__name__}({words})"
 
     def __call__(self, key: jax.Array) -> Law:
-        """The law of this key."""
+        """The law whose random parameters are drawn by this key, each by a key of its own."""
         law, known = self.law, free_parameters_of(self.law)
         for i, (name, distribution) in enumerate(sorted(self.parameters.items())):
             old, path, _ = known[name]
@@ -207,7 +210,11 @@ class RandomLaw(eqx.Module):
 
 
 def as_source(name: str, value: Any, size: int, non_negative: bool) -> Any:
-    """A distribution, a function of a key, rows (S, size), or a constant (size,); checked."""
+    """The argument `name` checked: a distribution, a function of a key, rows (S, size) or (size,).
+
+    Raise a ValueError for another size, and, where `non_negative`, for negative entries; a
+    TypeError for a function that gives no array.
+    """
     if isinstance(value, Distribution):
         value.check(name, size, non_negative)
         return value
@@ -253,6 +260,6 @@ def _check_domain(name: str, drawn: Distribution, domain: Domain) -> None:
 
 
 def _short(value: jax.Array) -> str:
-    """A number, or a list of numbers."""
+    """A number, or a list of numbers, as text."""
     entries = [f"{x:g}" for x in np.ravel(np.asarray(value))]
     return entries[0] if np.ndim(value) == 0 else f"[{', '.join(entries)}]"
