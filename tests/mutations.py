@@ -164,7 +164,7 @@ MUTATIONS = [
     Mutation("Akaike's criterion without the noise", "FitResult.aic", "len(self.names) + 1", "len(self.names)", ("test_fit.py::test_parameters_by_name_and_criteria",)),
     Mutation("small-sample correction of AIC", "_aicc", "2 * k * (k + 1) / (n - k - 1)", "2 * k * (k + 1) / (n - k)", ("test_selection.py::test_the_criterion_without_sigma_is_corrected_for_few_values",)),
     Mutation("spheres of the inertia of discs", "Sphere", "0.4 * radius ** 2", "0.5 * radius ** 2", ("test_piles.py::test_spheres_are_a_body_like_others",)),
-    Mutation("levers of spheres on the wrong side", "RigidBodies.contact_jacobian", "cross(lever, ways)", "cross(ways, lever)", ("test_piles.py::test_directions_are_velocities_of_the_points_that_touch",)),
+    Mutation("levers of spheres on the wrong side", "RigidBodies.contact_jacobian", "cross(lever, along)", "cross(along, lever)", ("test_piles.py::test_directions_are_velocities_of_the_points_that_touch",)),
     Mutation("MuJoCo's normals from the second geom", "_contacts", "second - first", "first - second", ("test_mujoco.py::test_gap_velocities_are_rates_of_distances",)),
     Mutation("MuJoCo's frictionless contacts rub", "_friction", "c.friction[0] if c.dim > 1 else 0.0", "c.friction[0]", ("test_mujoco.py::test_contacts_without_friction_have_none",)),
     Mutation("MuJoCo's impedance acts once on stiffness", "_restitution", "stiffness * d", "stiffness", ("test_mujoco.py::test_restitution_is_that_of_mujoco",)),

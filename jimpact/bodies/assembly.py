@@ -26,6 +26,7 @@ from jimpact.bodies.rigid import (
     Placed,
     RigidBodies,
     RigidBody,
+    Shape,
     times,
     unit_quaternion,
 )
@@ -140,6 +141,7 @@ class Bodies(RigidBodies):
         places: Any = (),
         room: int | None = None,
     ):
+        """Check the arguments, stack the arrays of all bodies, and choose the pairs or the grid."""
         for name, some in (("bodies", bodies), ("fixed", fixed)):
             if not np.iterable(some):
                 raise TypeError(f"Argument `{name}` must be a list of bodies, but is {some!r}.")
@@ -439,7 +441,7 @@ def _check_kinds(bodies: tuple[Any, ...], fixed: tuple[Any, ...]) -> None:
 
 def _as_pairs(
     every: tuple[RigidBody, ...],
-    shapes: Sequence[Any],
+    shapes: Sequence[Shape],
     moving: int,
     d: int,
     pairs: Sequence[Any] | None,

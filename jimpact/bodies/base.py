@@ -178,7 +178,7 @@ class Body(eqx.Module):
     def active_pairs(self, q: jax.Array, later: jax.Array, below: jax.Array) -> ActivePairs:
         """The contacts, at q, with gaps up to `below` [m] at q or `later`, for time stepping.
 
-        Of bodies with three velocities each in a plane, six in space, and a diagonal mass matrix.
+        Only for bodies with three velocities each in a plane, six in space, and a diagonal M.
         """
         raise NotImplementedError(f"{type(self).__name__} has no `pair_count`, no `active_pairs`.")
 
@@ -201,7 +201,7 @@ class Body(eqx.Module):
         raise TypeError(f"{type(self).__name__} has no outlines: give `outlines` yourself.")
 
     def outlines_by_body(self, q: np.ndarray, point: float) -> Sequence[Sequence[np.ndarray]]:
-        """The outlines of each body, for its colour; here each outline is a body.
+        """Curves (k, 2) [m] of each body, drawn in one colour; here each curve of `outlines` alone.
 
         Args:
             q: configuration (n,).
@@ -331,7 +331,7 @@ def _many_parts(body: Body, q: jax.Array) -> Parts:
 
 
 def check_range(name: str, body: Body, margin: Any, where: str = "") -> None:
-    """Raise where the margin () of the range of the gap function is negative."""
+    """Raise a ValueError where `margin` (), that is `body.valid` of the argument, is negative."""
     if not is_traced(margin) and not float(margin) >= 0:
         raise ValueError(
             f"Argument `{name}` must be in the range of the gap function ({body.range_in_words}), "
@@ -340,7 +340,7 @@ def check_range(name: str, body: Body, margin: Any, where: str = "") -> None:
 
 
 def check_penetration(name: str, f: jax.Array, closed_below: jax.Array) -> None:
-    """Raise unless all gaps f (m,) are at least `-closed_below` [m]."""
+    """Raise a ValueError of argument `name` unless all gaps f (m,) are >= `-closed_below` [m]."""
     if is_traced((f, closed_below)) or (np.asarray(f) >= -np.asarray(closed_below)).all():
         return
     worst = int(np.argmin(f))

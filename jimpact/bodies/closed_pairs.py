@@ -1,7 +1,7 @@
 """The closed contacts of many bodies: the first rows of arrays of fixed length, in blocks."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -13,8 +13,10 @@ from jimpact.core.scene import Scene, sparse_scene
 # Ten times more: few contacts among many bodies take as long as all of them.
 BLOCK = 128
 
+Carry = TypeVar("Carry")
 
-def over_blocks(count: Any, one: Callable[[Any, Any], Any], start: Any) -> Any:
+
+def over_blocks(count: jax.Array, one: Callable[[jax.Array, Carry], Carry], start: Carry) -> Carry:
     """Result of a loop over blocks of `BLOCK` rows, as many as hold the first `count` () rows.
 
     Equation: `carry = one(first_row, carry)` for each block, from `carry = start` on.
@@ -59,7 +61,7 @@ class ListedPairs(NamedTuple):
     scene: Scene  # the contacts without friction
 
 
-def listed_pairs(pairs: ActivePairs, mass: Any) -> ListedPairs:
+def listed_pairs(pairs: ActivePairs, mass: jax.Array) -> ListedPairs:
     """The closed contacts of bodies with masses (n,), on the host and in order, as a scene."""
     velocities = pairs.directions.shape[3]  # of a body
     count = len(mass) // velocities

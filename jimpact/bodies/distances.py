@@ -91,10 +91,10 @@ def _from_side(
     the normal points from the end to the point.
     """
     square, from_begin = dot(side, side), point - begin
-    along = dot(side, from_begin)
+    along = dot(side, from_begin)  # from 0 at the begin to |side|^2 at the end
     slack = PARALLEL * jnp.sqrt(square)
     beyond = (along < -slack) | (along > square + slack)
-    end = begin + jnp.where(along > square, 1.0, 0.0)[..., None] * side
+    end = begin + jnp.where(along > square, 1.0, 0.0)[..., None] * side  # the nearer one
     length, toward = lengths(point - end)
     distance = jnp.where(beyond, length, dot(n, from_begin))
     beyond = beyond[..., None]
@@ -156,11 +156,11 @@ def polygon_on_polygon(
     ends = _at_side(is_facing, ends)  # (body, pair, begin or end, x or y)
     begin, side = ends[:, :, 0], ends[:, :, 1] - ends[:, :, 0]
     # the ends of each body's side in the order of the contacts, against the other body's side
-    turned = jnp.stack([swapped, ~swapped])[:, :, None, None]
-    ends = jnp.where(turned, ends[:, :, ::-1], ends)
+    reverse = jnp.stack([swapped, ~swapped])[:, :, None, None]
+    ends = jnp.where(reverse, ends[:, :, ::-1], ends)
     others = (x[::-1, :, None] for x in (begin, side, outward(side)))
-    gaps, points, normals = _from_side(ends, *others)
-    first = gaps[0] <= gaps[1]
+    gaps, points, normals = _from_side(ends, *others)  # (body, pair, contact, ..)
+    first = gaps[0] <= gaps[1]  # the end of the first side is nearer
     of_first = first[..., None]
     return ContactPoints(
         jnp.where(first, gaps[0], gaps[1]),
@@ -205,24 +205,24 @@ def changed_places(
 def _full_turns(
     corners: jax.Array, side: jax.Array, angle: jax.Array, direction: jax.Array
 ) -> jax.Array:
-    """Full turns (g,) of the direction [rad] to the other body beyond that of the facing side.
+    """Full turns (g,) between the `direction` (g,) [rad] to the other body and a facing side.
 
-    The direction of the side's normal is counted on from the body's `angle` [rad], which has no
-    jumps: from there to the normal of side 0, and on to that of `side` (g,), each by less than a
-    turn.
+    Equation: `round((direction - phi) / 2 pi)`, phi the angle of the normal of `side` (g,), counted
+    on from the body's `angle` (g,) [rad], which has no jumps: from there to the normal of side 0,
+    and on to that of `side`, each by less than a turn. `corners` (g, K, 2) [m].
     """
     normal = sides(corners)[1]
-    normal = jnp.arctan2(normal[..., 1], normal[..., 0])
-    first, facing = normal[:, 0], normal[np.arange(len(normal)), side]
-    at = angle + (first - angle) % (2 * np.pi) + (facing - first) % (2 * np.pi)
-    return jnp.round((direction - at) / (2 * np.pi)).astype(jnp.int32)
+    angles = jnp.arctan2(normal[..., 1], normal[..., 0])  # (g, K)
+    first, facing = angles[:, 0], angles[np.arange(len(angles)), side]
+    phi = angle + (first - angle) % (2 * np.pi) + (facing - first) % (2 * np.pi)
+    return jnp.round((direction - phi) / (2 * np.pi)).astype(jnp.int32)
 
 
 def margin_of_places(polygons: tuple[jax.Array, jax.Array], facing: Facing) -> jax.Array:
-    """Margins (g,) that are >= 0 while contacts of an odd and an even polygon keep their places.
+    """Margins (g,) that are >= 0 while contacts of an odd and an even polygon keep their order.
 
     Equation: `max(1 - cos(angle between n and _CUT) - _NEAR_CUT, distance along n - _TOUCHING)`:
-    polygons in touch must not have their normal n at `_CUT`.
+    polygons in touch must not have their normal n at `_CUT`, see `changed_places`.
     """
     (a, b), n = polygons, facing.normal[:, None]
     distance = jnp.min(dot(b, n), axis=1) - jnp.max(dot(a, n), axis=1)

@@ -26,6 +26,7 @@ class FunctionBody(Body):
     sliding: Callable[[jax.Array], jax.Array | None] | None
 
     def __init__(self, gap_function: Any, mass: Any, tangent_function: Any = None):
+        """Keep the functions; raise a TypeError for what is no function, check a constant mass."""
         for name, function in (
             ("gap_function", gap_function),
             ("tangent_function", tangent_function),

@@ -1,6 +1,6 @@
 """The closed contacts of many bodies, found among the pairs that a grid of cells says are near."""
 
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +28,8 @@ NEAR = 8
 # what moves farther in a step than the least radius is a `coarse_step`. Ten times more makes cells
 # hold twenty times more bodies.
 MARGIN = 0.5
+
+_Arrays = tuple[jax.Array, ...]
 
 
 class Pile(Protocol):
@@ -78,7 +80,7 @@ class Pile(Protocol):
     def placed_at(self, at: jax.Array, points: jax.Array) -> Placed:
         """The same of bodies at coordinates (b, ..), with these points (b, P, d)."""
 
-    def contact_jacobian(self, at: jax.Array, point: jax.Array, ways: jax.Array) -> jax.Array:
+    def contact_jacobian(self, at: jax.Array, point: jax.Array, directions: jax.Array) -> jax.Array:
         """Velocities of points along directions, by the velocities of their bodies."""
 
 
@@ -124,7 +126,7 @@ def crowd_of_cells(bodies: Pile) -> int:
     return crowd if 2 * rows * crowd < bodies.count else 0
 
 
-def _circle_gaps(bodies: Pile, q: jax.Array, i: Any, j: Any) -> jax.Array:
+def _circle_gaps(bodies: Pile, q: jax.Array, i: jax.Array, j: jax.Array) -> jax.Array:
     """Gaps `|x_i - x_j| - R_i - R_j` (C,) [m] of the discs or balls around bodies i, j (C,)."""
     columns = bodies.of_bodies(q)[:, : bodies.dimension].T  # one by one: five times faster
     squares = sum((x[i] - x[j]) ** 2 for x in columns)
@@ -144,17 +146,17 @@ def _plane_gaps(bodies: Pile, q: jax.Array) -> jax.Array:
 
 
 def _candidates(bodies: Pile, q: jax.Array, margin: jax.Array) -> Candidates:
-    """Pairs of bodies, all those with gaps up to `margin` among them."""
+    """Candidates for contact: all pairs of bodies with gaps up to `margin` [m] at q, and others."""
     if bodies.crowd == 0:
         return all_pairs(bodies.count)
     distance = 2 * jnp.max(outer_radii(bodies)) + margin
     return near_pairs(bodies.of_bodies(q)[:, : bodies.dimension], distance, bodies.crowd)
 
 
-def _pair_contacts(bodies: Pile, at: jax.Array, i: Any, j: Any) -> ContactPoints:
-    """Contacts of bodies i and j (g,): gaps (g, slots), points (g, slots, d), normals towards i.
+def _pair_contacts(bodies: Pile, at: jax.Array, i: jax.Array, j: jax.Array) -> ContactPoints:
+    """Contacts of bodies i and j (g,), k = `slots` a pair: gaps (g, k), points (g, k, d), normals.
 
-    `at` (b, ..) are the coordinates of all bodies.
+    `at` (b, ..) are the coordinates of all bodies; normals are towards body i.
     """
     a, b = (bodies.placed_at(at[x], bodies.points[x]).points for x in (i, j))
     r, s = bodies.rims[i], bodies.rims[j]
@@ -207,9 +209,9 @@ def _near_gaps(bodies: Pile, q: jax.Array, later: jax.Array, below: jax.Array) -
     Pairs from the grid are tested by the discs or balls around them; those of polygons that pass
     get the gaps of their sides, the least one at q and at `later`.
     """
-    way = jnp.abs(bodies.of_bodies(later - q)[:, : bodies.dimension])
-    # each moves by half of its way from the middle; what moves farther is a `coarse_step`
-    farther = jnp.minimum(jnp.max(jnp.sum(way, axis=1)), MARGIN * least_radius(bodies))
+    displacement = jnp.abs(bodies.of_bodies(later - q)[:, : bodies.dimension])
+    # two bodies move by half of theirs from (q + later) / 2; larger ones are a `coarse_step`
+    farther = jnp.minimum(jnp.max(jnp.sum(displacement, axis=1)), MARGIN * least_radius(bodies))
     near = _candidates(bodies, 0.5 * (q + later), below + farther)
     circles = [_circle_gaps(bodies, x, near.first, near.second) for x in (q, later)]
     gaps = jnp.where(near.used, jnp.minimum(*circles), jnp.inf)
@@ -220,7 +222,7 @@ def _near_gaps(bodies: Pile, q: jax.Array, later: jax.Array, below: jax.Array) -
     count = jnp.minimum(so_far[-1], rows)
     at = jnp.stack([bodies.of_bodies(x) for x in (q, later)])  # (2, b, ..)
 
-    def fill_block(first: jax.Array, filled: Any) -> Any:
+    def fill_block(first: jax.Array, filled: _Arrays) -> _Arrays:
         """The arrays i, j, gaps with the rows of the block from row `first` on."""
         used, place = chosen_rows(so_far, first, count)
         i, j = (jnp.where(used, x[place], 0) for x in (near.first, near.second))
@@ -229,7 +231,7 @@ def _near_gaps(bodies: Pile, q: jax.Array, later: jax.Array, below: jax.Array) -
         return tuple(with_block(x, part, first) for x, part in zip(filled, new))
 
     none = jnp.zeros(rows, jnp.int32)
-    start = none, none, jnp.full((rows, slots(bodies)), jnp.inf, q.dtype)
+    start: _Arrays = none, none, jnp.full((rows, slots(bodies)), jnp.inf, q.dtype)
     i, j, gaps = over_blocks(count, fill_block, start)
     return _NearGaps(i, j, gaps, near.overflows | (so_far[-1] > rows))
 
@@ -270,8 +272,8 @@ def active_pairs(bodies: Pile, q: jax.Array, later: jax.Array, below: jax.Array)
     d = bodies.dimension
     no_contact = jnp.int32(slots(bodies) * bodies.count * stride(bodies))  # above all numbers
 
-    def fill_block(first: jax.Array, filled: Any) -> Any:
-        """The arrays with the rows from `first` on, as many as a block has."""
+    def fill_block(first: jax.Array, filled: _Arrays) -> _Arrays:
+        """The numbers, bodies and directions with the rows of the block from row `first` on."""
         used, chosen = chosen_rows(closed_up_to, first, count)
         chosen = jnp.where(used, numbers[chosen], 0)
         i, j, directions = _of_contacts(bodies, q, chosen)
@@ -282,7 +284,7 @@ def active_pairs(bodies: Pile, q: jax.Array, later: jax.Array, below: jax.Array)
         )
         return tuple(with_block(x, part, first) for x, part in zip(filled, new))
 
-    start = (
+    start: _Arrays = (
         jnp.full(rows, no_contact, jnp.int32),
         jnp.zeros((rows, 2), jnp.int32),
         jnp.zeros((rows, d, 2, d + bodies.angular), q.dtype),
@@ -321,7 +323,7 @@ def _of_contacts(
         corners = bodies.placed_at(at[i], bodies.points[i]).points
         lowest = corners[row, corner] - bodies.rims[i][:, None] * n
         point = jnp.where(on_plane, lowest, point)
-    ways = jnp.concatenate([n[:, None], tangents_of(n)], axis=1)
+    along = jnp.concatenate([n[:, None], tangents_of(n)], axis=1)
     jacobian = bodies.contact_jacobian
-    of_both = jacobian(at[i], point, ways), -jacobian(at[other], point, ways)
+    of_both = jacobian(at[i], point, along), -jacobian(at[other], point, along)
     return i, jnp.minimum(partner, bodies.count), jnp.stack(of_both, axis=2)

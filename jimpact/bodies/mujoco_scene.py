@@ -81,13 +81,15 @@ class MujocoScene(NamedTuple):
     names: tuple[str, ...]
 
     def __str__(self) -> str:
-        """A row for each contact: its gap, how fast it opens, its friction."""
+        """A table with a row for each contact: gap f [m], gap velocity gamma [m/s], friction mu."""
         scene, gamma = self.scene, gap_velocity(self.scene, self.velocity)
         zeros = np.zeros(scene.contacts)
         gaps = zeros if scene.gaps is None else np.asarray(scene.gaps)
         friction = [None] * len(zeros) if self.friction is None else self.friction.tolist()
         columns = (
-            *(Column("contact"), Column("geoms"), Column("gap_m", ".3g", "gap", "m")),
+            Column("contact"),
+            Column("geoms"),
+            Column("gap_m", ".3g", "gap", "m"),
             Column("gap_velocity_m_per_s", ".4g", "gap velocity", "m/s"),
             Column("friction", ".3g"),
         )
@@ -384,7 +386,7 @@ def _warn_of_overlap(model: Any, contacts: list[Any], names: tuple[str, ...]) ->
 def _warn_of_exceeded_limits(
     mujoco: ModuleType, model: Any, data: Any, limits: tuple[str, ...]
 ) -> None:
-    """Warn of joints and tendons that are beyond their limits, which count as just reached."""
+    """Warn of joints and tendons that exceed their limits by `_BEYOND`, taken as just reached."""
     turning = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_BALL)
     rows = np.concatenate([_rows_of(mujoco, model, data, kind)[0] for kind, _, _ in _LIMITS])
     beyond = []

@@ -52,7 +52,7 @@ def near_pairs(points: jax.Array, distance: jax.Array, crowd: int) -> Candidates
     lengths = jnp.max(cell, axis=0) + 2  # number of cells along each axis
 
     def number(indices: jax.Array) -> jax.Array:
-        """Numbers (k,) of cells of these indices (k, d), consecutive along the last axis."""
+        """Numbers (k,) of cells with indices (k, d): `(i_1 L_2 + i_2) L_3 + i_3`, L = lengths."""
         result = indices[:, 0]
         for axis in range(1, d):
             result = result * lengths[axis] + indices[:, axis]

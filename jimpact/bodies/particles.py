@@ -40,6 +40,7 @@ class Corner(Body):
     particle_mass: jax.Array
 
     def __init__(self, angle: Any, mass: Any = 1.0):
+        """Check that the angle lies in (0, pi) and the mass is positive."""
         self.angle, self.particle_mass = number("angle", angle), positive("mass", mass)
         if not is_traced(self.angle) and not 0 < float(self.angle) < np.pi:
             raise ValueError(

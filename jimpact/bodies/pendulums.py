@@ -40,14 +40,15 @@ class PendulumCradle(Body):
     gaps: jax.Array
 
     def __init__(self, masses: Any, length: Any, radius: Any, gaps: Any = 0.0):
+        """Check the arguments, see the class; a scalar radius or gap is repeated."""
         self.masses = positives("masses", masses)
         n = self.masses.shape[0]
         if n < 2:
             raise ValueError(f"Argument `masses` must hold two balls or more, but holds {n}.")
         self.length = positive("length", length)
         self.radius = positives("radius", radius, n)
-        off = as_float_array("gaps", gaps)
-        self.gaps = jnp.full(n - 1, off) if off.ndim == 0 else off
+        gaps = as_float_array("gaps", gaps)
+        self.gaps = jnp.full(n - 1, gaps) if gaps.ndim == 0 else gaps
         check_shape("gaps", self.gaps, (n - 1,), "one between each two balls")
         check_values("gaps", self.gaps, low=0.0)
 
@@ -69,7 +70,8 @@ class PendulumCradle(Body):
         touching = self.radius[:-1] + self.radius[1:]
         right = touching + self.gaps + self.length * jnp.diff(jnp.sin(q))
         up = self.length * jnp.diff(jnp.cos(q))
-        # |c| - d as (|c|^2 - d^2) / (|c| + d), d the sum of the radii: exactly 0 at rest
+        # with the centres' distance c = (right, up) and d = touching, |c| - d as
+        # (|c|^2 - d^2) / (|c| + d): exactly 0 at rest
         across = (right - touching) * (right + touching) + up**2
         return across / (jnp.sqrt(right**2 + up**2) + touching)
 

@@ -38,7 +38,10 @@ _EDGES = [0, 1, 3, 2, 0, 4, 5, 1, 5, 7, 3, 7, 6, 2, 6, 4]  # a way along all edg
 
 
 def _quaternion_product() -> np.ndarray:
-    """(4, 4, 4): `(e f)_i = sum_jk table_ijk e_j f_k`; the last three of each form a vector."""
+    """Table (4, 4, 4) of the product of quaternions: `(e f)_i = sum_jk table_ijk e_j f_k`.
+
+    The first entry of each is the scalar.
+    """
     table = np.zeros((4, 4, 4))
     table[0] = np.diag([1.0, -1.0, -1.0, -1.0])
     table[1:, 0, 1:] = table[1:, 1:, 0] = np.eye(3)
@@ -219,10 +222,10 @@ class RigidBodies(Body):
         )
 
     def _turned(self, q: jax.Array, u: jax.Array, turn: jax.Array) -> jax.Array:
-        """q with places moved by those of u (n,), and quaternions `e turn / |e|`, `turn` (b, 4)."""
+        """q moved by the places of u (n,), with quaternions `e f / |e|`, f = `turn` (b, 4)."""
         q, u, table = self.of_bodies(q), self.of_bodies(u), _QUATERNION_PRODUCT.astype(q.dtype)
         _, e = lengths(q[:, 3:])
-        product = dot(jnp.tensordot(turn, table, (1, 2)), e[:, None])
+        product = dot(jnp.tensordot(turn, table, (1, 2)), e[:, None])  # sum_jk table_ijk e_j f_k
         return jnp.concatenate([q[:, :3] + u[:, :3], product], axis=1).reshape(-1)
 
     @property
@@ -235,7 +238,7 @@ class RigidBodies(Body):
         """Potential `V = g sum m_i h_i` [J], h the height: y in the plane, z in space [m]."""
         d = self.dimension
         size = 7 if self.quaternions else d + self.angular
-        up = jnp.eye(1, size, d - 1, dtype=self.masses.dtype)
+        up = jnp.eye(1, size, d - 1, dtype=self.masses.dtype)  # h among a body's coordinates
         return LinearPotential((self.masses[:, None] * up).reshape(-1) * acceleration)
 
     # ---- positions and velocities of points
@@ -297,19 +300,19 @@ class RigidBodies(Body):
     def directions(self, q: jax.Array, with_tangents: bool = True) -> Directions:
         """f (m,) [m], N (n, m) and, `with_tangents`, H_t (n, m) or (n, 2 m) at q."""
         gap, point, normal = self.contacts(q)
-        ways = normal[:, None]
+        directions = normal[:, None]
         if not with_tangents:
-            return Directions(gap, self._relative_jacobian(q, point, ways)[..., 0], None)
-        ways = jnp.concatenate([ways, self.ways(normal)], axis=1)
-        jacobian = self._relative_jacobian(q, point, ways)
+            return Directions(gap, self._relative_jacobian(q, point, directions)[..., 0], None)
+        directions = jnp.concatenate([directions, self.unit_tangents(normal)], axis=1)
+        jacobian = self._relative_jacobian(q, point, directions)
         return Directions(gap, jacobian[..., 0], jacobian[..., 1:].reshape(len(jacobian), -1))
 
-    def ways(self, normal: jax.Array) -> jax.Array:
+    def unit_tangents(self, normal: jax.Array) -> jax.Array:
         """Unit tangents (m, d - 1, d) of normals (m, d)."""
         return tangents_of(normal)
 
-    def contact_jacobian(self, at: jax.Array, point: jax.Array, ways: jax.Array) -> jax.Array:
-        """Rows (.., k, velocities of a body): velocity of a point along k directions.
+    def contact_jacobian(self, at: jax.Array, point: jax.Array, directions: jax.Array) -> jax.Array:
+        """J (.., k, velocities of a body): `J v` is the velocity of its point along k directions.
 
         Equation: row k is `J_k = [d_k, r x d_k]`, r the lever arm from the body to the point; with
         quaternions `r x d_k` in the axes of the body.
@@ -317,39 +320,42 @@ class RigidBodies(Body):
         Args:
             at: coordinates of the bodies (.., c); leading axes of all three are broadcast.
             point: (.., d) [m].
-            ways: unit vectors d_k (.., k, d).
+            directions: unit vectors d_k (.., k, d).
         """
-        lever = (point - at[..., : self.dimension])[..., None, :]
+        lever, along = (point - at[..., : self.dimension])[..., None, :], directions
         if self.dimension == 2:
-            around = (lever[..., 0] * ways[..., 1] - lever[..., 1] * ways[..., 0])[..., None]
+            around = (lever[..., 0] * along[..., 1] - lever[..., 1] * along[..., 0])[..., None]
         else:
-            around = cross(lever, ways)
+            around = cross(lever, along)
         if self.quaternions:  # omega is in the axes of the body
             around = times(jnp.swapaxes(self.turns(at), -1, -2)[..., None, :, :], around)
-        along = jnp.broadcast_to(ways, (*around.shape[:-1], self.dimension))
+        along = jnp.broadcast_to(along, (*around.shape[:-1], self.dimension))
         return jnp.concatenate([along, around], axis=-1)
 
-    def _relative_jacobian(self, q: jax.Array, point: jax.Array, ways: jax.Array) -> jax.Array:
-        """J (n, m, k): `J^T v` are velocities of body i relative to body j along `ways` (m, k, d).
+    def _relative_jacobian(
+        self, q: jax.Array, point: jax.Array, directions: jax.Array
+    ) -> jax.Array:
+        """J (n, m, k): `J^T v` are velocities of body i relative to body j at m contacts.
 
-        Both are taken at the contact points `point` (m, d) [m].
+        They are taken at contact points `point` (m, d) [m] along unit `directions` (m, k, d).
         """
         pairs = self.pairs_in_contact()
         movers = pairs if (pairs[:, 1] >= 0).any() else pairs[:, :1]  # a plane does not move
         at = self.of_bodies(q)[movers]
-        jacobian = self.contact_jacobian(at, point[:, None], ways[:, None])
+        jacobian = self.contact_jacobian(at, point[:, None], directions[:, None])
         jacobian = jacobian.at[:, 1:].multiply(-1.0)  # (m, i or j, k, velocities)
         # by JAX: of thousands of bodies only the shapes are needed, and this would fill the memory
         own = jnp.asarray(movers)[:, :, None] == np.arange(self.count, dtype=np.int32)[None, None]
         rows = jnp.sum(jnp.where(own[..., None, None], jacobian[:, :, None], 0.0), axis=1)
         velocities = self.count * (self.dimension + self.angular)
-        return rows.transpose(1, 3, 0, 2).reshape(velocities, *ways.shape[:2])
+        return rows.transpose(1, 3, 0, 2).reshape(velocities, *directions.shape[:2])
 
     @full_precision
     def at(self, positions: Any, turns: Any = None) -> jax.Array:
-        """q (n,), the bodies at `positions` (b, d) [m], by angles (b,) or quaternions (b, 4).
+        """q (n,) of bodies at `positions` (b, d) [m], with angles (b,) [rad] or quaternions (b, 4).
 
-        In the plane these are the centres of mass, in space the middles of the shapes.
+        Positions are those of the centres of mass, in space of the middles of the shapes:
+        `x = position - R middle`. `turns` None: 0, or no rotation.
         """
         d, count = self.dimension, self.count
         places = as_numbers("positions", positions, (count, d), "one for each body")
@@ -499,7 +505,7 @@ class RigidBody(RigidBodies):
         """About the centre of mass, () in the plane, (3,) or (3, 3) in space [kg m^2]."""
         return self.inertias[0, 0] if self.dimension == 2 else self.inertias[0]
 
-    def ways(self, normal: jax.Array) -> jax.Array:
+    def unit_tangents(self, normal: jax.Array) -> jax.Array:
         """Unit tangents (m, d - 1, d) of unit normals n (m, d); in space t_1 has no y component.
 
         Equation: `t_1 = (n_z, 0, -n_x) / sqrt(n_x^2 + n_z^2)`, `t_2 = n x t_1`.
@@ -511,9 +517,9 @@ class RigidBody(RigidBodies):
         return jnp.stack([first, cross(normal, first)], axis=1)
 
     def at(self, position: Any, turn: Any = None) -> jax.Array:
-        """q, the body at `position` (d,) [m], turned by an angle or a quaternion (4,).
+        """q of the body at `position` (d,) [m], turned by an angle [rad] or a quaternion (4,).
 
-        In the plane this is the centre of mass, in space the middle of its shape.
+        The position is that of the centre of mass, in space of the middle of its shape.
         """
         place = as_numbers("position", position, (self.dimension,), "a point")
         return super().at(place[None], None if turn is None else [turn])

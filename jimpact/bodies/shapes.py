@@ -77,14 +77,15 @@ class Block(_PlanarBody):
         inertia: Any = None,
         corners: str = "all",
     ):
+        """Set the corners `(+/- L/2, +/- l/2)` and the moment of inertia, see the class."""
         width, height = positive("width", width), positive("height", height)
         if inertia is None:
             inertia = positive("mass", mass) * (height**2 + width**2) / 12
         check_choice("corners", corners, ("all", "base"))
         w, h = 0.5 * width, 0.5 * height
         points = jnp.stack([jnp.stack([-w, w, w, -w]), jnp.stack([-h, -h, h, h])], axis=1)
-        order = (1, 0, 3, 2) if corners == "all" else (1, 0)
-        self._make(points, mass, inertia, Shape(order, 4, True, False))
+        order = (1, 0, 3, 2) if corners == "all" else (1, 0)  # contact 1 is the right lower corner
+        self._make(points, mass, inertia, Shape(order, 4, faces=True, centred=False))
 
     @property
     def range_in_words(self) -> str:  # type: ignore[override]
@@ -128,6 +129,7 @@ class Polygon(_PlanarBody):
     """
 
     def __init__(self, corners: Any, mass: Any = 1.0, inertia: Any = None, centre: Any = None):
+        """Set the corners from the centre of mass, counter-clockwise, and the moment of inertia."""
         c = as_float_array("corners", corners)
         if c.ndim != 2 or c.shape[1] != 2 or c.shape[0] < 3:
             raise ValueError(f"Argument `corners` must have shape (k, 2), k >= 3, not {c.shape}.")
@@ -143,7 +145,7 @@ class Polygon(_PlanarBody):
             raise ValueError(
                 f"Argument `centre` must lie inside the polygon, but has value {middle.tolist()}."
             )
-        self._make(points, mass, inertia, Shape(order, len(order), True, False))
+        self._make(points, mass, inertia, Shape(order, len(order), faces=True, centred=False))
 
 
 class Disc(_PlanarBody):
@@ -204,7 +206,7 @@ class Dimer(_PlanarBody):
     def __init__(self, radius: Any, length: Any, sphere_mass: Any = 1.0, rod_mass: Any = 1.0):
         radius = positive("radius", radius, low_allowed=True)
         ends, mass, inertia = _dimer(radius, length, sphere_mass, rod_mass)
-        self._make(ends, mass, inertia, Shape((0, 1), 2, False, False), radius)
+        self._make(ends, mass, inertia, Shape((0, 1), 2, faces=False, centred=False), radius)
 
 
 # --------------------------------------------------------------------------------- in space
@@ -289,6 +291,10 @@ class Box(_SpatialBody):
         rounding: Any = 0.0,
         normal: Any = LEVEL,
     ):
+        """Set the middles of the rounded corners, `middle + (+/- (a/2 - r), ..)`, and moments.
+
+        Moments of inertia of a homogeneous box over its mass are `(b^2 + c^2) / 12`, ...
+        """
         sizes = positives("sizes", as_float_array("sizes", sizes), 3)
         rounding = positive("rounding", rounding, low_allowed=True)
         middle = -as_numbers("centre", np.zeros(3) if centre is None else centre, (3,), "a vector")
@@ -302,7 +308,7 @@ class Box(_SpatialBody):
                 )
         points = middle[None] + jnp.asarray(_SIGNS, sizes.dtype) * (0.5 * sizes - rounding)[None]
         homogeneous = (jnp.sum(sizes**2) - sizes**2) / 12
-        shape = Shape(tuple(range(8)), 8, True, False)
+        shape = Shape(tuple(range(8)), 8, faces=True, centred=False)
         self._make(points, mass, inertia, homogeneous, centre, normal, shape, rounding)
 
     @property
@@ -341,6 +347,7 @@ class Sphere(_SpatialBody):
         centre: Any = None,
         normal: Any = LEVEL,
     ):
+        """Set the middle from the centre of mass and the moments of inertia, see the class."""
         radius = positive("radius", radius)
         isotropic = inertia is None or np.ndim(inertia) == 0
         if inertia is not None and isotropic:
@@ -382,11 +389,12 @@ class SpatialDimer(_SpatialBody):
         rod_mass: Any = 1.0,
         normal: Any = LEVEL,
     ):
+        """Set the middles of the spheres and the inertia `(I_a, I_t, I_t)`, see the class."""
         radius = positive("radius", radius)  # without radius no inertia about the axis
         ends, mass, across = _dimer(radius, length, sphere_mass, rod_mass)
         along = 0.8 * positive("sphere_mass", sphere_mass) * radius**2
         inertia = jnp.stack([along, across, across])
-        shape = Shape((0, 1), 2, False, False)
+        shape = Shape((0, 1), 2, faces=False, centred=False)
         points = jnp.pad(ends, ((0, 0), (0, 1)))
         self._make(points, mass, inertia, jnp.ones(3), None, normal, shape, radius)
 
@@ -434,6 +442,7 @@ class Coin(_SpatialBody):
         corners: int = 0,
         normal: Any = LEVEL,
     ):
+        """Set the corners of both rims (round ones have none) and the inertia, see the class."""
         radius, thickness = positive("radius", radius), positive("thickness", thickness)
         self.disc = jnp.stack([radius, thickness])
         corners = as_whole("corners", corners, 0)
@@ -445,7 +454,7 @@ class Coin(_SpatialBody):
         points = self._rims(jnp.asarray(np.stack([np.cos(angle), np.sin(angle)], axis=1)))
         across = (3 * radius**2 + thickness**2) / 12
         homogeneous = jnp.stack([across, across, 0.5 * radius**2])
-        shape = Shape(tuple(range(len(points))), len(points), False, False)
+        shape = Shape(tuple(range(len(points))), len(points), faces=False, centred=False)
         self._make(points, mass, inertia, homogeneous, None, normal, shape)
 
     def _rims(self, outward: jax.Array) -> jax.Array:
@@ -532,7 +541,7 @@ def _round_shape(
                 f"Argument `centre` must be at most {float(radius):g} m from the middle, but has "
                 f"value {(-middle).tolist()}."
             )
-    return Shape((0,), 1, False, isotropic and centre is None), middle
+    return Shape((0,), 1, faces=False, centred=isotropic and centre is None), middle
 
 
 def _dimer(
