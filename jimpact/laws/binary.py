@@ -93,6 +93,7 @@ class Binary(Law):
         friction: Any = None,
         tangential_restitution: Any = 0.0,
     ):
+        """Set the fields; their declarations check them. Without friction e_t must be 0."""
         self.restitution, self.order, self.max_collisions = restitution, order, max_collisions
         self.friction, self.tangential_restitution = friction_fields(
             friction, tangential_restitution
@@ -218,7 +219,7 @@ class Binary(Law):
         return steps
 
     def _prepared(self, scene: Scene, velocity: Any) -> tuple["Binary", Scene, jax.Array]:
-        """Law, scene and velocity checked and in one dtype."""
+        """The law, the scene and v- (n,) [m/s], checked and in one floating-point type."""
         v = as_velocity(scene, velocity)
         check_values("velocity", v)
         law, scene, v = in_common_dtype(self, scene, v)

@@ -4,6 +4,7 @@ A pair's coefficient of restitution does not determine what a chain does: forces
 the same speed spread an impact differently (docs/compliant.md).
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -94,7 +95,7 @@ def calibrate(force: Force, restitution: Any, mass: Any, speed: Any) -> Force:
 
 
 @precise_jit
-def _each(function: Any, force: Force, *values: jax.Array) -> jax.Array:
+def _each(function: Callable[..., jax.Array], force: Force, *values: jax.Array) -> jax.Array:
     """`function(force, *values)`, a function of scalars, for each entry of their common shape.
 
     Arrays of the force are broadcast with `values`, but those of a `UserForce` are passed on as
@@ -133,7 +134,7 @@ def _damping(force: Force, mass: jax.Array, speed: jax.Array, e: jax.Array) -> j
         known = damped.pair_restitution(mass, speed)
         return e - (_integrated(damped, mass, speed) if known is None else known)
 
-    def bisected(f: Any, guess: jax.Array) -> jax.Array:
+    def bisected(f: Callable[[jax.Array], jax.Array], guess: jax.Array) -> jax.Array:
         """The root () of an increasing function f between 0 and `STRONGEST`."""
 
         def half(_: Any, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
@@ -147,7 +148,7 @@ def _damping(force: Force, mass: jax.Array, speed: jax.Array, e: jax.Array) -> j
         low, high = jax.lax.fori_loop(0, BISECTIONS, half, ends)
         return (low + high) / 2
 
-    def scalar_solve(linear: Any, right: jax.Array) -> jax.Array:
+    def scalar_solve(linear: Callable[[jax.Array], jax.Array], right: jax.Array) -> jax.Array:
         """x with `linear(x) = right`, a linear function of a scalar."""
         return right / linear(jnp.ones_like(right))
 

@@ -147,7 +147,7 @@ def to_inputs(
 ) -> Inputs:
     """The normalized problem: `qn = gamma / d`, `G = W / (d d^T)`, `d_j = sqrt(W_jj)` (root).
 
-    Gaps and d decide the order of collisions only, and have no derivatives.
+    The fields `gaps` and `root` only decide the order of collisions, and have no derivatives.
     """
     root = jnp.sqrt(diagonal(delassus))
     g = scaled(delassus, 1 / root)
@@ -198,7 +198,7 @@ def run(inputs: Inputs, options: Options) -> tuple[tuple[jax.Array, jax.Array | 
 
 
 def coupling_matrix(inputs: Inputs, options: Options) -> Symmetric:
-    """G with its unit diagonal, tridiagonal for a chain."""
+    """G (m, m) of its entries off the unit diagonal, `inputs.coupling`; tridiagonal for a chain."""
     m, dtype = inputs.qn.shape[0], inputs.qn.dtype
     if options.chain:
         return Tridiagonal(jnp.ones(m, dtype), inputs.coupling)
@@ -252,9 +252,9 @@ def choose(inputs: Inputs, options: Options, g: Symmetric, at: CollisionState) -
     approaching = at.qn < -rest
     if options.cycle is not None:
         cycle = jnp.array(options.cycle, jnp.int32)
-        turn = approaching[cycle]
-        ahead = turn & (jnp.arange(len(options.cycle), dtype=jnp.int32) >= at.place)
-        k = jnp.where(jnp.any(ahead), jnp.argmax(ahead), jnp.argmax(turn)).astype(jnp.int32)
+        ready = approaching[cycle]  # entries whose contact approaches
+        ahead = ready & (jnp.arange(len(options.cycle), dtype=jnp.int32) >= at.place)
+        k = jnp.where(jnp.any(ahead), jnp.argmax(ahead), jnp.argmax(ready)).astype(jnp.int32)
         return NextCollision(cycle[k], k + 1, jnp.zeros_like(at.time), jnp.array(False))
     speed = jnp.where(approaching, -at.qn * inputs.root, 0.0)  # m/s
     rivals, wait = approaching, jnp.zeros_like(speed)
@@ -304,26 +304,26 @@ def collide(inputs: Inputs, options: Options, g: Symmetric, at: CollisionState) 
     chosen = jnp.arange(at.qn.shape[0], dtype=jnp.int32) == choice.contact
     slip, tangential, code = at.slip, at.tangential, at.code
     if inputs.ratio is not None:
-        jump, status = _correlated(inputs, inputs.ratio, g, at, chosen)
-        after, code = at.qn + times(g, jump), jnp.maximum(code, status)
+        p, status = _correlated(inputs, inputs.ratio, g, at, chosen)
+        after, code = at.qn + times(g, p), jnp.maximum(code, status)
     elif inputs.friction is None:
-        jump = jnp.where(chosen, -(1 + inputs.restitution) * at.qn, 0.0)
-        after = jnp.where(chosen, -inputs.restitution * at.qn, at.qn + times(g, jump))
+        p = jnp.where(chosen, -(1 + inputs.restitution) * at.qn, 0.0)
+        after = jnp.where(chosen, -inputs.restitution * at.qn, at.qn + times(g, p))
     else:
         assert slip is not None
         assert tangential is not None
-        jump, jump_t, status = _with_friction(inputs, inputs.friction, at, choice.contact)
+        p, p_t, status = _with_friction(inputs, inputs.friction, at, choice.contact)
         cross, tangent, _ = inputs.friction.block
-        after = at.qn + times(g, jump) + cross @ jump_t
-        slip = slip + cross.T @ jump + tangent @ jump_t
-        tangential, code = tangential + jump_t, jnp.maximum(code, status)
+        after = at.qn + times(g, p) + cross @ p_t
+        slip = slip + cross.T @ p + tangent @ p_t
+        tangential, code = tangential + p_t, jnp.maximum(code, status)
     gaps = at.gaps
     if gaps is not None:
         flown = gaps + jax.lax.stop_gradient(at.qn) * inputs.root * choice.wait
         gaps = jnp.where(chosen, 0.0, jnp.maximum(flown, 0.0))
     return CollisionState(
         qn=after,
-        p=at.p + jump,
+        p=at.p + p,
         number=at.number + jnp.array(1, jnp.int32),
         place=choice.place,
         speed=jax.lax.stop_gradient(-at.qn[choice.contact]),
@@ -368,8 +368,8 @@ def _correlated(
     left = at.qn + s * a
     allowed = allowed & ~jnp.any(((d > 0) | beside) & (left < -rest_of(inputs)))
     alone = jnp.where(chosen, -(1 + inputs.restitution) * at.qn, 0.0)
-    jump = jnp.where(allowed & jnp.any(beside), s * d, alone)
-    return jump, jnp.where(allowed, CODE["ok"], CODE["infeasible"])
+    p = jnp.where(allowed & jnp.any(beside), s * d, alone)
+    return p, jnp.where(allowed, CODE["ok"], CODE["infeasible"])
 
 
 def _with_friction(
@@ -395,9 +395,9 @@ def _with_friction(
         friction.coefficient[contact][None],
         complementary=True,
     )
-    jump = jnp.zeros_like(at.qn).at[contact].set(impulses.normal[0])
-    jump_t = jnp.zeros_like(at.slip).at[rows].set(impulses.tangential)
-    return jump, jump_t, impulses.status
+    p = jnp.zeros_like(at.qn).at[contact].set(impulses.normal[0])
+    p_t = jnp.zeros_like(at.slip).at[rows].set(impulses.tangential)
+    return p, p_t, impulses.status
 
 
 def endless_pair(inputs: Inputs, first: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -416,19 +416,19 @@ def endless_pair(inputs: Inputs, first: jax.Array) -> tuple[jax.Array, jax.Array
     noise = precision(qn.dtype).noise
     e_j, e_k, s_1 = e[first], e[1 - first], -qn[first]
     s_2 = c * (1 + e_j) * s_1 - qn[1 - first]
-    both = e_j * e_k
+    det = e_j * e_k
     trace = c**2 * (1 + e_j) * (1 + e_k) - e_j - e_k
-    ratio = c * (1 + e_k) * s_2 / s_1 - e_j
-    chi = ratio**2 - trace * ratio + both
-    above = (ratio >= trace / 2) | (chi <= noise * (ratio**2 + trace * ratio + both))
-    possible = (c > 0) & (trace >= 2 * jnp.sqrt(jax.lax.stop_gradient(both)))
+    ratio = c * (1 + e_k) * s_2 / s_1 - e_j  # s_3 / s_1
+    chi = ratio**2 - trace * ratio + det
+    above = (ratio >= trace / 2) | (chi <= noise * (ratio**2 + trace * ratio + det))
+    possible = (c > 0) & (trace >= 2 * jnp.sqrt(jax.lax.stop_gradient(det)))
     endless = possible & (s_2 > 0) & (ratio >= 0) & above
     # redundant contacts (c = 1) have no inverse: there s_3 = e_1 e_2 s_1, a geometric series
-    free = 1 - c**2
-    redundant = free <= noise
-    other = -(qn + c * jnp.flip(qn)) / jnp.where(redundant, 1.0, free)
-    decay = jnp.where(both < 1, 1 - both, 1.0)
+    det_g = 1 - c**2
+    redundant = det_g <= noise
+    inverse = -(qn + c * jnp.flip(qn)) / jnp.where(redundant, 1.0, det_g)  # -G^-1 qn
+    decay = jnp.where(det < 1, 1 - det, 1.0)
     series_j, series_k = (1 + e_j) * s_1 / decay, (1 + e_k) * s_2 / decay
     chosen = jnp.arange(2, dtype=jnp.int32) == first
-    p = jnp.where(redundant, jnp.where(chosen, series_j, series_k), other)
-    return endless & ~(redundant & (both >= 1)), p
+    p = jnp.where(redundant, jnp.where(chosen, series_j, series_k), inverse)
+    return endless & ~(redundant & (det >= 1)), p

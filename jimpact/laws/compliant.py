@@ -79,7 +79,11 @@ class Compliant(Law):
     adjoint: str = option("jacobian", ADJOINTS)
 
     def __check_init__(self) -> None:
-        """Raise where `force` is not a force, or has no energy to store."""
+        """Raise a TypeError for a `force` that is none, a ValueError for what it does not allow.
+
+        A viscous or yielding force allows no `initial_energy`, a yielding one no friction and no
+        method 'implicit'.
+        """
         if not isinstance(self.force, Force):
             raise TypeError(
                 "Argument `force` must be a contact force such as Hertz(k), "
@@ -105,7 +109,7 @@ class Compliant(Law):
         return self.force.bistiffness is not None
 
     def check(self, scene: Scene, dtype: jnp.dtype) -> None:
-        """Raise for a tolerance finer than the precision can hold, and too many contacts."""
+        """Raise a ValueError for an `rtol` below rounding, or too many contacts with friction."""
         if self.rtol is not None:
             check_rtol(self.rtol, dtype)
         if self.friction is not None:

@@ -13,7 +13,10 @@ from jimpact.tools.checks import is_traced
 
 
 def friction_fields(friction: Any, tangential_restitution: Any) -> tuple[Any, Any]:
-    """`(mu, e_t)`, or `(None, None)` without friction; then e_t must be 0 (ValueError)."""
+    """The fields `(mu, e_t)` of a law, `(None, None)` without friction.
+
+    Raise a ValueError for an e_t that is not 0, or traced, without friction.
+    """
     if friction is not None:
         return friction, tangential_restitution
     if is_traced(tangential_restitution) or np.any(np.asarray(tangential_restitution) != 0):

@@ -32,7 +32,7 @@ class GapScale(eqx.Module):
         return self.gaps / self.delta
 
     def __str__(self) -> str:
-        """A line for each gap, and what delta_c is."""
+        """A line for each gap, and the definition of delta_c."""
         if is_traced(self.delta):
             return repr(self)
         rows = enumerate(zip(np.asarray(self.gaps), np.asarray(self.delta)))

@@ -94,7 +94,11 @@ def history(law: Law, scene: Scene, velocity: Any, samples: int = 200) -> Histor
 
 @quick_jit
 def _history(law: Law, scene: Scene, v: jax.Array, samples: int, traced: Traced) -> History:
-    """`History` (s = `samples` rows) in SI units, from the dimensionless flow of the law."""
+    """`History` of s = `samples` rows in SI units, from the dimensionless dynamics of the law.
+
+    Where nothing happens, the dynamics run from gamma- = -1 m/s, and their samples are replaced by
+    values before the impact.
+    """
     contact = law.contact(scene, v)
     happens, gamma = contact.happens, contact.gap_velocity
     harmless = jnp.where(happens, gamma, -jnp.ones_like(gamma))

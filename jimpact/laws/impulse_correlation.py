@@ -66,7 +66,7 @@ class ImpulseCorrelation(Law):
     max_collisions: int = option(10_000, low=1)
 
     def check(self, scene: Scene, dtype: jnp.dtype) -> None:
-        """Raise a ValueError where a ratio is outside its interval for a pair of contacts."""
+        """Raise a ValueError where a ratio of two closed contacts is outside its `interval`."""
         if is_traced((scene, self.restitution, self.ratio)):
             return
         m = scene.contacts

@@ -238,6 +238,7 @@ class RestitutionMatrix(Kinematic):
         friction: Any = None,
         tangential_restitution: Any = 0.0,
     ):
+        """Set the fields; raise a ValueError unless E is square, or for e_t without friction."""
         self.matrix, self.admissible = matrix, admissible
         shape = np.shape(matrix)
         if len(shape) != 2 or shape[0] != shape[1] or shape[0] == 0:

@@ -47,7 +47,7 @@ def default_rtol(method: str, dtype: jnp.dtype) -> float:
     return table.get(str(dtype), table["float32"])
 
 
-def solver_of(law: Any, contact: Contact) -> tuple[str, Any]:
+def solver_of(law: Any, contact: Contact) -> tuple[str, Any]:  # law: LZB, Compliant
     """The `method` of a law with impact dynamics at these contacts, 'auto' decided, and its rtol.
 
     The tolerance is the law's, else the contact's, else the default of the method.
@@ -60,7 +60,7 @@ def solver_of(law: Any, contact: Contact) -> tuple[str, Any]:
 
 
 def check_few_contacts(scene: Scene) -> None:
-    """Raise a ValueError where too many contacts have friction."""
+    """Raise a ValueError for a scene of more than `MOST_WITH_FRICTION` contacts, with friction."""
     if scene.contacts > MOST_WITH_FRICTION:
         raise ValueError(
             f"Argument `scene` must have at most {MOST_WITH_FRICTION} contacts for impact dynamics "
@@ -140,7 +140,7 @@ class LZB(Law):
     adjoint: str = option("jacobian", ADJOINTS)
 
     def check(self, scene: Scene, dtype: jnp.dtype) -> None:
-        """Raise for a tolerance finer than the precision can hold, and too many contacts."""
+        """Raise a ValueError for an `rtol` below rounding, or too many contacts with friction."""
         if self.rtol is not None:
             check_rtol(self.rtol, dtype)
         if self.friction is not None:

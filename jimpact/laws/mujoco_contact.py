@@ -152,7 +152,7 @@ def mujoco_solref(
 
 
 def _check(timestep: float, solimp: tuple[float, ...], speed: float) -> None:
-    """Raise a ValueError for values out of range."""
+    """Raise a ValueError for a time step, an impedance or a speed out of range."""
     check_values("timestep", timestep, low=0.0, open_low=True)
     check_values("speed", speed, low=0.0, open_low=True)
     check_shape("solimp", np.asarray(solimp), (5,), "dmin, dmax, width, midpoint, power")
@@ -190,7 +190,7 @@ class _Impedance(NamedTuple):
     power: float
 
     def clipped(self) -> "_Impedance":
-        """The same in the ranges to which MuJoCo confines its numbers."""
+        """The impedance with numbers confined to the ranges that MuJoCo allows."""
         low, high = _LEAST_IMPEDANCE, 1 - _LEAST_IMPEDANCE
         dmin, dmax, midpoint = (
             min(max(x, low), high) for x in (self.dmin, self.dmax, self.midpoint)

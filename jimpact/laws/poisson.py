@@ -69,6 +69,7 @@ class Poisson(Law):
         *,
         allow_above_one: bool = False,
     ):
+        """Set the fields; their declarations check them. Without friction e_t must be 0."""
         self.restitution, self.allow_above_one = restitution, allow_above_one
         self.friction, self.tangential_restitution = friction_fields(
             friction, tangential_restitution
@@ -76,7 +77,7 @@ class Poisson(Law):
 
     @full_precision
     def impulses(self, contact: Contact) -> Impulses:
-        """Impulses of compression and of expansion, each by a complementarity problem."""
+        """Impulses `p = (1 + e) p_c + s`, p_c and s each by a complementarity problem."""
         mu, e_t = self.friction, self.tangential_restitution
         if mu is not None and e_t is not None:
             return self._with_friction(contact, mu, e_t)
@@ -92,7 +93,10 @@ class Poisson(Law):
         return Impulses(compression.z + returned + supplement.z, None, code)
 
     def _with_friction(self, contact: Contact, mu: jax.Array, e_t: jax.Array) -> Impulses:
-        """Impulses of compression and of expansion, each by a friction problem, see the class."""
+        """Impulses of compression and of expansion, each by a friction problem, see the class.
+
+        Equation: `p = (1 + e) p_c + s`, `p_t = p_tc + p_te`.
+        """
         assert contact.slip is not None  # see `check_law`
         a, gamma = contact.whole_delassus, contact.gap_velocity
         mu, e = mu * jnp.ones_like(gamma), self.restitution * jnp.ones_like(gamma)
@@ -186,7 +190,10 @@ def _free_columns(w: jax.Array, loaded: jax.Array) -> jax.Array:
 
 
 def _depends_on_sharing(w: jax.Array, e: jax.Array, free: jax.Array) -> jax.Array:
-    """True () where `W diag(e) p_c` differs among p_c that differ by columns of `free` (m, m)."""
+    """True () where `W diag(e) p_c` differs among p_c (m,) that differ by columns of `free` (m, m).
+
+    Equation: an entry of `D^-1 W diag(e) free`, `D = diag(sqrt(W_jj))`, is more than rounding.
+    """
     w, e = jax.lax.stop_gradient((w, e))
     norm = jnp.sqrt(jnp.diagonal(w))
     returned = w @ (e[:, None] * free) / jnp.where(norm > 0, norm, 1.0)[:, None]

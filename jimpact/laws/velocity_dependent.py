@@ -129,28 +129,28 @@ class VelocityDependent(Law):
         return self._at(as_float_array("speed", speed))
 
     def _at(self, v: jax.Array) -> jax.Array:
-        """e (m,) at speeds v [m/s]: `e^2 = y^2 + (1 - y^2) f^2`, f = `power`, see the class."""
+        """e (m,) at speeds v [m/s]: `e^2 = y^2 + (1 - y^2) f^2`, y and f as of the class."""
         e = free_parameters_of(self.law)["restitution"].value
         moving = v > 0
         safe = jnp.where(moving, v, self.reference_speed)  # at rest e is that of the law
         # comparisons, as min() of two equal numbers would halve the derivative
-        most = jnp.where(e > 1, e, 1.0)
-        power = e * jnp.ones_like(v)
+        largest = jnp.where(e > 1, e, 1.0)  # of f: 1, or an e above 1 itself
+        f = e * jnp.ones_like(v)
         if self.speed_exponent is not None:
             ratio = safe / self.reference_speed
-            falls = e * ratio**-self.speed_exponent <= most
+            falls = e * ratio**-self.speed_exponent <= largest
             falling = e * jnp.where(falls, ratio, 1.0) ** -self.speed_exponent
-            power = jnp.where(falls, falling, most)
+            f = jnp.where(falls, falling, largest)
         elif self.curve is not None:
-            power = e * self._curve_at(safe)
-            power = jnp.where(power <= most, power, most)
+            f = e * self._curve_at(safe)
+            f = jnp.where(f <= largest, f, largest)
         if self.yield_speed is None:
-            return power
+            return f
         yields = safe >= self.yield_speed
         y = jnp.where(yields, self.yield_speed / jnp.where(yields, safe, 1.0), 1.0)
-        some = moving & (y > 0)  # the root has no slope at 0
-        square = jnp.where(some, y**2 + (1 - y**2) * power**2, 1.0)
-        return jnp.where(some, jnp.sqrt(square), power)
+        smooth = moving & (y > 0)  # the root has no slope at 0
+        square = jnp.where(smooth, y**2 + (1 - y**2) * f**2, 1.0)
+        return jnp.where(smooth, jnp.sqrt(square), f)
 
     def _curve_at(self, v: jax.Array) -> jax.Array:
         """Values of the curve at speeds v [m/s]; a table is linear between its rows."""
@@ -161,11 +161,11 @@ class VelocityDependent(Law):
 
     @full_precision
     def impulses(self, contact: Contact) -> Impulses:
-        """Those of the law with e at this speed."""
+        """Impulses of the law with e at the speeds of approach of these contacts."""
         return self._law_at(contact).impulses(contact)
 
     def dynamics(self, contact: Contact) -> Dynamics:
-        """Those of the law with e at this speed."""
+        """Dynamics of the law with e at the speeds of approach of these contacts."""
         return self._law_at(contact).dynamics(contact)
 
     def _law_at(self, contact: Contact) -> Law:
@@ -206,7 +206,7 @@ def approach_speed(contact: Contact) -> jax.Array:
         (jnp.abs(w) > least * root[:, None] * root[None, :], speed)
     )
 
-    def passed_on(state: tuple[jax.Array, Any]) -> tuple[jax.Array, jax.Array]:
+    def passed_on(state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         """Fastest contact (m,) known to each one or to its neighbours; True () if one changed."""
         fastest, _ = state
         around = jnp.where(coupled, constant[fastest][None, :], -1.0)
