@@ -97,8 +97,9 @@ class Contact(eqx.Module):
         tangential_block: Any = None,
         rtol: Any = None,
     ):
-        own_form = isinstance(delassus, (Tridiagonal, Sparse))
-        self.delassus = delassus if own_form else as_float_array("delassus", delassus)
+        """Set the fields, arrays of floats; what is None becomes its default, see the class."""
+        structured = isinstance(delassus, (Tridiagonal, Sparse))
+        self.delassus = delassus if structured else as_float_array("delassus", delassus)
         self.gap_velocity = as_float_array("gap_velocity", gap_velocity)
         zero = jnp.zeros_like(self.gap_velocity)
         self.closed = zero == 0 if closed is None else jnp.asarray(closed, bool)
@@ -382,7 +383,10 @@ def delassus_matrix(scene: Scene) -> Symmetric:
 
 
 def decoupled(delassus: Symmetric, closed: jax.Array) -> Symmetric:
-    """W whose rows and columns of open contacts hold their diagonal only."""
+    """The Delassus matrix with rows and columns of open contacts 0 but for their diagonal entry.
+
+    `closed` (m,) is True for contacts that stay coupled.
+    """
     if isinstance(delassus, Sparse):
         return delassus.within(closed)
     if isinstance(delassus, Tridiagonal):
@@ -393,7 +397,7 @@ def decoupled(delassus: Symmetric, closed: jax.Array) -> Symmetric:
 
 
 def kinetic_norm(scene: Scene) -> jax.Array:
-    """`|grad f_j|` in the metric of M^-1 (m,), the square roots of the free W_jj."""
+    """`|grad f_j| = sqrt(N_j^T M^-1 N_j)` (m,) [1 / sqrt(kg)], without bilateral constraints."""
     if scene.walls is not None or scene.pairs is not None:
         return jnp.sqrt(diagonal(delassus_matrix(scene)))
     moved = solve_mass(without_constraints(scene), scene.normals)
@@ -557,6 +561,7 @@ def contacts_of_groups(
         tangents = tangents.reshape(len(index), each * g)  # columns of H of each group
         directions = jnp.concatenate([index, m + tangents], axis=1)  # of (N, H)
         part = jnp.asarray(padded < m) & scene.closed[index]
+        # [[W, W_nt], [W_tn, W_tt]] of each group
         matrix = jnp.einsum("nca,ncb->cab", columns[:, directions], moved[:, directions])
         block = (matrix[:, :g, g:], matrix[:, g:, g:], slip[tangents]) if each else None
         contact = Contact(

@@ -68,7 +68,7 @@ ADVISED = ("restitution", "stiffness", "exponent", "friction")
 
 
 def simplest_first() -> tuple[str, ...]:
-    """Names of the laws that `advise` tries, in the order of what they must know of the contacts.
+    """Names of the laws that `advise` tries: first those that need to know least of the contacts.
 
     >>> import jimpact as ji
     >>> from jimpact.core.registry import simplest_first
@@ -126,7 +126,7 @@ def register(
     check_kind("name", name, str)
 
     def enter(law: Any) -> Any:
-        """The class, entered."""
+        """Enter the class in `REGISTRY` under its name, after checks, and return it."""
         if not (isinstance(law, type) and issubclass(law, Law)):
             raise TypeError(f"Argument `law` must be a class of Law, but is {law!r}.")
         if name != name.lower() or not name:
@@ -140,15 +140,15 @@ def register(
                 f"{other.law.__module__}."
             )
         row = Row(
-            law,
-            summary,
-            right_when,
-            fails_when,
-            frozenset(promises),
-            source,
-            bibtex,
-            make,
-            simplicity,
+            law=law,
+            summary=summary,
+            right_when=right_when,
+            fails_when=fails_when,
+            promises=frozenset(promises),
+            source=source,
+            bibtex=bibtex,
+            make=make,
+            simplicity=simplicity,
         )
         unknown = [key for key in row.required if key not in ADVISED]
         if simplicity is not None and unknown:

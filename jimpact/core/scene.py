@@ -155,6 +155,7 @@ class Scene(eqx.Module):
         gaps: Any = None,
         constraints: Any = None,
     ):
+        """Set the fields, arrays of floats, and check shapes and values."""
         self.mass = as_float_array("mass", mass)
         self._normals = as_float_array("normals", normals)
         self.tangents = None if tangents is None else as_float_array("tangents", tangents)
@@ -172,7 +173,7 @@ class Scene(eqx.Module):
         return " A body has a scene at each configuration: `.scene(q)`." if body else ""
 
     def __str__(self) -> str:
-        """Sizes, masses and gaps, in numbers."""
+        """Lines with the sizes n and m, masses, normals and gaps."""
         kind = "scene"
         if self.walls is not None:
             walls = next(name for name, sides in WALLS.items() if sides == self.walls)
@@ -370,7 +371,7 @@ class PaddedScene(NamedTuple):
     scene: Scene
     coordinates: slice  # of its own coordinates among all
     contacts: slice  # of its own contacts among all
-    copied: np.ndarray  # (contacts,) own contact whose parameters each contact takes
+    copied: Any  # array (contacts,), own contact whose parameters each contact takes
 
 
 def pad_scene(scene: Scene, contacts: int) -> PaddedScene:
@@ -560,7 +561,7 @@ def chain_scene(masses: jax.Array, walls: tuple[bool, bool], gaps: jax.Array | N
     return _unchecked(mass=masses, walls=walls, gaps=gaps)
 
 
-def sparse_scene(mass: jax.Array, directions: jax.Array, bodies: Any, count: int) -> Scene:
+def sparse_scene(mass: jax.Array, directions: jax.Array, bodies: np.ndarray, count: int) -> Scene:
     """A packing: m frictionless contacts between two of `count` bodies each.
 
     `mass` (n,), `directions` (m, 2, n / count) of `bodies` (m, 2), where -1 is none (a wall): its
@@ -578,7 +579,7 @@ def _unchecked(**fields: Any) -> Scene:
 
 
 def _check_scene(scene: Scene) -> None:
-    """Raise a ValueError for shapes or values that no scene has."""
+    """Raise a ValueError unless shapes and values are those that `Scene` documents."""
     mass, normals = scene.mass, scene.normals
     if mass.ndim not in (1, 2) or (mass.ndim == 2 and mass.shape[0] != mass.shape[1]):
         raise ValueError(

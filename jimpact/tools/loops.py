@@ -38,14 +38,14 @@ def any_lane(happens: jax.Array) -> jax.Array:
 def while_loop(
     goes_on: Callable[[State], jax.Array], one_pass: Callable[[State], State], start: State
 ) -> State:
-    """As `jax.lax.while_loop`, from a start of the types that its passes end with."""
+    """`jax.lax.while_loop` whose start varies over all mesh axes that a pass adds."""
     return jax.lax.while_loop(goes_on, one_pass, _begin(one_pass, start))
 
 
 def fori_loop(
     first: int, last: Any, one_pass: Callable[[Any, State], State], start: State
 ) -> State:
-    """As `jax.lax.fori_loop`, from a start of the types that its passes end with."""
+    """`jax.lax.fori_loop` whose start varies over all mesh axes that a pass adds."""
     return jax.lax.fori_loop(first, last, one_pass, _begin(lambda s: one_pass(first, s), start))
 
 
@@ -55,13 +55,13 @@ def scan(
     rows: Any,
     length: int | None = None,
 ) -> tuple[State, Any]:
-    """As `jax.lax.scan`, from a start of the types that its passes end with."""
+    """`jax.lax.scan` over `rows` whose start varies over all mesh axes that a pass adds."""
     first = jax.tree.map(lambda x: x[0], rows)
     return jax.lax.scan(one, _begin(lambda s: one(s, first)[0], start), rows, length)
 
 
 def cond(which: jax.Array, then: Callable[[], State], otherwise: Callable[[], State]) -> State:
-    """As `jax.lax.cond` of branches that may vary over different mesh axes."""
+    """`jax.lax.cond` of branches whose results may vary over different mesh axes."""
     if not jax.sharding.get_abstract_mesh().manual_axes:
         return jax.lax.cond(which, then, otherwise)
     both = [jax.make_jaxpr(branch)().out_avals for branch in (then, otherwise)]
@@ -108,9 +108,9 @@ def _varying(x: Any, axes: frozenset[Any]) -> Any:
 
 
 def axes_of(kind: Any) -> frozenset[Any]:
-    """The mesh axes that arrays of this abstract kind vary over.
+    """Mesh axes over which arrays of an abstract value (`jax.typeof(x)`) vary.
 
-    Some versions of JAX have the axes themselves, under another name.
+    Versions of JAX keep them under one of two names.
     """
     manual = getattr(kind, "manual_axis_type", None)
     return getattr(kind, "vma", frozenset()) if manual is None else manual.varying

@@ -162,7 +162,7 @@ class Steps:
         self.show_finished: Callable[[], None] | None = None
 
     def __call__(self, step: str) -> None:
-        """Record a step that is done."""
+        """Record a `step` that is done; print it where the command has run longer than `LONG`."""
         self.done.append(step)
         seconds = time.monotonic() - self.patience.begun
         if seconds > LONG:

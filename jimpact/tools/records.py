@@ -23,7 +23,7 @@ _LEAST_WIDTH = 20  # characters of a column whose text is wrapped; narrower ones
 
 
 def as_data(value: Any) -> Any:
-    """Records, arrays and mappings as what a JSON file can hold; numbers not finite are None.
+    """Records, arrays and mappings as dicts, lists and numbers of a JSON file; NaN, inf as None.
 
     >>> import numpy as np
     >>> from jimpact.tools.records import as_data
@@ -51,7 +51,7 @@ def fields_as_data(record: Any, *left_out: str) -> dict[str, Any]:
 
 
 def number(value: float | None, form: str) -> str:
-    """The number in this format, '' for None and NaN.
+    """A number as text in the format `form`, '' for None and NaN.
 
     >>> from jimpact.tools.records import number
     >>> number(0.25, ".1f"), number(float("nan"), ".1f"), number(None, ".1f")
@@ -114,7 +114,7 @@ def degrees(count: int) -> str:
 
 
 def formatted(value: Any, form: str) -> str:
-    """A number or words as of `format`; a number that rounds to 0 has no minus sign.
+    """A number or text by Python's `format`; a number that rounds to 0 has no minus sign.
 
     >>> from jimpact.tools.records import formatted
     >>> formatted(-0.0, "6g"), formatted(-4e-9, ".5f"), formatted(-0.01, ".1e")
@@ -141,7 +141,7 @@ def plain(value: float, scale: float = 1.0) -> float:
 
 
 def with_error(value: float, error: float) -> str:
-    """A value and its standard error, to the digits that count.
+    """A value and its standard error as text, to the error's first digit (two if this is 1).
 
     >>> from jimpact.tools.records import with_error
     >>> with_error(0.99123, 0.0042), with_error(131.7, 18.2), with_error(0.4, 0.0)
@@ -288,7 +288,7 @@ class Tabular:
         return self.table.to_pandas()
 
     def plot(self, title: str = "") -> "Figure":
-        """The result's picture of `ji.plot`."""
+        """The figure that `ji.plot` draws of the result; raise a TypeError if there is none."""
         if not self.picture:
             raise TypeError(f"{type(self).__name__} has no picture, only a `table`.")
         pictures = import_module("jimpact.plot")  # late: matplotlib takes long to import
