@@ -81,8 +81,8 @@ class PendulumCradle(Body):
         if not len(i):
             return super().valid(q)
         between = self.radius[:-1] + self.radius[1:] + self.gaps
-        at = jnp.concatenate([jnp.zeros_like(between[:1]), jnp.cumsum(between)])
-        right, up = at + self.length * jnp.sin(q), self.length * jnp.cos(q)
+        suspensions = jnp.concatenate([jnp.zeros_like(between[:1]), jnp.cumsum(between)])
+        right, up = suspensions + self.length * jnp.sin(q), self.length * jnp.cos(q)
         apart = jnp.sqrt((right[i] - right[j]) ** 2 + (up[i] - up[j]) ** 2)
         return jnp.min(apart - self.radius[i] - self.radius[j])
 
@@ -103,7 +103,7 @@ class PendulumCradle(Body):
     def outlines_by_body(self, q: np.ndarray, point: float) -> list[list[np.ndarray]]:
         """Curves (k, 2) [m] by body: the string and the circle of each ball at angles q (n,)."""
         length, radius = float(self.length), np.asarray(self.radius)
-        between = radius[:-1] + radius[1:] + np.asarray(self.gaps)
+        between = radius[:-1] + radius[1:] + np.asarray(self.gaps)  # distances of suspensions
         curves = []
         for x, r, angle in zip(np.cumsum([0.0, *between]), radius, q):
             pivot = np.array([x, 0.0])

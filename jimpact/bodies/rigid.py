@@ -247,7 +247,7 @@ class RigidBodies(Body):
         """Rotation matrices R (.., d, d) of bodies at coordinates (.., c), to the axes of space."""
         if self.quaternions:
             return rotation(at[..., 3:])
-        if self.dimension == 3:
+        if self.dimension == 3:  # spheres of a pile: their turns do not matter
             return jnp.broadcast_to(jnp.eye(3, dtype=at.dtype), (*at.shape[:-1], 3, 3))
         c, s = jnp.cos(at[..., 2]), jnp.sin(at[..., 2])
         return jnp.stack([c, -s, s, c], axis=-1).reshape(*c.shape, 2, 2)
@@ -346,6 +346,7 @@ class RigidBodies(Body):
         jacobian = jacobian.at[:, 1:].multiply(-1.0)  # (m, i or j, k, velocities)
         # by JAX: of thousands of bodies only the shapes are needed, and this would fill the memory
         own = jnp.asarray(movers)[:, :, None] == np.arange(self.count, dtype=np.int32)[None, None]
+        # (m, body, k, velocities)
         rows = jnp.sum(jnp.where(own[..., None, None], jacobian[:, :, None], 0.0), axis=1)
         velocities = self.count * (self.dimension + self.angular)
         return rows.transpose(1, 3, 0, 2).reshape(velocities, *directions.shape[:2])

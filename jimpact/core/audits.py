@@ -38,7 +38,7 @@ class Audit(eqx.Module):
         worst_gap_velocity: the least gamma+ ().
         worst_impulse: the least p ().
         energy_gain: T+ - T- less what was stored ().
-        momentum_residual: largest entry of M (v+ - v-) - N p ().
+        momentum_residual: largest entry of M (v+ - v-) - N p - H p_t, over that of M v- ().
     """
 
     kinematic: jax.Array
@@ -66,7 +66,8 @@ def audit(scene: Scene, velocity: Any, out: Impact) -> Audit:
     """Check an outcome against what every impact must satisfy, whatever the law.
 
     Equation: closed contacts `gamma+ >= 0` (kinematic), `p >= 0` (kinetic),
-    `T+ - T- <= sum U_0` (energetic), `M (v+ - v-) = N p` (momentum).
+    `T+ - T- <= sum U_0` (energetic), `M (v+ - v-) = N p + H p_t` (momentum), but for reactions of
+    bilateral constraints.
 
     Args:
         scene: the scene of the impact.
@@ -94,9 +95,9 @@ def audit(scene: Scene, velocity: Any, out: Impact) -> Audit:
     approach = jnp.sum((jnp.minimum(gamma, 0.0) / root) ** 2)
     size = jnp.sqrt(approach + 2 * out.initial_energy)  # scale of the impact [sqrt(J)]
     size = jnp.where(size > 0, size, 1.0)
-    jump = momentum(scene, out.velocity - v)
-    change = 0.5 * jump @ (out.velocity + v)  # T+ - T- without their cancellation
-    residual = jump - scene.normals @ out.impulse
+    momentum_change = momentum(scene, out.velocity - v)
+    change = 0.5 * momentum_change @ (out.velocity + v)  # T+ - T- without their cancellation
+    residual = momentum_change - scene.normals @ out.impulse
     if scene.tangents is not None:
         residual = residual - scene.tangents @ out.tangential_impulse
     if scene.constraints is not None:  # reactions of the constraints are not listed in `out`
