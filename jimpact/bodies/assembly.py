@@ -26,6 +26,7 @@ from jimpact.bodies.rigid import (
     Placed,
     RigidBodies,
     RigidBody,
+    Shape,
     times,
     unit_quaternion,
 )
@@ -126,7 +127,7 @@ class Bodies(RigidBodies):
     20
     """
 
-    places: jax.Array  # (f, ..) where the fixed bodies are
+    places: jax.Array  # (f, ..) coordinates of the fixed bodies
     pairs: tuple[tuple[int, int], ...] | None = eqx.field(static=True)  # None: by the grid
     room: int = eqx.field(static=True)  # 0 of few
     crowd: int = eqx.field(static=True)  # see `near_pairs`; 0: every pair is looked at
@@ -140,6 +141,7 @@ class Bodies(RigidBodies):
         places: Any = (),
         room: int | None = None,
     ):
+        """Check the arguments, stack the arrays of all bodies, and choose the pairs or the grid."""
         for name, some in (("bodies", bodies), ("fixed", fixed)):
             if not np.iterable(some):
                 raise TypeError(f"Argument `{name}` must be a list of bodies, but is {some!r}.")
@@ -180,7 +182,7 @@ class Bodies(RigidBodies):
             raise ValueError("Arguments `bodies`, `planes` and `pairs` must give a contact.")
 
     def _may_be_many(self, d: int) -> bool:
-        """Whether the grid knows their contacts."""
+        """True if the grid can find their contacts: discs and polygons, or centred spheres."""
         return all(s.centred if d == 3 else s.faces or s.is_round for s in self.shapes)
 
     @property
@@ -192,7 +194,8 @@ class Bodies(RigidBodies):
 
     @property
     def _kinds(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Pairs (g, 2) of round bodies; of a round one and one with faces; of two with faces."""
+        """Pairs (g, 2) of bodies in contact by kind: two round ones; a round one first and one with
+        faces (polygon, box); two with faces."""
         if self.pairs is None:
             each = np.stack(np.triu_indices(self.count, 1), axis=1).astype(np.int32)
         else:
@@ -201,8 +204,9 @@ class Bodies(RigidBodies):
         if round_bodies.all():  # of thousands there are millions of pairs
             return each, each[:0], each[:0]
         is_round = round_bodies[each]
-        mixed, swap = each[is_round[:, 0] != is_round[:, 1]], is_round[is_round.sum(axis=1) == 1]
-        mixed = np.where(swap[:, :1], mixed, mixed[:, ::-1])
+        one_round = is_round.sum(axis=1) == 1
+        mixed, first_round = each[one_round], is_round[one_round, :1]
+        mixed = np.where(first_round, mixed, mixed[:, ::-1])
         return each[is_round.all(axis=1)], mixed, each[~is_round.any(axis=1)]
 
     def pairs_in_contact(self) -> np.ndarray:
@@ -219,7 +223,7 @@ class Bodies(RigidBodies):
         return jnp.concatenate([self.of_bodies(q), self.places.astype(q.dtype)])
 
     def contacts(self, q: jax.Array) -> ContactPoints:
-        """Gaps, points and normals at q; `between` says of which bodies."""
+        """Gaps, points and normals (m,) at q; `between` holds the bodies of each contact."""
         placed, rims = self.placed(q), self.rims
         points, parts = placed.points, [self.on_planes(placed.points)]
         discs, mixed, faces = self._kinds
@@ -231,11 +235,12 @@ class Bodies(RigidBodies):
         if len(faces):
             i, j = faces.T
             a, b = points[i], points[j]
-            facing = facing_sides(*jax.lax.stop_gradient((a, b)))  # which sides: no derivative
+            facing = facing_sides(*jax.lax.stop_gradient((a, b)))  # numbers have no derivative
             counts, angles = self._counts, self.all_bodies(q)[:, 2]
             at, sizes = (angles[i], angles[j]), (counts[i], counts[j])
-            both = polygon_on_polygon(a, b, facing, changed_places((a, b), at, sizes, facing))
-            parts.append(ContactPoints(*(x.reshape(-1, *x.shape[2:]) for x in both)))
+            swapped = changed_places((a, b), at, sizes, facing)
+            two_each = polygon_on_polygon(a, b, facing, swapped)  # (g, 2, ..)
+            parts.append(ContactPoints(*(x.reshape(-1, *x.shape[2:]) for x in two_each)))
         return ContactPoints(*(jnp.concatenate(rows) for rows in zip(*parts)))
 
     @property
@@ -244,20 +249,28 @@ class Bodies(RigidBodies):
         return np.array([shape.size for shape in self.shapes])
 
     def _round_on_faces(self, placed: Placed, i: np.ndarray, j: np.ndarray) -> ContactPoints:
-        """Contacts of discs i with polygons j, of spheres i with boxes j."""
+        """Contacts (g,) of discs i with polygons j, in space of spheres i with boxes j.
+
+        A box is rounded by its rim r_j, a sphere has the radius r_i: `f = d - r_j - r_i`, d the
+        distance of the sphere's middle from the box of the points.
+        """
         points, turns, rims = placed.points, placed.turns, self.rims
         if self.dimension == 2:
             return disc_on_polygon(points[i, 0], rims[i], points[j])
         middle = 0.5 * (points[j, 0] + points[j, -1])
-        half = 0.5 * (self.points[j, -1] - self.points[j, 0])
-        from_middle = times(jnp.swapaxes(turns[j], 1, 2), points[i, 0] - middle)
+        half = 0.5 * (self.points[j, -1] - self.points[j, 0])  # sizes of the boxes
+        from_middle = times(jnp.swapaxes(turns[j], 1, 2), points[i, 0] - middle)  # in their axes
         distance, n = from_box(from_middle, half)
         normal, away = times(turns[j], n), distance - rims[j]
         return ContactPoints(away - rims[i], points[i, 0] - away[:, None] * normal, normal)
 
     @full_precision
     def valid(self, q: jax.Array) -> jax.Array:
-        """The least of the margins () [m], see the class; of many bodies it is not looked at."""
+        """The least margin (): >= 0 where the gap function holds at q, see the class.
+
+        In the plane margins are distances [m] of the centres of discs from each other and from
+        polygons, and `margin_of_places`. Many bodies, and bodies in space, have none of these.
+        """
         margin = super().valid(q)
         if self.room or self.dimension == 3:
             return margin
@@ -276,7 +289,7 @@ class Bodies(RigidBodies):
 
     @property
     def range_in_words(self) -> str:  # type: ignore[override]
-        """What `valid` asks for."""
+        """The condition `valid(q) >= 0` in words, for errors."""
         if self.dimension == 3:
             return super().range_in_words
         return "see `Bodies`: no centre of a disc in another body"
@@ -284,7 +297,10 @@ class Bodies(RigidBodies):
     def touching(
         self, angle: Any = 0.0, along: Any = 0.0, body: int = 0, plane: int = 0
     ) -> jax.Array:
-        """(x, y, theta) of one body on one plane, turned by `angle` from it, `along` it [m]."""
+        """(x, y, theta) of one body that touches one plane, turned by `angle` [rad] against it.
+
+        Its centre of mass is at the distance `along` [m] from the foot of the origin on the plane.
+        """
         if self.dimension == 3 or not len(self.planes):
             raise TypeError(
                 "Bodies in space or without planes have no `touching`: give `q` yourself, see `at`."
@@ -293,8 +309,9 @@ class Bodies(RigidBodies):
         check_choice("plane", plane, range(len(self.planes)))
         turn, distance = number("angle", angle), number("along", along)
         (n_x, n_y, offset) = self.planes[plane]
-        low = jnp.sin(turn) * self.points[body, :, 0] + jnp.cos(turn) * self.points[body, :, 1]
-        up = offset + self.rims[body] - jnp.min(low)
+        # heights of its points over the centre of mass, along the normal
+        heights = jnp.sin(turn) * self.points[body, :, 0] + jnp.cos(turn) * self.points[body, :, 1]
+        up = offset + self.rims[body] - jnp.min(heights)
         place = [n_y * distance + n_x * up, n_y * up - n_x * distance]
         return jnp.stack([*place, turn + jnp.arctan2(-n_x, n_y)])
 
@@ -302,7 +319,7 @@ class Bodies(RigidBodies):
 
     @property
     def pair_count(self) -> int | None:
-        """The contacts of every pair (i, j), in both orders, and every corner with every plane."""
+        """Number of contacts of pairs (i, j), in both orders, and of corners with planes."""
         return grid.slots(self) * self.count * grid.stride(self) if self.room else None
 
     @property
@@ -311,7 +328,7 @@ class Bodies(RigidBodies):
         return _OVERLAP * grid.least_radius(self) if self.room else 0.0
 
     def active_pairs(self, q: jax.Array, later: jax.Array, below: jax.Array) -> ActivePairs:
-        """The contacts, at q, with gaps up to `below` at q or `later`."""
+        """The contacts, at q, with gaps up to `below` () [m] at q or `later`."""
         return grid.active_pairs(self, q, later, below)
 
     def least_gap(self, q: jax.Array) -> jax.Array:
@@ -363,15 +380,15 @@ class Bodies(RigidBodies):
                 f"Argument `q` must hold at most {self.room} contacts (the argument `room` of "
                 "`Bodies`), but holds more."
             )
-        _, _, directions, scene = listed_pairs(pairs, self.mass)
-        if not directions[:, 0].any(axis=(1, 2)).all():
+        listed = listed_pairs(pairs, self.mass)
+        if not listed.directions[:, 0].any(axis=(1, 2)).all():
             raise ValueError("Argument `q` must hold bodies with different centres.")
-        return scene
+        return listed.scene
 
 
 @precise_jit
 def _active_pairs(bodies: Bodies, q: jax.Array, below: jax.Array) -> tuple[ActivePairs, jax.Array]:
-    """The contacts that are closed at q, and the least gap."""
+    """The contacts with gaps up to `below` () [m] at q, and the least gap () [m]."""
     return bodies.active_pairs(q, q, below), bodies.least_gap(q)
 
 
@@ -391,7 +408,7 @@ def _alike(inertias: Sequence[jax.Array]) -> list[jax.Array]:
 
 
 def _padded(bodies: Sequence[RigidBody]) -> list[Any]:
-    """Points (P, d) of each body, the last one repeated."""
+    """Points (P, d) [m] of each body, its last one repeated up to the largest number P."""
     most = max(body.points.shape[1] for body in bodies)
     pad = jnp if is_traced([body.points for body in bodies]) else np
     return [
@@ -401,7 +418,7 @@ def _padded(bodies: Sequence[RigidBody]) -> list[Any]:
 
 
 def _check_kinds(bodies: tuple[Any, ...], fixed: tuple[Any, ...]) -> None:
-    """Raise for what is no body with contact points, or of another dimension than the first one."""
+    """Raise a TypeError for entries without contact points, or of another dimension than others."""
     for name, some in (("bodies", bodies), ("fixed", fixed)):
         for body in some:
             kind = type(body).__name__
@@ -424,12 +441,20 @@ def _check_kinds(bodies: tuple[Any, ...], fixed: tuple[Any, ...]) -> None:
 
 def _as_pairs(
     every: tuple[RigidBody, ...],
-    shapes: Sequence[Any],
+    shapes: Sequence[Shape],
     moving: int,
     d: int,
     pairs: Sequence[Any] | None,
 ) -> tuple[tuple[int, int], ...]:
-    """Pairs of bodies that have a gap function, of which the first `moving` ones move."""
+    """Pairs (i, j) of bodies that have a gap function; raise a ValueError for others in `pairs`.
+
+    Args:
+        every: bodies, the first `moving` ones of which move, others are fixed.
+        shapes: their shapes.
+        moving: number of bodies that move.
+        d: 2 or 3, in the plane or in space.
+        pairs: the argument of `Bodies`; None: all pairs one of which moves.
+    """
     count = len(every)
     if pairs is None:
         ready = [i for i, shape in enumerate(shapes) if shape.faces or shape.is_round]

@@ -47,7 +47,7 @@ def numbered(names: Sequence[str], count: int) -> tuple[str, ...]:
 
 
 class Directions(NamedTuple):
-    """Gaps at one configuration, and along which velocities they and the bodies' slip change."""
+    """Gaps at one configuration, and gradients: `f' = N^T v`, slip velocities `H_t^T v`."""
 
     gaps: jax.Array  # f (m,)
     normals: jax.Array  # N (n, m)
@@ -75,7 +75,7 @@ class Body(eqx.Module):
 
     @property
     def coordinates(self) -> int | None:
-        """How many numbers q has; None: as many as there are velocities."""
+        """Number of coordinates in q; None: as many as there are velocities."""
         return None
 
     def gap_function(self, q: jax.Array) -> jax.Array:
@@ -97,7 +97,7 @@ class Body(eqx.Module):
         return self.moved(q, u)
 
     def rates(self, q: jax.Array, v: jax.Array) -> jax.Array:
-        """q' at velocities v (n,)."""
+        """q' at velocities v (n,): the derivative of `nearby(q, u)` in u, at 0, along v."""
         return jax.jvp(lambda u: self.nearby(q, u), (jnp.zeros_like(v),), (v,))[1]
 
     @property
@@ -120,13 +120,13 @@ class Body(eqx.Module):
         return self._gradient(self.tangent_function, q)
 
     def directions(self, q: jax.Array, with_tangents: bool = True) -> Directions:
-        """f, N and, `with_tangents`, H_t at q; a body with formulas finds them in one go."""
+        """f, N and, `with_tangents`, H_t at q; here by differentiation, see `has_formulas`."""
         tangents = self.tangents(q) if with_tangents else None
         return Directions(self.gap_function(q), self.normals(q), tangents)
 
     @property
     def has_formulas(self) -> bool:
-        """Whether `directions` needs no differentiation."""
+        """True if the body has its own `directions`, which need no differentiation."""
         return type(self).directions is not Body.directions
 
     def mass_matrix(self, q: jax.Array) -> jax.Array:
@@ -136,7 +136,7 @@ class Body(eqx.Module):
 
     @full_precision
     def inertial_force(self, q: jax.Array, v: jax.Array) -> jax.Array:
-        """What constant velocities take (n,) at q: `M v' = F + inertial_force`, Coriolis terms.
+        """Coriolis and centrifugal terms (n,) [N] of `M v' = F + inertial_force` at q and v.
 
         Equation: `grad(v^T M v) / 2 - M' v`, 0 for a constant M.
         """
@@ -152,18 +152,18 @@ class Body(eqx.Module):
         return 0.5 * jax.grad(lambda x: v @ momentum(x))(q) - change
 
     def pulled(self, q: jax.Array, gradient: jax.Array) -> jax.Array:
-        """Gradient in q as one in the displacements (n,): `(dq'/dv)^T gradient`."""
-        still = jnp.zeros(self.mass_matrix(q).shape[:1], q.dtype)
-        return jax.vjp(lambda u: self.nearby(q, u), still)[1](gradient)[0]
+        """A `gradient` in q as one in the displacements u (n,): `(dq/du)^T gradient` at u = 0."""
+        zero = jnp.zeros(self.mass_matrix(q).shape[:1], q.dtype)
+        return jax.vjp(lambda u: self.nearby(q, u), zero)[1](gradient)[0]
 
     def _gradient(self, function: Callable[[jax.Array], Any], q: jax.Array) -> jax.Array:
-        """(n, k) of a function q -> (k,), in the displacements; forward, as it may have loops."""
-        still = jnp.zeros(self.mass_matrix(q).shape[:1], q.dtype)
-        return jax.jacfwd(lambda u: function(self.nearby(q, u)))(still).T
+        """Gradients (n, k) of q -> (k,) in displacements u, at 0; forward mode allows loops."""
+        zero = jnp.zeros(self.mass_matrix(q).shape[:1], q.dtype)
+        return jax.jacfwd(lambda u: function(self.nearby(q, u)))(zero).T
 
     @property
     def pair_count(self) -> int | None:
-        """How many contacts `active_pairs` chooses from; None: time stepping takes all contacts."""
+        """Number of contacts that `active_pairs` chooses from; None: time stepping takes all."""
         return None
 
     @property
@@ -178,7 +178,7 @@ class Body(eqx.Module):
     def active_pairs(self, q: jax.Array, later: jax.Array, below: jax.Array) -> ActivePairs:
         """The contacts, at q, with gaps up to `below` [m] at q or `later`, for time stepping.
 
-        Of bodies with three velocities each in a plane, six in space, and a diagonal mass matrix.
+        Only for bodies with three velocities each in a plane, six in space, and a diagonal M.
         """
         raise NotImplementedError(f"{type(self).__name__} has no `pair_count`, no `active_pairs`.")
 
@@ -201,7 +201,7 @@ class Body(eqx.Module):
         raise TypeError(f"{type(self).__name__} has no outlines: give `outlines` yourself.")
 
     def outlines_by_body(self, q: np.ndarray, point: float) -> Sequence[Sequence[np.ndarray]]:
-        """The outlines of each body, for its colour; here each outline is a body.
+        """Curves (k, 2) [m] of each body, drawn in one colour; here each curve of `outlines` alone.
 
         Args:
             q: configuration (n,).
@@ -246,19 +246,20 @@ class Body(eqx.Module):
         size = mass.shape[:1] if self.coordinates is None else (self.coordinates,)
         check_shape("q", q, size, "one per coordinate of the body")
         check_values("q", q)
-        mass, normals, tangents, f, margin = self._parts(q)
+        parts = self._parts(q)
+        f = parts.gaps
         if f.ndim != 1 or f.size == 0:
             raise ValueError(
                 "Argument `gap_function` must return shape (m,), a gap for each of m >= 1 contacts "
                 f"of {type(self).__name__}, but it returns {f.shape}."
             )
-        check_range("q", self, margin)
+        check_range("q", self, parts.margin)
         noise = precision(f.dtype).noise * jnp.maximum(1.0, jnp.abs(q).max())
-        none = jnp.maximum(closed_below, noise)
-        check_penetration("q", f, none)
-        gaps = jnp.where(f <= none.astype(f.dtype), 0.0, f)  # NaN stays
-        parts = (mass, normals, tangents, gaps)
-        return Scene(*jax.tree.map(lambda x: x.astype(f.dtype), parts))
+        largest = jnp.maximum(closed_below, noise)  # gap that counts as closed
+        check_penetration("q", f, largest)
+        gaps = jnp.where(f <= largest.astype(f.dtype), 0.0, f)  # NaN stays
+        fields = (parts.mass, parts.normals, parts.tangents, gaps)
+        return Scene(*jax.tree.map(lambda x: x.astype(f.dtype), fields))
 
     def scenes(self, q: Any, near: float = CLOSED_BELOW) -> list[Scene]:
         """Scenes at measured configurations q (K, d): the contacts that touch, no others.
@@ -283,33 +284,38 @@ class Body(eqx.Module):
         check_shape("q", q, (len(q), d), "a configuration a row")
         check_values("q", q)
         check_values("near", near, low=0.0)
-        each = jax.tree.map(np.asarray, _many_parts(self, q))
-        masses, normals, tangents, gaps, margins = each
-        for k, margin in enumerate(margins):
+        each = jax.tree.map(np.asarray, _many_parts(self, q))  # rows: configurations
+        for k, margin in enumerate(each.margin):
             check_range("q", self, margin, f" in row {k + 1}")
-        scenes, count = [], gaps.shape[1]
+        scenes, gaps, tangents = [], each.gaps, each.tangents
         for k, closed in enumerate(gaps <= gaps.min(axis=1, keepdims=True) + near):
             closed_tangents = None
             if tangents is not None:
-                columns = np.repeat(closed, tangents.shape[2] // count)
+                columns = np.repeat(closed, tangents.shape[2] // gaps.shape[1])
                 closed_tangents = tangents[k][:, columns]
-            scenes.append(Scene(masses[k], normals[k][:, closed], closed_tangents))
+            scenes.append(Scene(each.mass[k], each.normals[k][:, closed], closed_tangents))
         return scenes
 
     def _parts(self, q: jax.Array) -> "Parts":
-        """What a scene at q needs, by a compiled program."""
+        """Mass, normals, tangents and gaps at q, by a compiled program."""
         return _compiled_parts(self, q)
 
 
-# mass, normals, tangents, gaps, margin of their range
-Parts = tuple[jax.Array, jax.Array, jax.Array | None, jax.Array, jax.Array]
+class Parts(NamedTuple):
+    """The arrays of a body's scene at q (d,); in a batch (K, ...)."""
+
+    mass: jax.Array  # M (n,) or (n, n)
+    normals: jax.Array  # N (n, m)
+    tangents: jax.Array | None  # H_t (n, m), in space (n, 2 m)
+    gaps: jax.Array  # f (m,) [m]
+    margin: jax.Array  # (), negative out of the range of the gap function
 
 
 def parts_at(body: Body, q: jax.Array) -> Parts:
-    """What a scene at q needs; normals are NaN out of the range of the gap function."""
+    """M, N, H_t, f and its margin at q; N is NaN out of the range of the gap function."""
     margin, (gaps, normals, tangents) = body.valid(q), body.directions(q)
     normals = jnp.where(margin >= 0, normals, jnp.nan)
-    return body.mass_matrix(q), normals, tangents, gaps, margin
+    return Parts(body.mass_matrix(q), normals, tangents, gaps, margin)
 
 
 @quick_jit
@@ -325,7 +331,7 @@ def _many_parts(body: Body, q: jax.Array) -> Parts:
 
 
 def check_range(name: str, body: Body, margin: Any, where: str = "") -> None:
-    """Raise where the margin () of the range of the gap function is negative."""
+    """Raise a ValueError where `margin` (), that is `body.valid` of the argument, is negative."""
     if not is_traced(margin) and not float(margin) >= 0:
         raise ValueError(
             f"Argument `{name}` must be in the range of the gap function ({body.range_in_words}), "
@@ -334,7 +340,7 @@ def check_range(name: str, body: Body, margin: Any, where: str = "") -> None:
 
 
 def check_penetration(name: str, f: jax.Array, closed_below: jax.Array) -> None:
-    """Raise unless all gaps f (m,) are at least `-closed_below` [m]."""
+    """Raise a ValueError of argument `name` unless all gaps f (m,) are >= `-closed_below` [m]."""
     if is_traced((f, closed_below)) or (np.asarray(f) >= -np.asarray(closed_below)).all():
         return
     worst = int(np.argmin(f))
@@ -345,7 +351,7 @@ def check_penetration(name: str, f: jax.Array, closed_below: jax.Array) -> None:
 
 
 class LinearPotential(eqx.Module):
-    """`V = w^T q`: constant forces -w."""
+    """Potential `V = w^T q` [J] of constant forces -w (n,) [N]."""
 
     weights: jax.Array
 
@@ -356,19 +362,22 @@ class LinearPotential(eqx.Module):
 
 
 def positive(name: str, value: Any, low_allowed: bool = False) -> jax.Array:
-    """A scalar > 0, or >= 0 where `low_allowed`."""
+    """The argument `name` as a scalar > 0, or >= 0 where `low_allowed`; else raise a ValueError."""
     return as_numbers(name, value, (), "one number", low=0.0, open_low=not low_allowed)
 
 
 def number(name: str, value: Any) -> jax.Array:
-    """A finite scalar."""
+    """The argument `name` as a finite scalar; else raise a ValueError."""
     return as_numbers(name, value, (), "one number")
 
 
 def positives(
     name: str, value: Any, count: int | None = None, low_allowed: bool = False
 ) -> jax.Array:
-    """Numbers (count,) > 0, or >= 0 where `low_allowed`; a scalar stands for all of them."""
+    """The argument `name` as numbers (count,) > 0, or >= 0 where `low_allowed`.
+
+    A scalar stands for all of them; `count` None: as many as are given.
+    """
     numbers = as_float_array(name, value)
     if count is not None and numbers.ndim == 0:
         numbers = jnp.full(count, numbers)
@@ -403,7 +412,7 @@ def as_planes(planes: Any, dimension: int) -> jax.Array:
 
 
 def lengths(vectors: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Lengths (..) and unit vectors of vectors (.., d); one of length 0 has no direction."""
+    """Lengths (..) and unit vectors (.., d) of vectors (.., d); of one of length 0 these are 0."""
     square = dot(vectors, vectors)
     length = jnp.sqrt(jnp.where(square > 0, square, 1.0))
     return jnp.where(square > 0, length, 0.0), vectors / length[..., None]

@@ -1,7 +1,7 @@
-"""The closed contacts of many bodies: in the first of so many rows, computed in blocks."""
+"""The closed contacts of many bodies: the first rows of arrays of fixed length, in blocks."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -13,15 +13,20 @@ from jimpact.core.scene import Scene, sparse_scene
 # Ten times more: few contacts among many bodies take as long as all of them.
 BLOCK = 128
 
+Carry = TypeVar("Carry")
 
-def over_blocks(count: Any, one: Callable[[Any, Any], Any], start: Any) -> Any:
-    """`start` carried by `one(first_row, carry)` through the blocks that hold `count` () rows."""
+
+def over_blocks(count: jax.Array, one: Callable[[jax.Array, Carry], Carry], start: Carry) -> Carry:
+    """Result of a loop over blocks of `BLOCK` rows, as many as hold the first `count` () rows.
+
+    Equation: `carry = one(first_row, carry)` for each block, from `carry = start` on.
+    """
     blocks = (count + BLOCK - 1) // BLOCK
     return jax.lax.fori_loop(jnp.int32(0), blocks, lambda i, carry: one(i * BLOCK, carry), start)
 
 
 def block(x: jax.Array, row: jax.Array) -> jax.Array:
-    """The rows of x (K, ...) from this one that are computed at once."""
+    """The `BLOCK` rows of x (K, ...) from this one on."""
     return jax.lax.dynamic_slice_in_dim(x, row, BLOCK)
 
 
@@ -38,7 +43,7 @@ class ActivePairs(NamedTuple):
 
     number: jax.Array  # (K,) of the contact among all of them; `pair_count` in unused rows
     closed: jax.Array  # (K,) whether the row is used
-    filled: jax.Array  # () how many are
+    filled: jax.Array  # () number of rows that are used
     bodies: jax.Array  # (K, 2); the number of bodies stands for a wall
     # (K, d, 2, velocities): normal and tangents, of both bodies, by the velocities of each: x, y
     # and turn in a plane, x, y, z and three turns in space
@@ -47,26 +52,34 @@ class ActivePairs(NamedTuple):
     reach: jax.Array  # () [m]: bodies that move farther in one step may pass each other
 
 
-def listed_pairs(pairs: ActivePairs, mass: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, Scene]:
-    """On the host: rows (m,) in order, bodies (m, 2) with -1 for walls, directions, the scene.
+class ListedPairs(NamedTuple):
+    """The m closed contacts of many bodies on the host: those of two bodies first, then walls."""
 
-    Contacts of two bodies come first; `mass` (n,). Walls do not move: their directions are 0.
-    """
-    size = pairs.directions.shape[3]
-    bodies = np.where(pairs.bodies == len(mass) // size, -1, pairs.bodies)[: int(pairs.filled)]
+    rows: np.ndarray  # (m,) of `ActivePairs`
+    bodies: np.ndarray  # (m, 2), -1 for a wall
+    directions: np.ndarray  # (m, d, 2, velocities) as of `ActivePairs`, 0 for a wall
+    scene: Scene  # the contacts without friction
+
+
+def listed_pairs(pairs: ActivePairs, mass: jax.Array) -> ListedPairs:
+    """The closed contacts of bodies with masses (n,), on the host and in order, as a scene."""
+    velocities = pairs.directions.shape[3]  # of a body
+    count = len(mass) // velocities
+    bodies = np.where(pairs.bodies == count, -1, pairs.bodies)[: int(pairs.filled)]
     order = np.lexsort((pairs.number[: len(bodies)], bodies[:, 1] < 0))
     bodies, directions = bodies[order], np.array(pairs.directions)[order]
-    directions[:, :, 1] *= (bodies[:, 1] >= 0)[:, None, None]
-    scene = sparse_scene(mass, jnp.asarray(directions[:, 0]), bodies, len(mass) // size)
-    return order, bodies, directions, scene
+    directions[:, :, 1] *= (bodies[:, 1] >= 0)[:, None, None]  # walls do not move
+    scene = sparse_scene(mass, jnp.asarray(directions[:, 0]), bodies, count)
+    return ListedPairs(order, bodies, directions, scene)
 
 
 def chosen_rows(
     so_far: jax.Array, first: jax.Array, count: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Of the next block of `count` () rows: which are used, and where they are found (BLOCK,).
+    """True (BLOCK,) for the rows from `first` on that are below `count` (), and their candidates.
 
-    `so_far` (C,) is how many have been found up to each place.
+    Equation: row k holds candidate `min {c: so_far_c = k + 1}` (BLOCK,), where `so_far` (C,) is the
+    number of chosen ones among the candidates 0 to c.
     """
     row = first + np.arange(BLOCK, dtype=np.int32)
     place = jnp.minimum(jnp.searchsorted(so_far, row + 1), so_far.size - 1)

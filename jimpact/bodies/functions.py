@@ -13,13 +13,20 @@ from jimpact.tools.compiling import full_precision
 
 
 class FunctionBody(Body):
-    """A body given by functions, see `System` and `scene_from_gaps`."""
+    """A body given by functions of its configuration q (n,), see `System` and `scene_from_gaps`.
+
+    Args:
+        gap_function: q -> gaps f(q) (m,) [m].
+        mass: M (n,), its diagonal, or (n, n), or a function q -> M(q).
+        tangent_function: q -> displacements (m,) [m] along the contact planes; None: no friction.
+    """
 
     gaps: Callable[[jax.Array], jax.Array]
     mass_argument: Any
     sliding: Callable[[jax.Array], jax.Array | None] | None
 
     def __init__(self, gap_function: Any, mass: Any, tangent_function: Any = None):
+        """Keep the functions; raise a TypeError for what is no function, check a constant mass."""
         for name, function in (
             ("gap_function", gap_function),
             ("tangent_function", tangent_function),
@@ -36,7 +43,7 @@ class FunctionBody(Body):
 
     @property
     def functions(self) -> tuple[Any, ...]:
-        """The gaps, the displacements and the mass."""
+        """The functions of the gaps and of the displacements, and the mass."""
         return self.gaps, self.sliding, self.mass_argument
 
     @property
@@ -54,7 +61,7 @@ class FunctionBody(Body):
         return None if displacements is None else jnp.atleast_1d(displacements)
 
     def _parts(self, q: jax.Array) -> Parts:
-        """What a scene at q needs."""
+        """Mass, normals, tangents and gaps at q, not compiled."""
         return parts_at(self, q)  # each new lambda would be compiled anew
 
 

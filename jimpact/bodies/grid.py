@@ -1,6 +1,6 @@
-"""The closed contacts of many bodies: a grid finds those that are near each other."""
+"""The closed contacts of many bodies, found among the pairs that a grid of cells says are near."""
 
-from typing import Any, Protocol
+from typing import NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -29,9 +29,11 @@ NEAR = 8
 # hold twenty times more bodies.
 MARGIN = 0.5
 
+_Arrays = tuple[jax.Array, ...]
+
 
 class Pile(Protocol):
-    """What the grid asks of `Bodies`, see there and `RigidBodies`: b bodies, w planes."""
+    """Members of `Bodies` (see there and `RigidBodies`) that the grid uses: b bodies, w planes."""
 
     @property
     def points(self) -> jax.Array:
@@ -55,7 +57,7 @@ class Pile(Protocol):
 
     @property
     def crowd(self) -> int:
-        """Bodies in a cell at most."""
+        """Most bodies in a row of three cells, see `near_pairs`; 0: every pair is looked at."""
 
     @property
     def count(self) -> int:
@@ -73,33 +75,40 @@ class Pile(Protocol):
         """q (n,) by body (b, ..)."""
 
     def placed(self, q: jax.Array) -> Placed:
-        """Turns and points in space."""
+        """Rotation matrices, and points in space, of all bodies."""
 
     def placed_at(self, at: jax.Array, points: jax.Array) -> Placed:
-        """The same of some bodies."""
+        """The same of bodies at coordinates (b, ..), with these points (b, P, d)."""
 
-    def contact_jacobian(self, at: jax.Array, point: jax.Array, ways: jax.Array) -> jax.Array:
-        """Rows of velocities of points along directions."""
+    def contact_jacobian(self, at: jax.Array, point: jax.Array, directions: jax.Array) -> jax.Array:
+        """Velocities of points along directions, by the velocities of their bodies."""
 
 
 def slots(bodies: Pile) -> int:
-    """Contacts of a pair: at both ends of the sides of polygons that face each other."""
+    """Contacts of a pair of bodies: 1 of discs or spheres; 2 of polygons, the ends of a side."""
     return min(2, bodies.points.shape[1])
 
 
 def stride(bodies: Pile) -> int:
-    """Partners of a body: the others, and each plane once for each corner."""
+    """Partners b + w P of a body, by which contacts are numbered: bodies, then planes x points."""
     return bodies.count + len(bodies.planes) * bodies.points.shape[1]
 
 
 def outer_radii(bodies: Pile) -> jax.Array:
-    """Radii (b,) of discs or balls about the centres of mass, around the bodies."""
+    """Radii (b,) [m] of discs or balls about the centres of mass that enclose the bodies.
+
+    Equation: `R = max |c| + r`, c the points of a body, r its rim.
+    """
     far = jnp.sqrt(jnp.max(jnp.sum(bodies.points**2, axis=2), axis=1))
     return far + bodies.rims
 
 
 def least_radius(bodies: Pile) -> jax.Array:
-    """The least radius () of a disc or ball about a centre of mass, within its body."""
+    """The least radius () [m] of a disc or ball about a centre of mass, within its body.
+
+    Equation: `r - |c|` of a round body of radius r about its point c, of a polygon the distance of
+    its nearest side.
+    """
     far = jnp.sqrt(jnp.sum(bodies.points[:, 0] ** 2, axis=1))
     if slots(bodies) == 1:
         return jnp.min(bodies.rims - far)
@@ -108,17 +117,17 @@ def least_radius(bodies: Pile) -> jax.Array:
 
 
 def crowd_of_cells(bodies: Pile) -> int:
-    """How many bodies a row of cells may hold; 0 where looking at every pair is less work."""
+    """Most bodies in a row of three cells; 0: radii are traced, or all pairs are less work."""
     if is_traced((bodies.points, bodies.rims)):
         return 0
     least, largest = float(least_radius(bodies)), float(outer_radii(bodies).max())
     crowd = crowd_of(least, largest + 0.5 * MARGIN * least, bodies.dimension)
-    rows = (3 ** (bodies.dimension - 1) + 1) // 2
+    rows = (3 ** (bodies.dimension - 1) + 1) // 2  # of cells in which a body looks for partners
     return crowd if 2 * rows * crowd < bodies.count else 0
 
 
-def _circle_gaps(bodies: Pile, q: jax.Array, i: Any, j: Any) -> jax.Array:
-    """Gaps (C,) of the discs or balls around these bodies."""
+def _circle_gaps(bodies: Pile, q: jax.Array, i: jax.Array, j: jax.Array) -> jax.Array:
+    """Gaps `|x_i - x_j| - R_i - R_j` (C,) [m] of the discs or balls around bodies i, j (C,)."""
     columns = bodies.of_bodies(q)[:, : bodies.dimension].T  # one by one: five times faster
     squares = sum((x[i] - x[j]) ** 2 for x in columns)
     radii = outer_radii(bodies)
@@ -127,7 +136,7 @@ def _circle_gaps(bodies: Pile, q: jax.Array, i: Any, j: Any) -> jax.Array:
 
 @full_precision
 def _plane_gaps(bodies: Pile, q: jax.Array) -> jax.Array:
-    """Gaps (b, w, P) of all corners; infinite of those that only fill a row."""
+    """Gaps `n . x - c - r` (b, w, P) [m] of all points x with all planes; infinite of padding."""
     n, offset = bodies.planes[:, :-1], bodies.planes[:, -1]
     height = jnp.sum(bodies.placed(q).points[:, None] * n[None, :, None], axis=3)
     gap = height - offset[None, :, None] - bodies.rims[:, None, None]
@@ -137,15 +146,18 @@ def _plane_gaps(bodies: Pile, q: jax.Array) -> jax.Array:
 
 
 def _candidates(bodies: Pile, q: jax.Array, margin: jax.Array) -> Candidates:
-    """Pairs of bodies, all those with gaps up to `margin` among them."""
+    """Candidates for contact: all pairs of bodies with gaps up to `margin` [m] at q, and others."""
     if bodies.crowd == 0:
         return all_pairs(bodies.count)
     distance = 2 * jnp.max(outer_radii(bodies)) + margin
     return near_pairs(bodies.of_bodies(q)[:, : bodies.dimension], distance, bodies.crowd)
 
 
-def _of_pairs(bodies: Pile, at: jax.Array, i: Any, j: Any) -> ContactPoints:
-    """Contacts of pairs (g,): gaps (g, slots), points (g, slots, d), normals towards i."""
+def _pair_contacts(bodies: Pile, at: jax.Array, i: jax.Array, j: jax.Array) -> ContactPoints:
+    """Contacts of bodies i and j (g,), k = `slots` a pair: gaps (g, k), points (g, k, d), normals.
+
+    `at` (b, ..) are the coordinates of all bodies; normals are towards body i.
+    """
     a, b = (bodies.placed_at(at[x], bodies.points[x]).points for x in (i, j))
     r, s = bodies.rims[i], bodies.rims[j]
     if slots(bodies) > 1:
@@ -154,84 +166,99 @@ def _of_pairs(bodies: Pile, at: jax.Array, i: Any, j: Any) -> ContactPoints:
 
 
 def least_gap(bodies: Pile, q: jax.Array) -> jax.Array:
-    """The least gap () [m]; of bodies that are near each other if there are any."""
+    """The least gap () [m] of all contacts at q.
+
+    If bodies near each other, or planes, have one up to `MARGIN` of the least radius, no other pair
+    can have less; else all pairs are tested.
+    """
     others = jnp.asarray(np.arange(bodies.count, dtype=np.int32))
     to_planes = jnp.min(_plane_gaps(bodies, q), initial=jnp.inf)
     at = bodies.of_bodies(q)
 
-    def of_all() -> jax.Array:
-        """Body by body, so that no table holds all pairs."""
+    def of_all_pairs() -> jax.Array:
+        """The least gap () of all pairs and planes, body by body: no table holds all pairs."""
 
         def with_one(i: jax.Array, least: jax.Array) -> jax.Array:
-            gaps = _of_pairs(bodies, at, jnp.full_like(others, i), others).gap
-            alone = (others == i)[:, None]
-            return jnp.minimum(least, jnp.min(jnp.where(alone, jnp.inf, gaps)))
+            """The least gap () with those of body i and every other one."""
+            gaps = _pair_contacts(bodies, at, jnp.full_like(others, i), others).gap
+            itself = (others == i)[:, None]
+            return jnp.minimum(least, jnp.min(jnp.where(itself, jnp.inf, gaps)))
 
         return jax.lax.fori_loop(jnp.int32(0), jnp.int32(bodies.count), with_one, to_planes)
 
     if bodies.crowd == 0:
-        return of_all()
+        return of_all_pairs()
     margin = MARGIN * least_radius(bodies)
-    _, _, gaps, overflows = _near_gaps(bodies, q, q, margin)
-    least = jnp.minimum(jnp.min(gaps, initial=jnp.inf), to_planes)
-    return jax.lax.cond((least <= margin) & ~overflows, lambda: least, of_all)
+    near = _near_gaps(bodies, q, q, margin)
+    least = jnp.minimum(jnp.min(near.gaps, initial=jnp.inf), to_planes)
+    return jax.lax.cond((least <= margin) & ~near.overflows, lambda: least, of_all_pairs)
 
 
-def _near_gaps(
-    bodies: Pile, q: jax.Array, later: jax.Array, below: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Bodies i and j (C,), the least gaps (C, slots) at q or `later`, and whether some miss.
+class _NearGaps(NamedTuple):
+    """Pairs of bodies that may be in contact, and their least gaps at one of two configurations."""
 
-    Among them are all pairs with gaps up to `below`.
+    first: jax.Array  # (C,) body i
+    second: jax.Array  # (C,) body j
+    gaps: jax.Array  # (C, slots) [m], infinite in unused rows
+    overflows: jax.Array  # () whether pairs are missing
+
+
+def _near_gaps(bodies: Pile, q: jax.Array, later: jax.Array, below: jax.Array) -> _NearGaps:
+    """All pairs of bodies with gaps up to `below` () [m] at q or at `later`, and others.
+
+    Pairs from the grid are tested by the discs or balls around them; those of polygons that pass
+    get the gaps of their sides, the least one at q and at `later`.
     """
-    way = jnp.abs(bodies.of_bodies(later - q)[:, : bodies.dimension])
-    # each moves by half of its way from the middle; what moves farther is a `coarse_step`
-    farther = jnp.minimum(jnp.max(jnp.sum(way, axis=1)), MARGIN * least_radius(bodies))
+    displacement = jnp.abs(bodies.of_bodies(later - q)[:, : bodies.dimension])
+    # two bodies move by half of theirs from (q + later) / 2; larger ones are a `coarse_step`
+    farther = jnp.minimum(jnp.max(jnp.sum(displacement, axis=1)), MARGIN * least_radius(bodies))
     near = _candidates(bodies, 0.5 * (q + later), below + farther)
     circles = [_circle_gaps(bodies, x, near.first, near.second) for x in (q, later)]
     gaps = jnp.where(near.used, jnp.minimum(*circles), jnp.inf)
     if all(shape.centred for shape in bodies.shapes):
-        return near.first, near.second, gaps[:, None], near.overflows
-    so_far = jnp.cumsum(gaps <= below, dtype=jnp.int32)
-    rows = -(-NEAR * bodies.count // BLOCK) * BLOCK
+        return _NearGaps(near.first, near.second, gaps[:, None], near.overflows)
+    so_far = jnp.cumsum(gaps <= below, dtype=jnp.int32)  # pairs among the candidates 0 to c
+    rows = -(-NEAR * bodies.count // BLOCK) * BLOCK  # rounded up to whole blocks
     count = jnp.minimum(so_far[-1], rows)
-    at = jnp.stack([bodies.of_bodies(x) for x in (q, later)])
+    at = jnp.stack([bodies.of_bodies(x) for x in (q, later)])  # (2, b, ..)
 
-    def one(first: jax.Array, filled: Any) -> Any:
-        """The next pairs."""
+    def fill_block(first: jax.Array, filled: _Arrays) -> _Arrays:
+        """The arrays i, j, gaps with the rows of the block from row `first` on."""
         used, place = chosen_rows(so_far, first, count)
         i, j = (jnp.where(used, x[place], 0) for x in (near.first, near.second))
-        both = jax.vmap(lambda at: _of_pairs(bodies, at, i, j).gap)(at)
+        both = jax.vmap(lambda at: _pair_contacts(bodies, at, i, j).gap)(at)
         new = i, j, jnp.where(used[:, None], jnp.min(both, axis=0), jnp.inf)
         return tuple(with_block(x, part, first) for x, part in zip(filled, new))
 
     none = jnp.zeros(rows, jnp.int32)
-    start = none, none, jnp.full((rows, slots(bodies)), jnp.inf, q.dtype)
-    i, j, gaps = over_blocks(count, one, start)
-    return i, j, gaps, near.overflows | (so_far[-1] > rows)
+    start: _Arrays = none, none, jnp.full((rows, slots(bodies)), jnp.inf, q.dtype)
+    i, j, gaps = over_blocks(count, fill_block, start)
+    return _NearGaps(i, j, gaps, near.overflows | (so_far[-1] > rows))
 
 
 def _closed(
     bodies: Pile, q: jax.Array, later: jax.Array, below: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Numbers of contacts (C,), which of them are closed, and whether some are missing.
+    """Numbers (C,) of contacts, True (C,) for those that are closed, and whether some are missing.
 
-    A contact is closed whose gap is at most `below` at q or `later`.
+    A contact is closed whose gap is at most `below` () [m] at q or `later`. Its number is
+    `slots (i stride + partner) + slot`, partner j of body i, or b + corner of each plane in turn.
     """
-    i, j, gaps, overflows = _near_gaps(bodies, q, later, below)
+    near = _near_gaps(bodies, q, later, below)
     to_planes = jnp.minimum(_plane_gaps(bodies, q), _plane_gaps(bodies, later)).reshape(-1)
     count, partners = slots(bodies), stride(bodies)
     slot = np.arange(count, dtype=np.int32)[None]
-    number = count * (i * partners + j)[:, None] + slot
+    of_pairs = count * (near.first * partners + near.second)[:, None] + slot
     partner = np.arange(bodies.count, partners, dtype=np.int32)
     body = np.arange(bodies.count, dtype=np.int32)[:, None]
     at_planes = (count * (body * partners + partner)).reshape(-1)
-    numbers = jnp.concatenate([number.reshape(-1), at_planes])
-    return numbers, jnp.concatenate([gaps.reshape(-1), to_planes]) <= below, overflows
+    numbers = jnp.concatenate([of_pairs.reshape(-1), at_planes])
+    closed = jnp.concatenate([near.gaps.reshape(-1), to_planes]) <= below
+    return numbers, closed, near.overflows
 
 
 def active_pairs(bodies: Pile, q: jax.Array, later: jax.Array, below: jax.Array) -> ActivePairs:
-    """The contacts whose gap is at most `below` at the coordinates q, or `later` at a step's end.
+    """The contacts with a gap up to `below` () [m] at coordinates q, or `later` at a step's end.
 
     Of all candidates the closed ones get the rows 0, 1, .. of arrays of fixed length, `bodies.room`
     rounded up to blocks, in the order of their numbers. Rows that are not used are 0, and have the
@@ -245,8 +272,8 @@ def active_pairs(bodies: Pile, q: jax.Array, later: jax.Array, below: jax.Array)
     d = bodies.dimension
     no_contact = jnp.int32(slots(bodies) * bodies.count * stride(bodies))  # above all numbers
 
-    def fill_block(first: jax.Array, filled: Any) -> Any:
-        """The arrays with the rows from `first` on, as many as a block has."""
+    def fill_block(first: jax.Array, filled: _Arrays) -> _Arrays:
+        """The numbers, bodies and directions with the rows of the block from row `first` on."""
         used, chosen = chosen_rows(closed_up_to, first, count)
         chosen = jnp.where(used, numbers[chosen], 0)
         i, j, directions = _of_contacts(bodies, q, chosen)
@@ -257,7 +284,7 @@ def active_pairs(bodies: Pile, q: jax.Array, later: jax.Array, below: jax.Array)
         )
         return tuple(with_block(x, part, first) for x, part in zip(filled, new))
 
-    start = (
+    start: _Arrays = (
         jnp.full(rows, no_contact, jnp.int32),
         jnp.zeros((rows, 2), jnp.int32),
         jnp.zeros((rows, d, 2, d + bodies.angular), q.dtype),
@@ -277,12 +304,15 @@ def active_pairs(bodies: Pile, q: jax.Array, later: jax.Array, below: jax.Array)
 def _of_contacts(
     bodies: Pile, q: jax.Array, number: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Bodies i and j (K,) of contacts of these numbers, j = `count` for planes; directions."""
+    """Bodies i and j (K,) of the contacts of these numbers (K,), and their directions, at q.
+
+    j is the number of bodies for a plane; directions (K, d, 2, velocities) as of `ActivePairs`.
+    """
     pair, slot = jnp.divmod(number, jnp.int32(slots(bodies)))
-    i, partner = jnp.divmod(pair, jnp.int32(stride(bodies)))
+    i, partner = jnp.divmod(pair, jnp.int32(stride(bodies)))  # see `_closed`
     other, row = jnp.minimum(partner, bodies.count - 1), np.arange(len(number))
     at = bodies.of_bodies(q)
-    _, points, normals = _of_pairs(bodies, at, i, other)
+    _, points, normals = _pair_contacts(bodies, at, i, other)
     point, n = points[row, slot], normals[row, slot]
     if len(bodies.planes):
         on_plane = (partner >= bodies.count)[:, None]
@@ -293,7 +323,7 @@ def _of_contacts(
         corners = bodies.placed_at(at[i], bodies.points[i]).points
         lowest = corners[row, corner] - bodies.rims[i][:, None] * n
         point = jnp.where(on_plane, lowest, point)
-    ways = jnp.concatenate([n[:, None], tangents_of(n)], axis=1)
+    along = jnp.concatenate([n[:, None], tangents_of(n)], axis=1)
     jacobian = bodies.contact_jacobian
-    sides = jacobian(at[i], point, ways), -jacobian(at[other], point, ways)
-    return i, jnp.minimum(partner, bodies.count), jnp.stack(sides, axis=2)
+    of_both = jacobian(at[i], point, along), -jacobian(at[other], point, along)
+    return i, jnp.minimum(partner, bodies.count), jnp.stack(of_both, axis=2)

@@ -81,13 +81,15 @@ class MujocoScene(NamedTuple):
     names: tuple[str, ...]
 
     def __str__(self) -> str:
-        """A row for each contact: its gap, how fast it opens, its friction."""
+        """A table with a row for each contact: gap f [m], gap velocity gamma [m/s], friction mu."""
         scene, gamma = self.scene, gap_velocity(self.scene, self.velocity)
         zeros = np.zeros(scene.contacts)
         gaps = zeros if scene.gaps is None else np.asarray(scene.gaps)
         friction = [None] * len(zeros) if self.friction is None else self.friction.tolist()
         columns = (
-            *(Column("contact"), Column("geoms"), Column("gap_m", ".3g", "gap", "m")),
+            Column("contact"),
+            Column("geoms"),
+            Column("gap_m", ".3g", "gap", "m"),
             Column("gap_velocity_m_per_s", ".4g", "gap velocity", "m/s"),
             Column("friction", ".3g"),
         )
@@ -207,14 +209,14 @@ def from_mujoco(model: Any, data: Any, margin: float = 0.0) -> MujocoScene:
 
 
 def _grow_bounding_volumes(model: Any, by: float) -> None:
-    """Make spheres and boxes, by which pairs that may touch are found, larger by this [m]."""
+    """Enlarge, by a length [m], spheres and boxes by which MuJoCo finds pairs that may touch."""
     model.geom_rbound += by * (model.geom_rbound > 0)  # 0 means without bound
     for boxes in (model.geom_aabb, model.bvh_aabb):
         boxes[:, 3:] += by  # their half sizes
 
 
 def _mass(mujoco: ModuleType, model: Any, data: Any) -> np.ndarray:
-    """M (n, n); `mj_fullM` takes other arguments in each version of MuJoCo."""
+    """Mass matrix M (n, n), column by column: arguments of `mj_fullM` differ among versions."""
     columns = np.eye(model.nv)
     mass = np.empty_like(columns)
     for column, product in zip(columns, mass):
@@ -223,8 +225,11 @@ def _mass(mujoco: ModuleType, model: Any, data: Any) -> np.ndarray:
 
 
 def _contacts(mujoco: ModuleType, model: Any, data: Any) -> tuple[list[Any], np.ndarray]:
-    """The contacts, and for each the velocities n, t1, t2 of its second body as seen from the first
-    one, by qvel: (m, 3, n)."""
+    """MuJoCo's contacts that can open or close (m), and Jacobians (m, 3, n) of their velocities.
+
+    Equation: `(v_n, v_t1, v_t2) = F (J2 - J1) qvel`, the velocity of the second body's contact
+    point relative to the first body's; rows of F are the contact frame n, t1, t2, n towards body 2.
+    """
     contacts: list[Any] = []
     jacobians = [np.zeros((0, 3, model.nv))]
     for contact in data.contact:
@@ -246,7 +251,7 @@ def _contacts(mujoco: ModuleType, model: Any, data: Any) -> tuple[list[Any], np.
 def _point_jacobian(
     mujoco: ModuleType, model: Any, data: Any, contact: Any, geom: int
 ) -> np.ndarray:
-    """The velocity (3, n) of the point of a geom's body at the contact, by qvel."""
+    """Jacobian J (3, n): `J qvel` is the velocity of the point of a geom's body at the contact."""
     jacobian = np.zeros((3, model.nv))
     body = int(model.geom_bodyid[geom])
     mujoco.mj_jac(model, data, jacobian, None, contact.pos, body)
@@ -254,11 +259,12 @@ def _point_jacobian(
 
 
 def _tangents(root: np.ndarray, jacobians: np.ndarray) -> np.ndarray | None:
-    """Tangents (n, 2 m), or (n, m) where each contact slides along one line, or None.
+    """Tangents H (n, 2 m), or (n, m) where each contact slides along one line, or None where none.
 
-    `jacobians` (m, 2, n) are of t1, t2; `root` is the lower root of the mass matrix.
+    Equation: contact j slides along the eigenvectors of its mobility `J_j M^-1 J_j^T` (2, 2) with
+    an eigenvalue that is not 0; `jacobians` J (m, 2, n) of (v_t1, v_t2); `root` L, `M = L L^T`.
     """
-    scaled = np.linalg.solve(root, np.swapaxes(jacobians, 1, 2))  # (m, n, 2)
+    scaled = np.linalg.solve(root, np.swapaxes(jacobians, 1, 2))  # L^-1 J^T (m, n, 2)
     mobility, directions = np.linalg.eigh(np.swapaxes(scaled, 1, 2) @ scaled)  # increasing
     least = _IMMOBILE * mobility.max()
     if not (mobility[:, 1] > least).any():
@@ -269,7 +275,10 @@ def _tangents(root: np.ndarray, jacobians: np.ndarray) -> np.ndarray | None:
 
 
 def _friction(contacts: list[Any], names: tuple[str, ...]) -> np.ndarray:
-    """mu (m,), with one warning for each thing that sliding friction leaves out."""
+    """Sliding friction mu (m,) of MuJoCo's contacts, 0 where a contact has none.
+
+    Warns of friction that differs in two directions, and of torsional or rolling friction.
+    """
     unequal, turning = [], []
     for contact, name in zip(contacts, names):
         first, second, *others = contact.friction
@@ -291,7 +300,7 @@ def _friction(contacts: list[Any], names: tuple[str, ...]) -> np.ndarray:
 
 
 def _rows_of(mujoco: ModuleType, model: Any, data: Any, kind: str) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers (c,) of the model's active constraints of a kind, and their gradients (c, n)."""
+    """Rows (c,) of `data.efc_J` of active constraints of a `kind` (`mjtConstraint`), as (c, n)."""
     rows = np.flatnonzero(data.efc_type == getattr(mujoco.mjtConstraint, kind))
     gradients = np.zeros((rows.size, model.nv))
     if not mujoco.mj_isSparse(model):
@@ -306,31 +315,40 @@ def _rows_of(mujoco: ModuleType, model: Any, data: Any, kind: str) -> tuple[np.n
 def _limits(
     mujoco: ModuleType, model: Any, data: Any
 ) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
-    """Names of the joints and tendons at their limits, the gradients (c, n) of the distances to
-    these, and the distances (c,) [rad, m]."""
+    """Joints and tendons at their limits, c in all, as contacts.
+
+    Returns their names, the gradients (c, n) of their distances to the limits, and these distances
+    (c,) [rad, m].
+    """
     names: list[str] = []
     gradients, distances = [np.zeros((0, model.nv))], [np.zeros(0)]
-    for kind, of, word in _LIMITS:
-        rows, ends = _rows_of(mujoco, model, data, kind)
+    for kind, object_type, word in _LIMITS:
+        rows, rows_of_kind = _rows_of(mujoco, model, data, kind)
         for row in rows:
             number = int(data.efc_id[row])
-            name = mujoco.mj_id2name(model, getattr(mujoco.mjtObj, of), number) or number
+            name = mujoco.mj_id2name(model, getattr(mujoco.mjtObj, object_type), number) or number
             names.append(f"limit of {word} {name}")
-        gradients.append(ends)
+        gradients.append(rows_of_kind)
         distances.append(data.efc_pos[rows])
     return tuple(names), np.concatenate(gradients), np.concatenate(distances)
 
 
 def _independent(root: np.ndarray, gradients: np.ndarray) -> np.ndarray:
-    """A basis h (n, b) of the columns, with `h^T M^-1 h` the identity."""
-    left, sizes, _ = np.linalg.svd(np.linalg.solve(root, gradients), full_matrices=False)
-    return root @ left[:, sizes > _REPEATED * sizes.max(initial=0.0)]
+    """A basis h (n, b) of the span of `gradients` G (n, c), with `h^T M^-1 h` the identity.
+
+    Equation: `h = L U` with the singular vectors U of `L^-1 G = U S V^T`; `root` L, `M = L L^T`.
+    """
+    vectors, sizes, _ = np.linalg.svd(np.linalg.solve(root, gradients), full_matrices=False)
+    return root @ vectors[:, sizes > _REPEATED * sizes.max(initial=0.0)]
 
 
 def _admissible(root: np.ndarray, constraints: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-    """The velocity (n,) without its part that breaks the constraints."""
+    """The velocity (n,) without its part that breaks the constraints h (n, b), h^T M^-1 h = I.
+
+    Equation: `v - M^-1 h h^T v`, computed from `L^T v`, whose square is 2 T; `root` L, `M = L L^T`.
+    """
     scaled = root.T @ velocity
-    basis = np.linalg.solve(root, constraints)
+    basis = np.linalg.solve(root, constraints)  # L^-1 h, orthonormal
     broken = basis @ (basis.T @ scaled)
     if np.linalg.norm(broken) > _DRIFT * np.linalg.norm(scaled):
         warnings.warn(
@@ -352,7 +370,7 @@ def _geom_name(mujoco: ModuleType, model: Any, geom: int) -> str:
 
 
 def _warn_of_overlap(model: Any, contacts: list[Any], names: tuple[str, ...]) -> None:
-    """Warn of bodies that are deep in each other: their contact points are arbitrary."""
+    """Warn of contacts deeper than `_DEEP` of the smaller bounding radius: points are arbitrary."""
     deep = []
     for contact, name in zip(contacts, names):
         radii = [r for r in model.geom_rbound[contact.geom] if r > 0]  # a plane's is 0
@@ -368,7 +386,7 @@ def _warn_of_overlap(model: Any, contacts: list[Any], names: tuple[str, ...]) ->
 def _warn_of_exceeded_limits(
     mujoco: ModuleType, model: Any, data: Any, limits: tuple[str, ...]
 ) -> None:
-    """Warn of joints and tendons that are beyond their limits, which count as just reached."""
+    """Warn of joints and tendons that exceed their limits by `_BEYOND`, taken as just reached."""
     turning = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_BALL)
     rows = np.concatenate([_rows_of(mujoco, model, data, kind)[0] for kind, _, _ in _LIMITS])
     beyond = []

@@ -32,11 +32,13 @@ def all_pairs(count: int) -> Candidates:
 
 
 def near_pairs(points: jax.Array, distance: jax.Array, crowd: int) -> Candidates:
-    """Pairs of points (k, d), d = 2 or 3, among which are all that are nearer than `distance` ().
+    """Pairs of points (k, d) [m], d = 2 or 3: all nearer than `distance` () [m], and others.
 
-    Points are sorted by cells of this size, those of neighbouring cells along the last axis next
-    to each other. So each point looks at the next ones of its own row of three cells, and at half
-    of the rows around it: a pair is met from one side only. A row may hold `crowd` points.
+    Space is divided into square or cubic cells of this length, and the points are sorted by the
+    numbers of their cells, which are consecutive along the last axis. Each point is paired with the
+    points after it in its own row of three cells (the cell before, its own, the next one along the
+    last axis), and with those of half of the rows around: the other half pairs with it. A row may
+    hold `crowd` points, else the result `overflows`.
 
     Source: Ericson, Real-Time Collision Detection (2005), ch. 7.1.
     """
@@ -47,29 +49,30 @@ def near_pairs(points: jax.Array, distance: jax.Array, crowd: int) -> Candidates
     half = _CELLS[d] // 2
     cell = jnp.clip(cell, -half, half).astype(jnp.int32)
     cell = cell - jnp.min(cell, axis=0, keepdims=True) + 1  # room for a neighbour on both sides
-    lengths = jnp.max(cell, axis=0) + 2
+    lengths = jnp.max(cell, axis=0) + 2  # number of cells along each axis
 
-    def number(at: jax.Array) -> jax.Array:
-        """The number of a cell, consecutive along the last axis."""
-        result = at[:, 0]
+    def number(indices: jax.Array) -> jax.Array:
+        """Numbers (k,) of cells with indices (k, d): `(i_1 L_2 + i_2) L_3 + i_3`, L = lengths."""
+        result = indices[:, 0]
         for axis in range(1, d):
-            result = result * lengths[axis] + at[:, axis]
+            result = result * lengths[axis] + indices[:, axis]
         return result
 
     own = number(cell)
     order = jnp.argsort(own).astype(jnp.int32)
     numbers = own[order]
+    # place of each point in this order
     place = jnp.zeros(count, jnp.int32).at[order].set(jnp.arange(count, dtype=jnp.int32))
     begin, end = [], []
     for row in itertools.product((-1, 0, 1), repeat=d - 1):
         if row < (0,) * (d - 1):
-            continue  # from there they are met
+            continue  # points of these rows are paired with those of this one
         low, high = (number(cell + np.array([[*row, last]], np.int32)) for last in (-1, 1))
-        alone = not any(row)
-        begin.append(place + 1 if alone else jnp.searchsorted(numbers, low, side="left"))
+        own_row = not any(row)
+        begin.append(place + 1 if own_row else jnp.searchsorted(numbers, low, side="left"))
         end.append(jnp.searchsorted(numbers, high, side="right"))
     starts, ends = jnp.stack(begin, axis=1), jnp.stack(end, axis=1)  # (k, rows)
-    at = starts[:, :, None] + np.arange(crowd, dtype=np.int32)[None, None]
+    at = starts[:, :, None] + np.arange(crowd, dtype=np.int32)[None, None]  # (k, rows, crowd)
     used = at < ends[:, :, None]
     other = order[jnp.minimum(at, count - 1)]
     point = jnp.broadcast_to(np.arange(count, dtype=np.int32)[:, None, None], other.shape)
@@ -82,12 +85,13 @@ def near_pairs(points: jax.Array, distance: jax.Array, crowd: int) -> Candidates
 
 
 def crowd_of(least: float, largest: float, d: int) -> int:
-    """The most discs (d = 2) or balls with a centre in a row of three cells, if none overlap.
+    """Most discs (d = 2) or balls that have centres in a row of three cells and do not overlap.
 
-    Equation: with s = 2 `least` and cells of length a = 2 `largest`, balls of diameter s fill at
-    most the share D of `(3 a + s) (a + s)^(d - 1)`, D = .9069 and .7405 of the densest packings;
-    one more for bodies that overlap a little.
+    Equation: with radii from `least` to `largest` [m], s = 2 `least` and cells of length
+    a = 2 `largest`, `N = D (3 a + s) (a + s)^(d - 1) / V + 1`, V the volume of a ball of diameter
+    s, D = .9069 (d = 2) and .7405 the share of the densest packing; one more for bodies that
+    overlap a little.
     """
     ratio = largest / least
-    of_one = {2: np.sqrt(4 / 3), 3: np.sqrt(2)}[d]  # D over the share of a ball in its cube
-    return int(of_one * (3 * ratio + 1) * (ratio + 1) ** (d - 1)) + 1
+    density = {2: np.sqrt(4 / 3), 3: np.sqrt(2)}[d]  # D s^d / V
+    return int(density * (3 * ratio + 1) * (ratio + 1) ** (d - 1)) + 1

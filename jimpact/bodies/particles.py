@@ -40,6 +40,7 @@ class Corner(Body):
     particle_mass: jax.Array
 
     def __init__(self, angle: Any, mass: Any = 1.0):
+        """Check that the angle lies in (0, pi) and the mass is positive."""
         self.angle, self.particle_mass = number("angle", angle), positive("mass", mass)
         if not is_traced(self.angle) and not 0 < float(self.angle) < np.pi:
             raise ValueError(
@@ -61,11 +62,11 @@ class Corner(Body):
         return LinearPotential(self.mass * jnp.array([0.0, 1.0], self.mass.dtype) * acceleration)
 
     def gap_function(self, q: jax.Array) -> jax.Array:
-        """Distances from the walls."""
+        """Distances f (2,) [m] from wall 1 and from wall 2, see the class."""
         return jnp.stack([q[1], q[0] * jnp.sin(self.angle) - q[1] * jnp.cos(self.angle)])
 
     def tangent_function(self, q: jax.Array) -> jax.Array:
-        """Ways along the walls, away from the corner."""
+        """Positions (2,) [m] along the walls: `x`, and `x cos(angle) + y sin(angle)`."""
         return jnp.stack([q[0], q[0] * jnp.cos(self.angle) + q[1] * jnp.sin(self.angle)])
 
     def touching(self) -> jax.Array:
@@ -125,7 +126,7 @@ class Column(Body):
         return LinearPotential(self.masses * acceleration)
 
     def gap_function(self, q: jax.Array) -> jax.Array:
-        """Distances from the floor and between neighbours."""
+        """Gaps f (n,) [m] to the floor and between neighbours, see the class."""
         top_below = jnp.concatenate([jnp.zeros(1, q.dtype), (q + self.radii)[:-1]])
         return q - self.radii - top_below
 
@@ -139,7 +140,7 @@ class Column(Body):
         return numbered(("height [m]",), self.masses.shape[0])
 
     def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
-        """Circles; mass points are drawn above their height."""
+        """Circles (k, 2) [m] about heights q; a mass point has the radius `point` and lies on q."""
         radii = np.asarray(self.radii)
         shown, lift = np.where(radii > 0, radii, point), np.where(radii > 0, 0.0, point)
         return [r * CIRCLE + (0, y + d) for r, y, d in zip(shown, q, lift, strict=True)]

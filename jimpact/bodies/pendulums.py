@@ -40,14 +40,15 @@ class PendulumCradle(Body):
     gaps: jax.Array
 
     def __init__(self, masses: Any, length: Any, radius: Any, gaps: Any = 0.0):
+        """Check the arguments, see the class; a scalar radius or gap is repeated."""
         self.masses = positives("masses", masses)
         n = self.masses.shape[0]
         if n < 2:
             raise ValueError(f"Argument `masses` must hold two balls or more, but holds {n}.")
         self.length = positive("length", length)
         self.radius = positives("radius", radius, n)
-        off = as_float_array("gaps", gaps)
-        self.gaps = jnp.full(n - 1, off) if off.ndim == 0 else off
+        gaps = as_float_array("gaps", gaps)
+        self.gaps = jnp.full(n - 1, gaps) if gaps.ndim == 0 else gaps
         check_shape("gaps", self.gaps, (n - 1,), "one between each two balls")
         check_values("gaps", self.gaps, low=0.0)
 
@@ -65,22 +66,23 @@ class PendulumCradle(Body):
         return jnp.zeros_like(self.masses)
 
     def gap_function(self, q: jax.Array) -> jax.Array:
-        """Distances between neighbouring balls."""
+        """Gaps f (n - 1,) [m] between neighbouring balls, see the class."""
         touching = self.radius[:-1] + self.radius[1:]
         right = touching + self.gaps + self.length * jnp.diff(jnp.sin(q))
         up = self.length * jnp.diff(jnp.cos(q))
-        # |c| - d as (|c|^2 - d^2) / (|c| + d): exactly 0 at rest
+        # with the centres' distance c = (right, up) and d = touching, |c| - d as
+        # (|c|^2 - d^2) / (|c| + d): exactly 0 at rest
         across = (right - touching) * (right + touching) + up**2
         return across / (jnp.sqrt(right**2 + up**2) + touching)
 
     def valid(self, q: jax.Array) -> jax.Array:
-        """The least distance () of balls that are no neighbours, which have no contact [m]."""
+        """The least gap () [m] between balls that are no neighbours: they have no contact."""
         i, j = np.triu_indices(self.masses.shape[0], 2)
         if not len(i):
             return super().valid(q)
         between = self.radius[:-1] + self.radius[1:] + self.gaps
-        at = jnp.concatenate([jnp.zeros_like(between[:1]), jnp.cumsum(between)])
-        right, up = at + self.length * jnp.sin(q), self.length * jnp.cos(q)
+        suspensions = jnp.concatenate([jnp.zeros_like(between[:1]), jnp.cumsum(between)])
+        right, up = suspensions + self.length * jnp.sin(q), self.length * jnp.cos(q)
         apart = jnp.sqrt((right[i] - right[j]) ** 2 + (up[i] - up[j]) ** 2)
         return jnp.min(apart - self.radius[i] - self.radius[j])
 
@@ -99,9 +101,9 @@ class PendulumCradle(Body):
         return [curve for curves in self.outlines_by_body(q, point) for curve in curves]
 
     def outlines_by_body(self, q: np.ndarray, point: float) -> list[list[np.ndarray]]:
-        """String and ball of each."""
+        """Curves (k, 2) [m] by body: the string and the circle of each ball at angles q (n,)."""
         length, radius = float(self.length), np.asarray(self.radius)
-        between = radius[:-1] + radius[1:] + np.asarray(self.gaps)
+        between = radius[:-1] + radius[1:] + np.asarray(self.gaps)  # distances of suspensions
         curves = []
         for x, r, angle in zip(np.cumsum([0.0, *between]), radius, q):
             pivot = np.array([x, 0.0])

@@ -1,4 +1,4 @@
-"""Rigid bodies in the plane and in space: where their points are, and how fast these move."""
+"""Rigid bodies in the plane and in space: positions and velocities of their points."""
 
 from typing import Any, NamedTuple
 
@@ -38,7 +38,10 @@ _EDGES = [0, 1, 3, 2, 0, 4, 5, 1, 5, 7, 3, 7, 6, 2, 6, 4]  # a way along all edg
 
 
 def _quaternion_product() -> np.ndarray:
-    """(4, 4, 4): `(e f)_i = sum_jk table_ijk e_j f_k`; the last three of each form a vector."""
+    """Table (4, 4, 4) of the product of quaternions: `(e f)_i = sum_jk table_ijk e_j f_k`.
+
+    The first entry of each is the scalar.
+    """
     table = np.zeros((4, 4, 4))
     table[0] = np.diag([1.0, -1.0, -1.0, -1.0])
     table[1:, 0, 1:] = table[1:, 1:, 0] = np.eye(3)
@@ -58,9 +61,9 @@ class ContactPoints(NamedTuple):
 
 
 class Shape(NamedTuple):
-    """What is known of a body when a program is compiled."""
+    """Constants of a body that are part of a compiled program."""
 
-    order: tuple[int, ...]  # which of its points make contact with planes, in order
+    order: tuple[int, ...]  # numbers of its points that make contact with planes, in order
     size: int  # number of its points
     faces: bool  # a polygon or a box, which others may touch anywhere
     centred: bool  # a disc or sphere that looks the same from all sides
@@ -72,10 +75,10 @@ class Shape(NamedTuple):
 
 
 class Placed(NamedTuple):
-    """Bodies where they are."""
+    """Orientations R and points of b bodies in space: `x + R c` for each point c of a body."""
 
-    turns: jax.Array  # (b, d, d) from the axes of each body to those of space
-    points: jax.Array  # (b, P, d)
+    turns: jax.Array  # R (b, d, d) from the axes of each body to those of space
+    points: jax.Array  # (b, P, d) [m]
 
 
 class RigidBodies(Body):
@@ -103,13 +106,13 @@ class RigidBodies(Body):
     shapes: tuple[Shape, ...] = eqx.field(static=True)
 
     def __repr__(self) -> str:
-        """What it is of, without its arrays."""
+        """Numbers of bodies, points and planes, without the arrays."""
         each = self.points.shape[1]
         return (
             f"{type(self).__name__}({self.count} of up to {each} points, {len(self.planes)} planes)"
         )
 
-    # ---- what there is
+    # ---- sizes
 
     @property
     def dimension(self) -> int:
@@ -128,17 +131,17 @@ class RigidBodies(Body):
 
     @property
     def quaternions(self) -> bool:
-        """Whether q holds quaternions."""
+        """True if q holds quaternions."""
         return self.dimension == 3
 
     @property
     def coordinates(self) -> int | None:
-        """Seven of each body in space, with six velocities."""
+        """Seven for each body in space, with six velocities; None: as many as velocities."""
         return 7 * self.count if self.quaternions else None
 
     @property
     def range_in_words(self) -> str:  # type: ignore[override]
-        """What `valid` asks for."""
+        """The condition `valid(q) >= 0` in words, for errors."""
         return "a quaternion of length 1 each" if self.quaternions else super().range_in_words
 
     def of_bodies(self, q: jax.Array) -> jax.Array:
@@ -150,7 +153,7 @@ class RigidBodies(Body):
         return self.of_bodies(q)
 
     def rows(self) -> tuple[np.ndarray, np.ndarray]:
-        """Bodies (p,) of all contact points with a plane, and which points these are."""
+        """Numbers of body and of point (p,) of every point that makes contact with planes."""
         orders = [shape.order for shape in self.shapes[: self.count]]
         return np.repeat(np.arange(len(orders)), [len(x) for x in orders]), np.concatenate(orders)
 
@@ -168,16 +171,16 @@ class RigidBodies(Body):
 
     @property
     def mass(self) -> jax.Array:
-        """M (n,), its diagonal, or (n, n)."""
-        places = jnp.broadcast_to(self.masses[:, None], (self.count, self.dimension))
+        """M = diag(m, .., m, I) of each body in turn: its diagonal (n,), or (n, n)."""
+        masses = jnp.broadcast_to(self.masses[:, None], (self.count, self.dimension))
         if self.inertias.ndim == 2:
-            return jnp.concatenate([places, self.inertias], axis=1).reshape(-1)
-        each = zip(places, self.inertias)
+            return jnp.concatenate([masses, self.inertias], axis=1).reshape(-1)
+        each = zip(masses, self.inertias)
         return jax.scipy.linalg.block_diag(*(block for m, i in each for block in (jnp.diag(m), i)))
 
     @full_precision
     def inertial_force(self, q: jax.Array, v: jax.Array) -> jax.Array:
-        """`-(0, omega x I omega)` of each body (n,)."""
+        """Gyroscopic terms `-(0, omega x I omega)` of each body (n,) [N, N m]; 0 in the plane."""
         if not self.quaternions:
             return jnp.zeros_like(v)
         omega = self.of_bodies(v)[:, 3:]
@@ -185,14 +188,18 @@ class RigidBodies(Body):
         return jnp.concatenate([jnp.zeros_like(omega), -cross(omega, spin)], axis=1).reshape(-1)
 
     def valid(self, q: jax.Array) -> jax.Array:
-        """How much farther from 1 the quaternions' lengths may be ()."""
+        """Margin () of the quaternions' lengths: `UNIT_WITHIN - max | |e| - 1 |`."""
         if not self.quaternions:
             return super().valid(q)
         return UNIT_WITHIN - jnp.max(jnp.abs(lengths(self.of_bodies(q)[:, 3:])[0] - 1))
 
     @full_precision
     def moved(self, q: jax.Array, u: jax.Array) -> jax.Array:
-        """q displaced, each body turned by a vector of its axes; |e| = 1."""
+        """q after the displacement u (n,): each body moved by u_x and turned by u_r, in its axes.
+
+        Equation: `x + u_x`, and the quaternion `e (cos |h|, sin |h| h / |h|)`, `h = u_r / 2`, of
+        length 1.
+        """
         if not self.quaternions:
             return q + u
         half = 0.5 * self.of_bodies(u)[:, 3:]
@@ -203,7 +210,7 @@ class RigidBodies(Body):
     def nearby(self, q: jax.Array, u: jax.Array) -> jax.Array:
         """q after a small displacement u, to second order in u: for derivatives at u = 0.
 
-        Equation: `x + u_x`, and the quaternion `(1 - |h|^2 / 2, h) e`, h half the turn in the axes
+        Equation: `x + u_x`, and the quaternion `e (1 - |h|^2 / 2, h)`, h half the turn in the axes
         of the body. First and second derivatives at u = 0 are those of `moved`, without its
         `sin|h| / |h|`, which is 0 / 0 there.
         """
@@ -215,55 +222,59 @@ class RigidBodies(Body):
         )
 
     def _turned(self, q: jax.Array, u: jax.Array, turn: jax.Array) -> jax.Array:
-        """q displaced by u, and turned by quaternions (b, 4)."""
+        """q moved by the places of u (n,), with quaternions `e f / |e|`, f = `turn` (b, 4)."""
         q, u, table = self.of_bodies(q), self.of_bodies(u), _QUATERNION_PRODUCT.astype(q.dtype)
         _, e = lengths(q[:, 3:])
-        product = dot(jnp.tensordot(turn, table, (1, 2)), e[:, None])
+        product = dot(jnp.tensordot(turn, table, (1, 2)), e[:, None])  # sum_jk table_ijk e_j f_k
         return jnp.concatenate([q[:, :3] + u[:, :3], product], axis=1).reshape(-1)
 
     @property
     def base_directions(self) -> jax.Array:
-        """All planes move along each axis (n, d)."""
+        """Velocities (n, d) of all bodies that move with their planes along each axis."""
         d = self.dimension
         return jnp.tile(jnp.eye(d + self.angular, d, dtype=self.masses.dtype), (self.count, 1))
 
     def gravity(self, acceleration: Any) -> LinearPotential:
-        """`V = g sum m_i h_i`, h the last place: y in the plane, z in space."""
+        """Potential `V = g sum m_i h_i` [J], h the height: y in the plane, z in space [m]."""
         d = self.dimension
         size = 7 if self.quaternions else d + self.angular
-        up = jnp.eye(1, size, d - 1, dtype=self.masses.dtype)
+        up = jnp.eye(1, size, d - 1, dtype=self.masses.dtype)  # h among a body's coordinates
         return LinearPotential((self.masses[:, None] * up).reshape(-1) * acceleration)
 
-    # ---- where points are and how they move
+    # ---- positions and velocities of points
 
     def turns(self, at: jax.Array) -> jax.Array:
-        """R (.., d, d) of bodies at (.., coordinates)."""
+        """Rotation matrices R (.., d, d) of bodies at coordinates (.., c), to the axes of space."""
         if self.quaternions:
             return rotation(at[..., 3:])
-        if self.dimension == 3:
+        if self.dimension == 3:  # spheres of a pile: their turns do not matter
             return jnp.broadcast_to(jnp.eye(3, dtype=at.dtype), (*at.shape[:-1], 3, 3))
         c, s = jnp.cos(at[..., 2]), jnp.sin(at[..., 2])
         return jnp.stack([c, -s, s, c], axis=-1).reshape(*c.shape, 2, 2)
 
     def placed(self, q: jax.Array) -> Placed:
-        """All bodies at q, in a `Bodies` the fixed ones last."""
+        """Orientations and points of all bodies at q, in a `Bodies` the fixed ones last."""
         return self.placed_at(self.all_bodies(q), self.points)
 
     def placed_at(self, at: jax.Array, points: jax.Array) -> Placed:
-        """Bodies of these points (b, P, d) at (b, ..)."""
+        """Orientations R and points `x + R c` of bodies with points c (b, P, d) at (b, ..)."""
         turns, centre = self.turns(at), at[:, None, : self.dimension]
         if all(shape.centred for shape in self.shapes):
             return Placed(turns, centre)
         return Placed(turns, centre + times(turns[:, None], points))
 
     def contacts(self, q: jax.Array) -> ContactPoints:
-        """Gaps, points and normals at q; `between` says of which bodies."""
+        """Gaps, points and normals (m,) at q; `between` holds the bodies of each contact."""
         return self.on_planes(self.placed(q).points)
 
     def on_planes(self, points: jax.Array) -> ContactPoints:
-        """Contacts (w p,) of all contact points, of (b, P, d), with all planes."""
-        (body, which), d = self.rows(), self.dimension
-        row = body * points.shape[1] + which
+        """Contacts (w p,) of the p contact points among points x (b, P, d) with the w planes.
+
+        Equation: `f = n . x - c - r` with the plane's normal n and distance c, and the body's rim
+        r; the contact point is `x - r n`.
+        """
+        (body, number), d = self.rows(), self.dimension
+        row = body * points.shape[1] + number
         points, rim = points.reshape(-1, d)[row], self.rims[body]
         n = jnp.broadcast_to(self.planes[:, None, :d], (len(self.planes), *points.shape))
         gap = jnp.sum(n * points[None], axis=2) - self.planes[:, d:] - rim[None]
@@ -277,30 +288,31 @@ class RigidBodies(Body):
 
     @full_precision
     def normals(self, q: jax.Array) -> jax.Array:
-        """N (n, m): how fast body i comes away from body j."""
+        """N (n, m): `N^T v` is the velocity of body i away from body j."""
         return self.directions(q, with_tangents=False).normals
 
     @full_precision
     def tangents(self, q: jax.Array) -> jax.Array | None:
-        """H_t (n, m), in space (n, 2 m): how fast body i slides along body j."""
+        """H_t (n, m), in space (n, 2 m): `H_t^T v` is the velocity of body i along body j."""
         return self.directions(q).tangents
 
     @full_precision
     def directions(self, q: jax.Array, with_tangents: bool = True) -> Directions:
-        """f, N and H_t."""
+        """f (m,) [m], N (n, m) and, `with_tangents`, H_t (n, m) or (n, 2 m) at q."""
         gap, point, normal = self.contacts(q)
-        ways = normal[:, None]
+        directions = normal[:, None]
         if not with_tangents:
-            return Directions(gap, self._of_all(q, point, ways)[..., 0], None)
-        rows = self._of_all(q, point, jnp.concatenate([ways, self.ways(normal)], axis=1))
-        return Directions(gap, rows[..., 0], rows[..., 1:].reshape(len(rows), -1))
+            return Directions(gap, self._relative_jacobian(q, point, directions)[..., 0], None)
+        directions = jnp.concatenate([directions, self.unit_tangents(normal)], axis=1)
+        jacobian = self._relative_jacobian(q, point, directions)
+        return Directions(gap, jacobian[..., 0], jacobian[..., 1:].reshape(len(jacobian), -1))
 
-    def ways(self, normal: jax.Array) -> jax.Array:
+    def unit_tangents(self, normal: jax.Array) -> jax.Array:
         """Unit tangents (m, d - 1, d) of normals (m, d)."""
         return tangents_of(normal)
 
-    def contact_jacobian(self, at: jax.Array, point: jax.Array, ways: jax.Array) -> jax.Array:
-        """Rows (.., k, velocities of a body): velocity of a point along k directions.
+    def contact_jacobian(self, at: jax.Array, point: jax.Array, directions: jax.Array) -> jax.Array:
+        """J (.., k, velocities of a body): `J v` is the velocity of its point along k directions.
 
         Equation: row k is `J_k = [d_k, r x d_k]`, r the lever arm from the body to the point; with
         quaternions `r x d_k` in the axes of the body.
@@ -308,36 +320,43 @@ class RigidBodies(Body):
         Args:
             at: coordinates of the bodies (.., c); leading axes of all three are broadcast.
             point: (.., d) [m].
-            ways: unit vectors d_k (.., k, d).
+            directions: unit vectors d_k (.., k, d).
         """
-        lever = (point - at[..., : self.dimension])[..., None, :]
+        lever, along = (point - at[..., : self.dimension])[..., None, :], directions
         if self.dimension == 2:
-            around = (lever[..., 0] * ways[..., 1] - lever[..., 1] * ways[..., 0])[..., None]
+            around = (lever[..., 0] * along[..., 1] - lever[..., 1] * along[..., 0])[..., None]
         else:
-            around = cross(lever, ways)
+            around = cross(lever, along)
         if self.quaternions:  # omega is in the axes of the body
             around = times(jnp.swapaxes(self.turns(at), -1, -2)[..., None, :, :], around)
-        along = jnp.broadcast_to(ways, (*around.shape[:-1], self.dimension))
+        along = jnp.broadcast_to(along, (*around.shape[:-1], self.dimension))
         return jnp.concatenate([along, around], axis=-1)
 
-    def _of_all(self, q: jax.Array, point: jax.Array, ways: jax.Array) -> jax.Array:
-        """(n, m, k): velocities along ways (m, k, d) of all bodies."""
+    def _relative_jacobian(
+        self, q: jax.Array, point: jax.Array, directions: jax.Array
+    ) -> jax.Array:
+        """J (n, m, k): `J^T v` are velocities of body i relative to body j at m contacts.
+
+        They are taken at contact points `point` (m, d) [m] along unit `directions` (m, k, d).
+        """
         pairs = self.pairs_in_contact()
-        sides = pairs if (pairs[:, 1] >= 0).any() else pairs[:, :1]  # a plane does not move
-        at = self.of_bodies(q)[sides]
-        jacobian = self.contact_jacobian(at, point[:, None], ways[:, None])
-        jacobian = jacobian.at[:, 1:].multiply(-1.0)  # (m, sides, k, velocities)
+        movers = pairs if (pairs[:, 1] >= 0).any() else pairs[:, :1]  # a plane does not move
+        at = self.of_bodies(q)[movers]
+        jacobian = self.contact_jacobian(at, point[:, None], directions[:, None])
+        jacobian = jacobian.at[:, 1:].multiply(-1.0)  # (m, i or j, k, velocities)
         # by JAX: of thousands of bodies only the shapes are needed, and this would fill the memory
-        own = jnp.asarray(sides)[:, :, None] == np.arange(self.count, dtype=np.int32)[None, None]
+        own = jnp.asarray(movers)[:, :, None] == np.arange(self.count, dtype=np.int32)[None, None]
+        # (m, body, k, velocities)
         rows = jnp.sum(jnp.where(own[..., None, None], jacobian[:, :, None], 0.0), axis=1)
         velocities = self.count * (self.dimension + self.angular)
-        return rows.transpose(1, 3, 0, 2).reshape(velocities, *ways.shape[:2])
+        return rows.transpose(1, 3, 0, 2).reshape(velocities, *directions.shape[:2])
 
     @full_precision
     def at(self, positions: Any, turns: Any = None) -> jax.Array:
-        """q (n,), the bodies at `positions` (b, d) [m], by angles (b,) or quaternions (b, 4).
+        """q (n,) of bodies at `positions` (b, d) [m], with angles (b,) [rad] or quaternions (b, 4).
 
-        In the plane these are the centres of mass, in space the middles of the shapes.
+        Positions are those of the centres of mass, in space of the middles of the shapes:
+        `x = position - R middle`. `turns` None: 0, or no rotation.
         """
         d, count = self.dimension, self.count
         places = as_numbers("positions", positions, (count, d), "one for each body")
@@ -354,14 +373,17 @@ class RigidBodies(Body):
 
     @property
     def middles(self) -> jax.Array:
-        """Of shapes in space (b, 3), from the centres of mass: between first and last points."""
+        """Middles (b, 3) [m] of shapes in space, from the centres of mass, in the bodies' axes.
+
+        Each is halfway between the first and the last point.
+        """
         return 0.5 * (self.points[: self.count, 0] + self.points[: self.count, -1])
 
     # ---- names and pictures
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Place and angle, quaternion or turns of each body."""
+        """Names of q: place and angle, quaternion or turns of each body."""
         if self.dimension == 2:
             return numbered(PLANAR, self.count)
         turns = tuple(f"turn {axis} [rad]" for axis in "xyz")
@@ -371,7 +393,7 @@ class RigidBodies(Body):
 
     @property
     def velocity_names(self) -> tuple[str, ...]:
-        """Rates of q, in space the angular velocities in the axes of the bodies."""
+        """Names of v: rates of q, in space angular velocities in the axes of the bodies."""
         if not self.quaternions:
             return super().velocity_names
         spins = tuple(f"omega{i} [rad/s]" for i in (1, 2, 3))
@@ -385,11 +407,11 @@ class RigidBodies(Body):
         return [(float(np.arctan2(-x, y)), float(c)) for x, y, c in np.asarray(self.planes)]
 
     def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
-        """Polygons, wheels and rods; of space in projection, with a shadow on the first plane."""
+        """Curves (k, 2) [m] of all bodies at q; in space projected, with a shadow on a plane."""
         return [curve for curves in self.outlines_by_body(q, point) for curve in curves]
 
     def outlines_by_body(self, q: np.ndarray, point: float) -> list[list[np.ndarray]]:
-        """The outlines of each body."""
+        """Curves (k, 2) [m] at q by body, see `outlines`; `point` is not used."""
         at = self.all_bodies(jnp.asarray(q, self.points.dtype))
         each = zip(self.shapes, self.points, self.rims, np.asarray(at), np.asarray(self.turns(at)))
         draw = self._plane_curves if self.dimension == 2 else self._space_curves
@@ -401,7 +423,10 @@ class RigidBodies(Body):
     def _plane_curves(
         self, shape: Shape, points: np.ndarray, rim: float, at: np.ndarray, turn: np.ndarray
     ) -> list[np.ndarray]:
-        """A wheel with the radius that shows how far it turned, a polygon, or a rod with discs."""
+        """Curves of a disc and one of its radii, of a polygon, or of a rod between two discs.
+
+        The body, of points (P, 2) [m] with a `rim` [m], is at `at` (x, y, theta), R = `turn`.
+        """
         if shape.is_round:
             spoke = np.concatenate([[[0.0, 0.0]], CIRCLE])
             return [at[:2] + (rim * spoke + points[:1]) @ turn.T]
@@ -413,7 +438,10 @@ class RigidBodies(Body):
     def _space_curves(
         self, shape: Shape, points: np.ndarray, rim: float, at: np.ndarray, turn: np.ndarray
     ) -> list[np.ndarray]:
-        """A ball with two great circles, the edges of a box, or a rod; and their shadow."""
+        """Projected curves, with shadows: a ball and two great circles, edges of a box, or a rod.
+
+        The body, of points (P, 3) [m] with a `rim` [m], has its centre of mass at `at`, R = `turn`.
+        """
         middle = 0.5 * (points[0] + points[-1])
         curve = points
         if shape.is_round:
@@ -427,7 +455,10 @@ class RigidBodies(Body):
         return drawn if shape.faces else [*drawn, *(end + rim * CIRCLE for end in drawn[0])]
 
     def with_shadow(self, curve: np.ndarray) -> list[np.ndarray]:
-        """A curve (k, 3) in projection, and its shadow on the first plane."""
+        """Projections (k, 2) of a curve x (k, 3) [m], and of its shadow on the first plane.
+
+        Equation: the shadow is `x - (n . x - c) n`; without planes on z = 0.
+        """
         plane = np.asarray(self.planes)[0] if len(self.planes) else np.array([0.0, 0, 1, 0])
         height = curve @ plane[:3] - plane[3]
         return [projected(curve), projected(curve - np.outer(height, plane[:3]))]
@@ -445,7 +476,16 @@ class RigidBody(RigidBodies):
         rim: Any,
         normal: Any,
     ) -> None:
-        """What it is: points (P, d), mass, inertia (1,), (3,) or (3, 3), rim, plane."""
+        """Set the fields of `RigidBodies` for one body and one plane through the origin.
+
+        Args:
+            points: c (P, d) from the centre of mass [m].
+            mass: m > 0 [kg].
+            inertia: (1,) in the plane; (3,) or (3, 3) in space [kg m^2].
+            shape: numbers and kind of the points.
+            rim: radius about the points [m].
+            normal: unit normal of the plane (d,).
+        """
         self.masses, self.inertias = positive("mass", mass)[None], inertia[None]
         self.points, self.shapes = points[None], (shape,)
         self.rims = jnp.asarray(rim, points.dtype)[None]
@@ -466,8 +506,11 @@ class RigidBody(RigidBodies):
         """About the centre of mass, () in the plane, (3,) or (3, 3) in space [kg m^2]."""
         return self.inertias[0, 0] if self.dimension == 2 else self.inertias[0]
 
-    def ways(self, normal: jax.Array) -> jax.Array:
-        """In space two directions in the plane (m, 2, 3), the first one that of x."""
+    def unit_tangents(self, normal: jax.Array) -> jax.Array:
+        """Unit tangents (m, d - 1, d) of unit normals n (m, d); in space t_1 has no y component.
+
+        Equation: `t_1 = (n_z, 0, -n_x) / sqrt(n_x^2 + n_z^2)`, `t_2 = n x t_1`.
+        """
         if self.dimension == 2:
             return tangents_of(normal)
         x, y, z = normal.T
@@ -475,15 +518,15 @@ class RigidBody(RigidBodies):
         return jnp.stack([first, cross(normal, first)], axis=1)
 
     def at(self, position: Any, turn: Any = None) -> jax.Array:
-        """q, the body at `position` (d,) [m], turned by an angle or a quaternion (4,).
+        """q of the body at `position` (d,) [m], turned by an angle [rad] or a quaternion (4,).
 
-        In the plane this is the centre of mass, in space the middle of its shape.
+        The position is that of the centre of mass, in space of the middle of its shape.
         """
         place = as_numbers("position", position, (self.dimension,), "a point")
         return super().at(place[None], None if turn is None else [turn])
 
     def touching(self, turn: Any = None) -> jax.Array:
-        """q, turned by an angle or a quaternion (4,), at which its lowest contacts touch."""
+        """q at which the lowest contacts touch, turned by an angle [rad] or a quaternion (4,)."""
         if self.dimension == 2:
             return _lowered(self, number("angle", 0.0 if turn is None else turn)[None])
         return _lowered(self, unit_quaternion(_UPRIGHT if turn is None else turn))
@@ -491,17 +534,20 @@ class RigidBody(RigidBodies):
 
 @full_precision
 def rotation(e: jax.Array) -> jax.Array:
-    """R (.., 3, 3) of quaternions (.., 4), whatever their length."""
+    """Rotation matrices R (.., 3, 3) of quaternions e = (s, a) (.., 4) of any length.
+
+    Equation: `R = I + 2 (s [a]x + a a^T - |a|^2 I) / |e|^2`, `[a]x b = a x b`.
+    """
     s, a = e[..., 0, None, None], e[..., 1:]
     square = dot(e, e)[..., None, None]
-    across = jnp.tensordot(a, -_CROSS.astype(e.dtype), (-1, 2))
+    across = jnp.tensordot(a, -_CROSS.astype(e.dtype), (-1, 2))  # [a]x
     outer = a[..., :, None] * a[..., None, :]
     one = jnp.broadcast_to(jnp.eye(3, dtype=e.dtype), across.shape)
     return one + 2 * (s * across + outer - dot(a, a)[..., None, None] * one) / square
 
 
 def _cosine_and_sine_ratio(square: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """`cos(a)` and `sin(a) / a` of `a^2`, with all derivatives at 0."""
+    """`cos(a)` and `sin(a) / a` of `square` a^2, by their series near 0: all derivatives exist."""
     small = square < _SERIES
     a = jnp.sqrt(jnp.where(small, 1.0, square))
     x = jnp.where(small, square, 0.0)
@@ -512,12 +558,16 @@ def _cosine_and_sine_ratio(square: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 @full_precision
 def cross(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Vector products (.., 3), in fewer operations to compile than `jnp.cross`."""
+    """Vector products `a x b` (.., 3), in fewer operations to compile than `jnp.cross`."""
     return jnp.sum(a[..., None, :] * jnp.tensordot(b, _CROSS.astype(b.dtype), (-1, 2)), axis=-1)
 
 
 def tangents_of(normal: jax.Array) -> jax.Array:
-    """Unit tangents (m, d - 1, d): to the right of normals (m, d), in space two."""
+    """Unit tangents (m, d - 1, d) of unit normals n (m, d).
+
+    Equation: in the plane `t = (n_y, -n_x)`; in space t_1 is the direction of
+    `a - (a . n) n` with a fixed a, `t_2 = n x t_1`.
+    """
     if normal.shape[1] == 2:
         return jnp.stack([normal[:, 1], -normal[:, 0]], axis=1)[:, None]
     aside = jnp.asarray(_ASIDE, normal.dtype)[None]
@@ -532,14 +582,17 @@ def times(matrices: jax.Array, vectors: jax.Array) -> jax.Array:
 
 @jax.jit  # operation by operation JAX would compile thirty programs
 def _lowered(body: RigidBody, turn: jax.Array) -> jax.Array:
-    """q of a body, turned like this, at which its lowest contacts touch its plane."""
+    """q of a body with the angle (1,) or quaternion (4,) `turn`, whose least gap to its plane is 0.
+
+    Equation: `x = -min f n`, f the gaps with the centre of mass at the origin.
+    """
     d = body.dimension
     q = jnp.concatenate([jnp.zeros(d, turn.dtype), turn])
     return q.at[:d].set(-jnp.min(body.gap_function(q)) * body.planes[0, :d].astype(q.dtype))
 
 
 def unit_quaternion(quaternion: Any) -> jax.Array:
-    """A quaternion (4,) of length 1."""
+    """The argument as a quaternion (4,), scalar first; raise a ValueError unless of length 1."""
     e = as_numbers("quaternion", quaternion, (4,), "scalar first")
     if not is_traced(e) and abs(float(np.linalg.norm(e)) - 1) > UNIT_WITHIN:
         raise ValueError(

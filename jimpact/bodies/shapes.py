@@ -36,7 +36,7 @@ class _PlanarBody(RigidBody):
     def _make(
         self, points: jax.Array, mass: Any, inertia: Any, shape: Shape, rim: Any = 0.0
     ) -> None:
-        """Set what all bodies have."""
+        """Set the fields of a body with points (P, 2) [m] over the ground; see `RigidBody._set`."""
         self._set(points, mass, positive("inertia", inertia)[None], shape, rim, (0.0, 1.0))
 
 
@@ -77,18 +77,19 @@ class Block(_PlanarBody):
         inertia: Any = None,
         corners: str = "all",
     ):
+        """Set the corners `(+/- L/2, +/- l/2)` and the moment of inertia, see the class."""
         width, height = positive("width", width), positive("height", height)
         if inertia is None:
             inertia = positive("mass", mass) * (height**2 + width**2) / 12
         check_choice("corners", corners, ("all", "base"))
         w, h = 0.5 * width, 0.5 * height
         points = jnp.stack([jnp.stack([-w, w, w, -w]), jnp.stack([-h, -h, h, h])], axis=1)
-        order = (1, 0, 3, 2) if corners == "all" else (1, 0)
-        self._make(points, mass, inertia, Shape(order, 4, True, False))
+        order = (1, 0, 3, 2) if corners == "all" else (1, 0)  # contact 1 is the right lower corner
+        self._make(points, mass, inertia, Shape(order, 4, faces=True, centred=False))
 
     @property
     def range_in_words(self) -> str:  # type: ignore[override]
-        """What `valid` asks for."""
+        """The condition `valid(q) >= 0` in words, for errors."""
         return "no upper corner below the ground: or give corners='all'"
 
     def valid(self, q: jax.Array) -> jax.Array:
@@ -128,6 +129,7 @@ class Polygon(_PlanarBody):
     """
 
     def __init__(self, corners: Any, mass: Any = 1.0, inertia: Any = None, centre: Any = None):
+        """Set the corners from the centre of mass, counter-clockwise, and the moment of inertia."""
         c = as_float_array("corners", corners)
         if c.ndim != 2 or c.shape[1] != 2 or c.shape[0] < 3:
             raise ValueError(f"Argument `corners` must have shape (k, 2), k >= 3, not {c.shape}.")
@@ -143,7 +145,7 @@ class Polygon(_PlanarBody):
             raise ValueError(
                 f"Argument `centre` must lie inside the polygon, but has value {middle.tolist()}."
             )
-        self._make(points, mass, inertia, Shape(order, len(order), True, False))
+        self._make(points, mass, inertia, Shape(order, len(order), faces=True, centred=False))
 
 
 class Disc(_PlanarBody):
@@ -204,7 +206,7 @@ class Dimer(_PlanarBody):
     def __init__(self, radius: Any, length: Any, sphere_mass: Any = 1.0, rod_mass: Any = 1.0):
         radius = positive("radius", radius, low_allowed=True)
         ends, mass, inertia = _dimer(radius, length, sphere_mass, rod_mass)
-        self._make(ends, mass, inertia, Shape((0, 1), 2, False, False), radius)
+        self._make(ends, mass, inertia, Shape((0, 1), 2, faces=False, centred=False), radius)
 
 
 # --------------------------------------------------------------------------------- in space
@@ -227,7 +229,18 @@ class _SpatialBody(RigidBody):
         shape: Shape,
         rim: Any = 0.0,
     ) -> None:
-        """Set what all bodies have; `homogeneous` are the moments of inertia over the mass."""
+        """Set the fields of a body, after checks of `inertia`, `centre` and `normal`.
+
+        Args:
+            points: c (P, 3) from the centre of mass [m].
+            mass: m > 0 [kg].
+            inertia: (3,) or (3, 3) about the centre of mass [kg m^2]; None: homogeneous.
+            homogeneous: moments (3,) of inertia of a homogeneous body, over its mass [m^2].
+            centre: centre of mass as given; None: the middle of the shape.
+            normal: normal of the plane (3,), z > 0, of any length.
+            shape: numbers and kind of the points.
+            rim: radius about the points [m].
+        """
         inertia = _given_inertia(inertia, positive("mass", mass) * homogeneous, centre)
         n = as_numbers("normal", normal, (3,), "a vector")
         if not is_traced(n) and not float(n[2]) > 0:
@@ -278,6 +291,10 @@ class Box(_SpatialBody):
         rounding: Any = 0.0,
         normal: Any = LEVEL,
     ):
+        """Set the middles of the rounded corners, `middle + (+/- (a/2 - r), ..)`, and moments.
+
+        Moments of inertia of a homogeneous box over its mass are `(b^2 + c^2) / 12`, ...
+        """
         sizes = positives("sizes", as_float_array("sizes", sizes), 3)
         rounding = positive("rounding", rounding, low_allowed=True)
         middle = -as_numbers("centre", np.zeros(3) if centre is None else centre, (3,), "a vector")
@@ -291,7 +308,7 @@ class Box(_SpatialBody):
                 )
         points = middle[None] + jnp.asarray(_SIGNS, sizes.dtype) * (0.5 * sizes - rounding)[None]
         homogeneous = (jnp.sum(sizes**2) - sizes**2) / 12
-        shape = Shape(tuple(range(8)), 8, True, False)
+        shape = Shape(tuple(range(8)), 8, faces=True, centred=False)
         self._make(points, mass, inertia, homogeneous, centre, normal, shape, rounding)
 
     @property
@@ -330,6 +347,7 @@ class Sphere(_SpatialBody):
         centre: Any = None,
         normal: Any = LEVEL,
     ):
+        """Set the middle from the centre of mass and the moments of inertia, see the class."""
         radius = positive("radius", radius)
         isotropic = inertia is None or np.ndim(inertia) == 0
         if inertia is not None and isotropic:
@@ -371,11 +389,12 @@ class SpatialDimer(_SpatialBody):
         rod_mass: Any = 1.0,
         normal: Any = LEVEL,
     ):
+        """Set the middles of the spheres and the inertia `(I_a, I_t, I_t)`, see the class."""
         radius = positive("radius", radius)  # without radius no inertia about the axis
         ends, mass, across = _dimer(radius, length, sphere_mass, rod_mass)
         along = 0.8 * positive("sphere_mass", sphere_mass) * radius**2
         inertia = jnp.stack([along, across, across])
-        shape = Shape((0, 1), 2, False, False)
+        shape = Shape((0, 1), 2, faces=False, centred=False)
         points = jnp.pad(ends, ((0, 0), (0, 1)))
         self._make(points, mass, inertia, jnp.ones(3), None, normal, shape, radius)
 
@@ -423,6 +442,7 @@ class Coin(_SpatialBody):
         corners: int = 0,
         normal: Any = LEVEL,
     ):
+        """Set the corners of both rims (round ones have none) and the inertia, see the class."""
         radius, thickness = positive("radius", radius), positive("thickness", thickness)
         self.disc = jnp.stack([radius, thickness])
         corners = as_whole("corners", corners, 0)
@@ -434,7 +454,7 @@ class Coin(_SpatialBody):
         points = self._rims(jnp.asarray(np.stack([np.cos(angle), np.sin(angle)], axis=1)))
         across = (3 * radius**2 + thickness**2) / 12
         homogeneous = jnp.stack([across, across, 0.5 * radius**2])
-        shape = Shape(tuple(range(len(points))), len(points), False, False)
+        shape = Shape(tuple(range(len(points))), len(points), faces=False, centred=False)
         self._make(points, mass, inertia, homogeneous, None, normal, shape)
 
     def _rims(self, outward: jax.Array) -> jax.Array:
@@ -447,7 +467,7 @@ class Coin(_SpatialBody):
 
     @property
     def range_in_words(self) -> str:  # type: ignore[override]
-        """What `valid` asks for."""
+        """The condition `valid(q) >= 0` in words, for errors."""
         return "a quaternion of length 1, and a round coin that does not lie flat"
 
     @property
@@ -457,33 +477,34 @@ class Coin(_SpatialBody):
 
     @full_precision
     def _toward(self, q: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """R (3, 3), and what the plane's normal is in the axes of the body (3,)."""
+        """Rotation matrix R (3, 3) at q, and the plane's normal in the body's axes, R^T n (3,)."""
         turn = rotation(q[3:])
         return turn, self.planes[0, :3] @ turn
 
     @full_precision
     def contacts(self, q: jax.Array) -> ContactPoints:
-        """Those of its corners, or of the lowest points (2, 3) of round rims."""
+        """Gaps, points and normals (m,) of its corners, or of the lowest point of round rims."""
         if self.points.size:
             return super().contacts(q)
         turn, up = self._toward(q)
-        points = q[None, :3] + self._rims(-lengths(up[None, :2])[1]) @ turn.T
+        lowest = -lengths(up[None, :2])[1]  # direction from the axis to them, -(u_1, u_2) / s
+        points = q[None, :3] + self._rims(lowest) @ turn.T
         n = jnp.broadcast_to(self.planes[:, :3], points.shape)
         return ContactPoints(jnp.sum(n * points, axis=1), points, n)
 
     def pairs_in_contact(self) -> np.ndarray:
-        """It and the plane (m, 2)."""
+        """Body 0 and the plane, -1, of each contact (m, 2)."""
         return np.array([[0, -1]] * (self.points.shape[1] or 2), np.int32)
 
     def valid(self, q: jax.Array) -> jax.Array:
-        """Of the quaternion; of round coins also the tilt beyond `FLAT`."""
+        """Margin () of the quaternion's length; of a round coin also `s - FLAT`, see the class."""
         length = super().valid(q)
         if self.points.size:
             return length
         return jnp.minimum(length, lengths(self._toward(q)[1][None, :2])[0][0] - FLAT)
 
     def outlines_by_body(self, q: np.ndarray, point: float) -> list[list[np.ndarray]]:
-        """Its rims, or their corners, a diameter, and their shadow, in projection."""
+        """Projected curves (k, 2) [m] at q: both rims, a diameter of the upper one, and shadows."""
         corners = self.points.shape[1] // 2
         around = np.linspace(0, 2 * np.pi, corners + 1)
         ring = np.stack([np.cos(around), np.sin(around)], axis=1) if corners else CIRCLE
@@ -498,7 +519,7 @@ class Coin(_SpatialBody):
 
 
 def _given_inertia(inertia: Any, homogeneous: jax.Array, centre: Any) -> Any:
-    """The argument `inertia`, or that of a homogeneous body, whose centre of mass is known."""
+    """The argument `inertia`; None: that of a homogeneous body, where no `centre` is given."""
     if inertia is None and centre is not None:
         raise ValueError("Argument `inertia` must be given with `centre`.")
     return homogeneous if inertia is None else inertia
@@ -507,7 +528,11 @@ def _given_inertia(inertia: Any, homogeneous: jax.Array, centre: Any) -> Any:
 def _round_shape(
     radius: jax.Array, centre: Any, d: int, isotropic: bool
 ) -> tuple[Shape, jax.Array]:
-    """Of a disc or sphere; and its middle (d,) from the centre of mass."""
+    """`Shape` of a disc or sphere, and its middle (d,) [m] from the centre of mass, `-centre`.
+
+    `radius` [m], `centre` of mass from the middle (d,) [m] or None; `isotropic`: equal moments of
+    inertia about all axes.
+    """
     middle = jnp.zeros(d, radius.dtype)
     if centre is not None:
         middle = -as_numbers("centre", centre, (d,), "a vector")
@@ -516,13 +541,17 @@ def _round_shape(
                 f"Argument `centre` must be at most {float(radius):g} m from the middle, but has "
                 f"value {(-middle).tolist()}."
             )
-    return Shape((0,), 1, False, isotropic and centre is None), middle
+    return Shape((0,), 1, faces=False, centred=isotropic and centre is None), middle
 
 
 def _dimer(
     radius: jax.Array, length: Any, sphere_mass: Any, rod_mass: Any
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Ends (2, 2), mass and inertia across the rod of a dimer."""
+    """Centres (2, 2) [m] of the spheres of a dimer, its mass [kg], and its inertia [kg m^2].
+
+    Equation: with the arm `a = L / 2 + R`, about an axis across the rod,
+    `I = 2 m_s (2 R^2 / 5 + a^2) + m_r L^2 / 12`.
+    """
     length = positive("length", length, low_allowed=True)
     arm = 0.5 * length + radius  # of a sphere's centre from the middle
     if not is_traced(arm) and arm <= 0:
@@ -535,7 +564,10 @@ def _dimer(
 
 
 def _moments_in_space(value: Any) -> jax.Array:
-    """Moments of inertia (3,), or their matrix (3, 3), that some body has [kg m^2]."""
+    """The argument `inertia` as (3,) or (3, 3) [kg m^2]; raise a ValueError where no body has it.
+
+    Principal moments obey `I_3 <= I_1 + I_2`.
+    """
     inertia = as_float_array("inertia", value)
     if inertia.shape not in ((3,), (3, 3)):
         raise ValueError(f"Argument `inertia` must have shape (3,) or (3, 3), not {inertia.shape}.")
@@ -545,25 +577,29 @@ def _moments_in_space(value: Any) -> jax.Array:
         check_mass(inertia)
     except ValueError as error:
         raise ValueError(str(error).replace("`mass`", "`inertia`").replace("M ", "I ")) from None
-    least = np.sort(inertia if inertia.ndim == 1 else np.linalg.eigvalsh(inertia))
-    if least[2] > (1 + _SLACK) * (least[0] + least[1]):
+    moments = np.sort(inertia if inertia.ndim == 1 else np.linalg.eigvalsh(inertia))
+    if moments[2] > (1 + _SLACK) * (moments[0] + moments[1]):
         raise ValueError(
             "Argument `inertia` must have principal moments none of which is more than the sum of "
-            f"the others, but has {least.tolist()}."
+            f"the others, but has {moments.tolist()}."
         )
     return inertia
 
 
 def _around(corners: jax.Array) -> tuple[int, ...]:
-    """Corners of a convex polygon in counter-clockwise order: as they are, or in reverse."""
+    """Numbers of the corners (k, 2) of a convex polygon in counter-clockwise order.
+
+    They are those given, or their reverse. Raise a ValueError unless sides turn the same way at all
+    corners, by 2 pi in all; corners that are traced are taken as they are.
+    """
     k = corners.shape[0]
     if is_traced(corners):
         return tuple(range(k))
     c = np.asarray(corners, float)
     side = np.roll(c, -1, axis=0) - c
     after = np.roll(side, -1, axis=0)
-    turn = np.arctan2(_cross(side, after), np.sum(side * after, axis=1))
-    around = np.sign(turn.sum())
+    turn = np.arctan2(_cross(side, after), np.sum(side * after, axis=1))  # [rad] between sides
+    around = np.sign(turn.sum())  # 1: counter-clockwise
     bad = np.flatnonzero(~((turn * around > 0) & (turn * around < np.pi)))
     if bad.size:
         worst = int(bad[0] + 1) % k
@@ -583,24 +619,30 @@ def _cross(a: Any, b: Any) -> Any:
 
 @jax.jit  # operation by operation JAX would compile thirty programs
 def inner_radii(corners: jax.Array) -> jax.Array:
-    """Distances (b,) of the origin from the nearest sides of counter-clockwise polygons (b, K, 2).
+    """Distances (b,) [m] of the origin from the nearest side of counter-clockwise polygons.
 
-    Sides without length do not count: of a single point it is infinite.
+    Equation: `min(c_i x s_i / |s_i|)` over the sides s_i from `corners` c_i (b, K, 2) with a
+    length, negative for an origin outside; infinite for a single point.
     """
     side = jnp.roll(corners, -1, axis=1) - corners
     length = jnp.sqrt(jnp.sum(side**2, axis=2))
-    away = _cross(corners, side) / jnp.where(length > 0, length, 1.0)
-    return jnp.min(jnp.where(length > 0, away, jnp.inf), axis=1)
+    distance = _cross(corners, side) / jnp.where(length > 0, length, 1.0)
+    return jnp.min(jnp.where(length > 0, distance, jnp.inf), axis=1)
 
 
 @jax.jit
 def _moments(ring: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Centroid (2,), and moment of inertia about it over the mass, of a homogeneous polygon."""
+    """Centroid (2,) [m], and moment of inertia about it over the mass () [m^2], of a polygon.
+
+    Equation: with corners a_i, b_i of side i from corner 0 of the `ring` (k, 2), and
+    `A_i = a_i x b_i`, the centroid is `sum A_i (a_i + b_i) / (3 sum A_i)`, the moment about corner
+    0 is `sum A_i (a_i^2 + a_i . b_i + b_i^2) / (6 sum A_i)`, less the centroid's square.
+    """
     start = ring - ring[:1]  # about a corner: far from the origin, areas would cancel
     end = jnp.roll(start, -1, axis=0)
-    twice = _cross(start, end)
-    area = jnp.sum(twice)
-    middle = jnp.sum((start + end) * twice[:, None], axis=0) / (3 * area)
+    twice_area = _cross(start, end)  # of the triangles at corner 0
+    total = jnp.sum(twice_area)
+    middle = jnp.sum((start + end) * twice_area[:, None], axis=0) / (3 * total)
     squares = jnp.sum(start**2 + start * end + end**2, axis=1)
-    about_corner = jnp.sum(twice * squares) / (6 * area)
+    about_corner = jnp.sum(twice_area * squares) / (6 * total)
     return ring[0] + middle, about_corner - jnp.sum(middle**2)

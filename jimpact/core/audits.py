@@ -28,7 +28,7 @@ CONSISTENCIES = ("kinematic", "kinetic", "energetic", "momentum")
 
 
 class Audit(eqx.Module):
-    """Whether four conditions hold, and the numbers behind them, scaled by the impact's size.
+    """Four conditions on an outcome, and the numbers behind them, scaled by the impact's size.
 
     Attributes:
         kinematic: whether gamma+ >= 0 at closed contacts ().
@@ -38,7 +38,7 @@ class Audit(eqx.Module):
         worst_gap_velocity: the least gamma+ ().
         worst_impulse: the least p ().
         energy_gain: T+ - T- less what was stored ().
-        momentum_residual: largest entry of M (v+ - v-) - N p ().
+        momentum_residual: largest entry of M (v+ - v-) - N p - H p_t, over that of M v- ().
     """
 
     kinematic: jax.Array
@@ -52,7 +52,7 @@ class Audit(eqx.Module):
 
     @property
     def consistent(self) -> jax.Array:
-        """Whether all four hold."""
+        """True () if all four conditions hold."""
         return self.kinematic & self.kinetic & self.energetic & self.momentum
 
     @property
@@ -66,7 +66,8 @@ def audit(scene: Scene, velocity: Any, out: Impact) -> Audit:
     """Check an outcome against what every impact must satisfy, whatever the law.
 
     Equation: closed contacts `gamma+ >= 0` (kinematic), `p >= 0` (kinetic),
-    `T+ - T- <= sum U_0` (energetic), `M (v+ - v-) = N p` (momentum).
+    `T+ - T- <= sum U_0` (energetic), `M (v+ - v-) = N p + H p_t` (momentum), but for reactions of
+    bilateral constraints.
 
     Args:
         scene: the scene of the impact.
@@ -92,11 +93,11 @@ def audit(scene: Scene, velocity: Any, out: Impact) -> Audit:
     gamma = jnp.where(scene.closed, contact.gap_velocity, 0.0)
     gamma_plus = gap_velocity(scene, out.velocity)
     approach = jnp.sum((jnp.minimum(gamma, 0.0) / root) ** 2)
-    size = jnp.sqrt(approach + 2 * out.initial_energy)
+    size = jnp.sqrt(approach + 2 * out.initial_energy)  # scale of the impact [sqrt(J)]
     size = jnp.where(size > 0, size, 1.0)
-    jump = momentum(scene, out.velocity - v)
-    change = 0.5 * jump @ (out.velocity + v)  # T+ - T- without their cancellation
-    residual = jump - scene.normals @ out.impulse
+    momentum_change = momentum(scene, out.velocity - v)
+    change = 0.5 * momentum_change @ (out.velocity + v)  # T+ - T- without their cancellation
+    residual = momentum_change - scene.normals @ out.impulse
     if scene.tangents is not None:
         residual = residual - scene.tangents @ out.tangential_impulse
     if scene.constraints is not None:  # reactions of the constraints are not listed in `out`
@@ -189,11 +190,12 @@ def summary(out: Impact, scene: Scene, velocity: Any, names: Sequence[str] = ())
         numbers = f"{formatted(a, '14.6g')} {formatted(b, '14.6g')}"
         lines.append(f"{i + 1:10d} {numbers}{f'   {names[i]}' if names else ''}")
     lines.append("contact          gamma-         gamma+   [m/s]     impulse [N s]")
-    g0, g1 = (
+    gamma, gamma_plus = (
         np.asarray(gap_velocity(scene, velocity)),
         np.asarray(gap_velocity(scene, out.velocity)),
     )
-    for j, (a, b, p, closed) in enumerate(zip(g0, g1, np.asarray(out.impulse), scene.closed)):
+    contacts = zip(gamma, gamma_plus, np.asarray(out.impulse), scene.closed)
+    for j, (a, b, p, closed) in enumerate(contacts):
         note = "" if closed else "   open: takes no part" if p == 0 else "   open before"
         numbers = f"{formatted(a, '15.6g')} {formatted(b, '14.6g')} {formatted(p, '21.6g')}"
         lines.append(f"{j + 1:7d} {numbers}{note}")

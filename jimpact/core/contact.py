@@ -97,8 +97,9 @@ class Contact(eqx.Module):
         tangential_block: Any = None,
         rtol: Any = None,
     ):
-        own_form = isinstance(delassus, (Tridiagonal, Sparse))
-        self.delassus = delassus if own_form else as_float_array("delassus", delassus)
+        """Set the fields, arrays of floats; what is None becomes its default, see the class."""
+        structured = isinstance(delassus, (Tridiagonal, Sparse))
+        self.delassus = delassus if structured else as_float_array("delassus", delassus)
         self.gap_velocity = as_float_array("gap_velocity", gap_velocity)
         zero = jnp.zeros_like(self.gap_velocity)
         self.closed = zero == 0 if closed is None else jnp.asarray(closed, bool)
@@ -138,12 +139,12 @@ class Contact(eqx.Module):
 
     @property
     def structure(self) -> Structure:
-        """Which entries of W are stored."""
+        """Structure of W: dense, tridiagonal or sparse."""
         return structure_of(self.delassus)
 
     @property
     def normalized_delassus(self) -> Symmetric:
-        """G: W between unit normals."""
+        """G = W between unit normals: `G_ij = W_ij / (|grad f_i| |grad f_j|)`."""
         return scaled(self.delassus, 1 / self.norm)
 
     @property
@@ -174,7 +175,7 @@ class Contact(eqx.Module):
 
     @property
     def happens(self) -> jax.Array:
-        """Whether () there is an impact: a contact approaches, stores energy or is not finite."""
+        """True () if there is an impact: a contact approaches, stores energy or is not finite."""
         gamma = self.gap_velocity
         return jnp.any(gamma < 0) | jnp.any(self.stored > 0) | ~jnp.all(jnp.isfinite(gamma))
 
@@ -198,7 +199,10 @@ class Contact(eqx.Module):
 
     @full_precision
     def gap_velocity_after(self, normal: jax.Array, tangential: jax.Array | None) -> jax.Array:
-        """gamma+ (m,) [m/s] of impulses, normal p (m,) and tangential p_t (t,)."""
+        """gamma+ (m,) [m/s] after impulses, `normal` p (m,) and `tangential` p_t (t,) [N s].
+
+        Equation: `gamma+ = gamma- + W p + W_nt p_t`.
+        """
         after = self.gap_velocity + self.delassus @ normal
         if self.tangential_block is None or tangential is None:
             return after
@@ -206,14 +210,20 @@ class Contact(eqx.Module):
 
     @full_precision
     def slip_after(self, normal: jax.Array, tangential: jax.Array) -> jax.Array:
-        """u+ (t,) [m/s] of impulses, normal (m,) and tangential (t,), where there are tangents."""
+        """u+ (t,) [m/s] after impulses, `normal` p (m,) and `tangential` p_t (t,) [N s].
+
+        Equation: `u+ = u- + W_tn p + W_tt p_t`; only where there are tangents.
+        """
         assert self.tangential_block is not None
         cross, tangent, slip = self.tangential_block
         return slip + cross.T @ normal + tangent @ tangential
 
     @full_precision
     def energy_change(self, normal: jax.Array, tangential: jax.Array | None = None) -> jax.Array:
-        """T+ - T- () [J] of normal and tangential impulses: their work at the mean velocities."""
+        """T+ - T- () [J], the work of impulses, `normal` p (m,) and `tangential` p_t (t,) [N s].
+
+        Equation: `(gamma- + gamma+) . p / 2 + (u- + u+) . p_t / 2`.
+        """
         mean = 0.5 * (self.gap_velocity + self.gap_velocity_after(normal, tangential))
         if tangential is None or self.slip is None:
             return mean @ normal
@@ -226,7 +236,11 @@ class Contact(eqx.Module):
 
     @full_precision
     def rounding(self, normal: jax.Array, tangential: jax.Array | None) -> jax.Array:
-        """Rounding (m,) of gamma+ after normal and tangential impulses: terms of W p may cancel."""
+        """Rounding (m,) [m/s] of gamma+ after `normal` p (m,) and `tangential` p_t (t,) [N s].
+
+        Equation: `noise + eps (|gamma-| + |W| |p| + |W_nt| |p_t|)`, eps that of one sum; terms of
+        W p may cancel, their rounding remains.
+        """
         w = self.delassus
         size: jax.Array = abs(w) @ jnp.abs(normal)  # type: ignore[operator]
         if self.cross is not None and tangential is not None:
@@ -239,9 +253,13 @@ class Contact(eqx.Module):
 def contact_of(
     scene: Scene, velocity: jax.Array, stored: jax.Array | None = None, uses_gaps: bool = False
 ) -> Contact:
-    """The contacts of a scene at a velocity v- (n,); `uses_gaps`: open ones take part.
+    """The contacts of a scene at a velocity v- (n,) [m/s].
 
-    Those with a gap of infinity never do.
+    Equation: `W = N^T M^-1 N`, `gamma- = N^T v-`; with tangents `W_nt = N^T M^-1 H`,
+    `W_tt = H^T M^-1 H`, `u- = H^T v-`.
+
+    `stored` is the energy in the contacts, () or (m,) [J]; None: 0. With `uses_gaps` open contacts
+    take part, but those with an infinite gap never do.
     """
     gamma, noise = rounded_gap_velocity(scene, velocity)
     w, block = delassus_matrix(scene), None
@@ -269,22 +287,26 @@ def contact_of(
 
 @full_precision
 def held_by_constraints(scene: Scene) -> jax.Array:
-    """Contacts (m,) whose normal is a combination of bilateral constraints, within rounding.
+    """True (m,) for contacts whose normal is a combination of bilateral constraints: they are held.
 
-    They cannot move. W_jj, a small difference of large numbers, does not show it: what decides is
-    the residual of the normal, the part of it that no reactions of the constraints balance.
+    Equation: `r^T M^-1 r` is rounding beside `N_j^T M^-1 N_j`, of the residual
+    `r = N_j - h (h^T M^-1 h)^-1 h^T M^-1 N_j`, the part of the normal that no reactions of the
+    constraints h balance. (W_jj, a small difference of large numbers, does not show it.)
     """
     free, h = without_constraints(scene), scene.constraints
     assert h is not None  # asked only of scenes with constraints
-    moved = solve_mass(free, h)
-    reactions = solve_definite(h.T @ moved, moved.T @ scene.normals)
-    left = scene.normals - h @ reactions
-    square = jnp.sum(left * solve_mass(free, left), axis=0)
+    m_inv_h = solve_mass(free, h)
+    reactions = solve_definite(h.T @ m_inv_h, m_inv_h.T @ scene.normals)
+    residual = scene.normals - h @ reactions
+    square = jnp.sum(residual * solve_mass(free, residual), axis=0)
     return square <= precision(square.dtype).noise * kinetic_norm(scene) ** 2
 
 
 def _without_held(contact: Contact, held: jax.Array) -> Contact:
-    """The contact where those `held` (m,) take no part, like open ones with the free W_jj."""
+    """The contacts where those `held` (m,) by constraints take no part, as if open.
+
+    Their diagonal entry of W becomes that of the bodies without constraints, |grad f_j|^2.
+    """
     own = jnp.diag(jnp.where(held, contact.norm**2, diagonal(contact.delassus)))
     w = jnp.where(jnp.eye(held.shape[0], dtype=bool), own, contact.normal_delassus)
     closed, stored = contact.closed & ~held, jnp.where(held, 0.0, contact.stored)
@@ -293,11 +315,11 @@ def _without_held(contact: Contact, held: jax.Array) -> Contact:
 
 
 def _taking_part(contact: Contact, part: jax.Array) -> Contact:
-    """The contact where those outside `part` (m,) are decoupled, at rest, and at a gap of 1 m."""
+    """The contacts where those outside `part` (m,) are decoupled, at rest, and at a gap of 1 m."""
     w = decoupled(contact.delassus, part)
     block = contact.tangential_block
     if block is not None:
-        each = block.slip.shape[0] // part.shape[0]
+        each = block.slip.shape[0] // part.shape[0]  # tangents of a contact
         rows = jnp.repeat(part, each)
         # a row that takes no part keeps a diagonal entry of the size of W's
         unit = jnp.diag(jnp.where(rows, 0.0, jnp.repeat(diagonal(w), each)))
@@ -315,9 +337,10 @@ def _taking_part(contact: Contact, part: jax.Array) -> Contact:
 
 @full_precision
 def rounded_gap_velocity(scene: Scene, velocity: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """gamma- (m,), 0 where it is within the rounding of v-, and that rounding (m,).
+    """gamma- (m,) [m/s], 0 where it is within the rounding of v- (n,), and that rounding (m,).
 
-    The derivative of gamma- remains that of N^T v- where its value is set to 0.
+    Equation: `gamma- = N^T v-`, its rounding `eps |N|^T |v-|`, eps that of one sum. The derivative
+    of gamma- remains that of N^T v- where its value is set to 0.
     """
     gamma, speed = gap_velocity(scene, velocity), jax.lax.stop_gradient(jnp.abs(velocity))
     if scene.pairs is not None:
@@ -360,7 +383,10 @@ def delassus_matrix(scene: Scene) -> Symmetric:
 
 
 def decoupled(delassus: Symmetric, closed: jax.Array) -> Symmetric:
-    """W whose rows and columns of open contacts hold their diagonal only."""
+    """The Delassus matrix with rows and columns of open contacts 0 but for their diagonal entry.
+
+    `closed` (m,) is True for contacts that stay coupled.
+    """
     if isinstance(delassus, Sparse):
         return delassus.within(closed)
     if isinstance(delassus, Tridiagonal):
@@ -371,7 +397,7 @@ def decoupled(delassus: Symmetric, closed: jax.Array) -> Symmetric:
 
 
 def kinetic_norm(scene: Scene) -> jax.Array:
-    """`|grad f_j|` in the metric of M^-1 (m,), the square roots of the free W_jj."""
+    """`|grad f_j| = sqrt(N_j^T M^-1 N_j)` (m,) [1 / sqrt(kg)], without bilateral constraints."""
     if scene.walls is not None or scene.pairs is not None:
         return jnp.sqrt(diagonal(delassus_matrix(scene)))
     moved = solve_mass(without_constraints(scene), scene.normals)
@@ -490,17 +516,18 @@ def coupled_groups(scene: Scene) -> Groups | None:
 
 
 def _by_size(groups: list[np.ndarray], m: int) -> Groups:
-    """The groups in one array, or the smaller ones and the larger ones in two."""
+    """The groups, of m contacts in all, in one padded array, or in one of small and one of large.
+
+    The split is where W of all padded groups has the fewest entries, `c g^2` of c groups of g.
+    """
     groups = sorted(groups, key=len)  # stable
     size = np.array([len(group) for group in groups])
-    few = np.arange(
-        len(groups)
-    )  # entry i: number of entries of W if the first i groups have their own array
-    entries = few * size[few - 1] ** 2 + (len(groups) - few) * size[-1] ** 2
+    smaller = np.arange(len(groups))  # number of groups in the first array
+    entries = smaller * size[smaller - 1] ** 2 + (len(groups) - smaller) * size[-1] ** 2
     cut = int(np.argmin(entries)) if entries[0] > WORTH_A_PROGRAM * entries.min() else 0
 
     def padded(part: list[np.ndarray]) -> np.ndarray:
-        """Index arrays in rows of the last one's length."""
+        """Groups (c, g), each padded to the length g of the last one, see `Groups`."""
         most = len(part[-1])
         return np.stack([np.pad(g, (0, most - len(g)), constant_values=m + g[0]) for g in part])
 
@@ -510,29 +537,31 @@ def _by_size(groups: list[np.ndarray], m: int) -> Groups:
 def contacts_of_groups(
     scene: Scene, velocity: jax.Array, stored: jax.Array, groups: Groups
 ) -> list[Contact]:
-    """For each array of groups (c, g) their contacts, with a leading axis (c,).
+    """The contacts of each array of groups (c, g), with a leading axis (c,).
 
-    W of all contacts is never formed. An entry that only pads its group is like an open contact.
+    `velocity` is v- (n,) [m/s], `stored` (m,) [J]. W of all contacts is never formed. An entry that
+    only pads its group is like an open contact.
     """
     gamma, noise = rounded_gap_velocity(scene, velocity)
     m, norm = scene.contacts, kinetic_norm(scene)
     gaps = jnp.zeros_like(gamma) if scene.gaps is None else scene.gaps
-    each = 0 if scene.tangents is None else scene.tangents.shape[1] // m
-    columns = scene.normals
+    each = 0 if scene.tangents is None else scene.tangents.shape[1] // m  # tangents of a contact
+    columns = scene.normals  # (N, H)
     if scene.tangents is not None:
         columns = jnp.concatenate([columns, scene.tangents], axis=1)
         slip = scene.tangents.T @ velocity
-    moved = solve_mass(scene, columns)
+    moved = solve_mass(scene, columns)  # M^-1 (N, H)
     held = None if scene.constraints is None else held_by_constraints(scene)
 
     def contacts_of(padded: np.ndarray) -> Contact:
-        """The contacts of groups of one size."""
+        """The contacts of padded groups (c, g), see `Groups`."""
         index = padded % m
         g = index.shape[1]
         tangents = each * index[:, :, None] + jnp.arange(each)[None, None, :]
-        tangents = tangents.reshape(len(index), each * g)
-        directions = jnp.concatenate([index, m + tangents], axis=1)
+        tangents = tangents.reshape(len(index), each * g)  # columns of H of each group
+        directions = jnp.concatenate([index, m + tangents], axis=1)  # of (N, H)
         part = jnp.asarray(padded < m) & scene.closed[index]
+        # [[W, W_nt], [W_tn, W_tt]] of each group
         matrix = jnp.einsum("nca,ncb->cab", columns[:, directions], moved[:, directions])
         block = (matrix[:, :g, g:], matrix[:, g:, g:], slip[tangents]) if each else None
         contact = Contact(

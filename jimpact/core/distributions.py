@@ -1,8 +1,9 @@
-"""What a sample is drawn from: uniform, normal, rows of an array, the user's own function."""
+"""Distributions that samples are drawn from: uniform, normal, rows of an array, own functions."""
 
 import abc
 import operator
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -39,7 +40,10 @@ class Distribution(eqx.Module):
         """One draw (size,); with `non_negative` truncated at 0."""
 
     def check(self, name: str, size: int, non_negative: bool) -> None:
-        """Raise where the parameters do not fit."""
+        """Raise a ValueError unless each parameter is a scalar or has `size` values.
+
+        `non_negative`: raise also where draws of the argument `name` could be negative.
+        """
         for field, value in vars(self).items():
             if np.shape(value) not in ((), (size,)):
                 raise ValueError(
@@ -73,12 +77,12 @@ class Uniform(Distribution):
             raise ValueError(f"Argument `high` must be at least `low`, but has {self!r}.")
 
     def sample(self, key: jax.Array, size: int, dtype: Any, non_negative: bool) -> jax.Array:
-        """One draw (size,)."""
+        """One draw (size,): `low + (high - low) u`, u uniform in [0, 1)."""
         low, high = (jnp.broadcast_to(x, (size,)).astype(dtype) for x in (self.low, self.high))
         return jnp.minimum(low + (high - low) * jax.random.uniform(key, (size,), dtype), high)
 
     def check(self, name: str, size: int, non_negative: bool) -> None:
-        """Raise where `low` is negative and must not be, or the shapes do not fit."""
+        """Raise a ValueError for another shape, and, where `non_negative`, for a `low` below 0."""
         super().check(name, size, non_negative)
         if non_negative and np.any(np.asarray(self.low) < 0):
             raise ValueError(
@@ -113,7 +117,7 @@ class Normal(Distribution):
         self.std = as_numbers("std", std, low=0.0, open_low=True)
 
     def sample(self, key: jax.Array, size: int, dtype: Any, non_negative: bool) -> jax.Array:
-        """One draw (size,)."""
+        """One draw (size,): `mean + std z`, z normal; `non_negative`: truncated at 0."""
         mean, std = (jnp.broadcast_to(x, (size,)).astype(dtype) for x in (self.mean, self.std))
         if not non_negative:
             return mean + std * jax.random.normal(key, (size,), dtype)
@@ -121,7 +125,7 @@ class Normal(Distribution):
         return jnp.maximum(mean + std * unit, 0)  # rounding only
 
     def check(self, name: str, size: int, non_negative: bool) -> None:
-        """Raise where a truncated distribution has a negative mean, or the shapes do not fit."""
+        """Raise a ValueError for another shape, and, where `non_negative`, for a mean below 0."""
         super().check(name, size, non_negative)
         if non_negative and np.any(np.asarray(self.mean) < 0):
             raise ValueError(
@@ -136,7 +140,7 @@ class GivenRows(eqx.Module):
     count: int
 
     def __repr__(self) -> str:
-        """How many rows they are."""
+        """The number of rows."""
         return f"{self.count} given rows"
 
 
@@ -197,7 +201,7 @@ class RandomLaw(eqx.Module):
         return f"{type(self.law).__name__}({words})"
 
     def __call__(self, key: jax.Array) -> Law:
-        """The law of this key."""
+        """The law whose random parameters are drawn by this key, each by a key of its own."""
         law, known = self.law, free_parameters_of(self.law)
         for i, (name, distribution) in enumerate(sorted(self.parameters.items())):
             old, path, _ = known[name]
@@ -207,7 +211,11 @@ class RandomLaw(eqx.Module):
 
 
 def as_source(name: str, value: Any, size: int, non_negative: bool) -> Any:
-    """A distribution, a function of a key, rows (S, size), or a constant (size,); checked."""
+    """The argument `name` checked: a distribution, a function of a key, rows (S, size) or (size,).
+
+    Raise a ValueError for another size, and, where `non_negative`, for negative entries; a
+    TypeError for a function that gives no array.
+    """
     if isinstance(value, Distribution):
         value.check(name, size, non_negative)
         return value
@@ -231,7 +239,7 @@ def as_source(name: str, value: Any, size: int, non_negative: bool) -> Any:
     return array
 
 
-def warn_without_key(name: str, function: Any) -> None:
+def warn_without_key(name: str, function: Callable[[jax.Array], Any]) -> None:
     """Warn where a function draws without its key, so that it is the same in all samples."""
     program = jax.make_jaxpr(function)(jax.random.key(0, impl="threefry2x32")).jaxpr
     if not any(program.invars[0] is x for step in program.eqns for x in step.invars):
@@ -243,7 +251,7 @@ def warn_without_key(name: str, function: Any) -> None:
 
 
 def _check_domain(name: str, drawn: Distribution, domain: Domain) -> None:
-    """Raise where a distribution can leave the domain of the parameter."""
+    """Raise a ValueError where draws can leave the `domain`; a Normal can give any number."""
     low, high = domain.bounds
     least, most = (drawn.low, drawn.high) if isinstance(drawn, Uniform) else (-np.inf, np.inf)
     if np.min(least) < low or np.max(most) > high:
@@ -253,6 +261,6 @@ def _check_domain(name: str, drawn: Distribution, domain: Domain) -> None:
 
 
 def _short(value: jax.Array) -> str:
-    """A number, or a list of numbers."""
+    """A number, or a list of numbers, as text."""
     entries = [f"{x:g}" for x in np.ravel(np.asarray(value))]
     return entries[0] if np.ndim(value) == 0 else f"[{', '.join(entries)}]"

@@ -59,39 +59,51 @@ def quasi_basis(scene: Scene) -> tuple[jax.Array, jax.Array]:
 
 @quick_jit
 def _basis(scene: Scene) -> tuple[jax.Array, jax.Array]:
-    """n_q and t_q, of a scene whose contacts are independent."""
-    fixed = _directions(scene)
+    """n_q (n, m) and t_q (n, k), k = n - m - b, of a scene whose contacts are independent.
+
+    Equation: with D = (N, grad h) and its unit columns `n = M^-1 D diag(1 / |D_j|)`,
+    `G = n^T M n`, the projector on the tangent space is `P = I - n G^-1 n^T M`; t_q are k columns
+    of P (see `_coordinates`), orthonormalized in the metric of M by Cholesky's factorization.
+    """
+    all_contacts = _with_constraints_as_contacts(scene)
     metric = jax.vmap(partial(momentum, scene), 1, 1)  # M X
-    gram = as_matrix(normalized_delassus(fixed))
-    unit = jnp.eye(fixed.contacts, dtype=gram.dtype) / kinetic_norm(fixed)[:, None]
-    # M^-1 (N, grad h), unit columns
-    normal = jax.vmap(partial(velocity_change, fixed), 1, 1)(unit)
+    gram = as_matrix(normalized_delassus(all_contacts))
+    unit = jnp.eye(all_contacts.contacts, dtype=gram.dtype) / kinetic_norm(all_contacts)[:, None]
+    normal = jax.vmap(partial(velocity_change, all_contacts), 1, 1)(unit)
     identity = jnp.eye(scene.size, dtype=gram.dtype)
-    free = identity - normal @ jnp.linalg.solve(gram, metric(normal).T)
-    chosen = _coordinates(metric(free), metric(identity), scene.size - fixed.contacts)
-    tangent = free[:, chosen]
+    projector = identity - normal @ jnp.linalg.solve(gram, metric(normal).T)
+    count = scene.size - all_contacts.contacts
+    tangent = projector[:, _coordinates(metric(projector), metric(identity), count)]
     triangle = jnp.linalg.cholesky(tangent.T @ metric(tangent))
     tangent = jax.scipy.linalg.solve_triangular(triangle, tangent.T, lower=True).T
     return normal[:, : scene.contacts], tangent
 
 
-def _directions(scene: Scene) -> Scene:
-    """The scene with its bilateral constraints as further contacts."""
-    fixed = scene.normals
+def _with_constraints_as_contacts(scene: Scene) -> Scene:
+    """The scene whose normals are (N, grad h) (n, m + b): constraints are further contacts.
+
+    Raise a ValueError for more of them than velocities.
+    """
+    normals = scene.normals
     if scene.constraints is not None:
-        fixed = jnp.concatenate([fixed, scene.constraints], axis=1)
-    if fixed.shape[1] > scene.size:
-        raise ValueError(_REDUNDANT.format(f"{fixed.shape[1]} of them for {scene.size} velocities"))
-    return Scene(scene.mass, fixed)
+        normals = jnp.concatenate([normals, scene.constraints], axis=1)
+    if normals.shape[1] > scene.size:
+        given = f"{normals.shape[1]} of them for {scene.size} velocities"
+        raise ValueError(_REDUNDANT.format(given))
+    return Scene(scene.mass, normals)
 
 
 def check_independent(scene: Scene) -> None:
-    """Raise a ValueError where contact normals and constraints are dependent (if concrete)."""
-    fixed = _directions(scene)
-    if is_traced((fixed.normals, fixed.mass)):
+    """Raise a ValueError where contact normals and constraints are dependent (if concrete).
+
+    They are where the least eigenvalue of their Gram matrix D^T M^-1 D, with a unit diagonal, is
+    rounding.
+    """
+    all_contacts = _with_constraints_as_contacts(scene)
+    if is_traced((all_contacts.normals, all_contacts.mass)):
         return
-    normals = np.asarray(fixed.normals, float)
-    gram = normals.T @ np.linalg.solve(dense_mass(fixed), normals)
+    normals = np.asarray(all_contacts.normals, float)
+    gram = normals.T @ np.linalg.solve(dense_mass(all_contacts), normals)
     norm = np.sqrt(np.diag(gram))
     smallest = np.linalg.eigvalsh(gram / np.outer(norm, norm))[0]
     if smallest < precision(gram.dtype).singular * len(gram):
@@ -101,9 +113,11 @@ def check_independent(scene: Scene) -> None:
 
 
 def _coordinates(shares: jax.Array, mass: jax.Array, count: int) -> jax.Array:
-    """The `count` coordinates that span the tangent space best, ascending.
+    """Indices (count,), ascending, of the coordinates that span the tangent space best.
 
-    Pivoted Cholesky factorization of the Gram matrix of the projected coordinate directions.
+    Pivots of the Cholesky factorization of the Gram matrix of the projected coordinate directions,
+    of unit length in the metric of M = `mass` (n, n); `shares` is M P (n, n), P the projector on
+    the tangent space.
     """
     if count == 0:
         return jnp.zeros(0, jnp.int32)
@@ -111,12 +125,12 @@ def _coordinates(shares: jax.Array, mass: jax.Array, count: int) -> jax.Array:
     gram = jax.lax.stop_gradient(shares * scale[:, None] * scale[None, :])
 
     def choose(i: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        """One more pivot, and the Gram matrix without its direction."""
+        """The Gram matrix without the direction of the next pivot, and pivots (count,) so far."""
         rest, chosen = state
-        left = jnp.diagonal(rest)
-        pivot = jnp.argmax(left >= (1 - _EQUAL_SHARE) * jnp.max(left)).astype(jnp.int32)
+        squares = jnp.diagonal(rest)  # of what no chosen direction spans
+        pivot = jnp.argmax(squares >= (1 - _EQUAL_SHARE) * jnp.max(squares)).astype(jnp.int32)
         column = rest[:, pivot]
-        return rest - jnp.outer(column, column) / left[pivot], chosen.at[i].set(pivot)
+        return rest - jnp.outer(column, column) / squares[pivot], chosen.at[i].set(pivot)
 
     start = (gram, jnp.zeros(count, jnp.int32))
     return jnp.sort(jax.lax.fori_loop(0, count, choose, start)[1])

@@ -1,4 +1,4 @@
-"""The registry of laws: what studies, comparisons and the command line know by name."""
+"""The registry of laws that studies, comparisons and the command line know by name."""
 
 import inspect
 from collections.abc import Callable, Iterable, Mapping
@@ -31,12 +31,12 @@ class Row(NamedTuple):
 
     @property
     def arguments(self) -> dict[str, inspect.Parameter]:
-        """What `build` takes, by name."""
+        """Arguments of `build`, by name."""
         return dict(inspect.signature(self.make or self.law).parameters)
 
     @property
     def options(self) -> tuple[str, ...]:
-        """Names of what says how the law is solved."""
+        """Names of the arguments that say how the law is solved."""
         return options_of(self.law)
 
     @property
@@ -46,7 +46,7 @@ class Row(NamedTuple):
 
     @property
     def in_python(self) -> str:
-        """How the class is called, without options: a study may give other, plain parameters."""
+        """The call of the class as text, without options: studies may give other parameters."""
         names = [x for x in inspect.signature(self.law).parameters if x not in self.options]
         return f"ji.{self.law.__name__}({', '.join(names)})"
 
@@ -63,12 +63,12 @@ class Row(NamedTuple):
 
 REGISTRY: dict[str, Row] = {}
 
-# What `advise` knows of the contacts, by the names of parameters.
+# Parameters of contacts that `advise` knows.
 ADVISED = ("restitution", "stiffness", "exponent", "friction")
 
 
 def simplest_first() -> tuple[str, ...]:
-    """Names of the laws that `advise` tries, in the order of what they must know of the contacts.
+    """Names of the laws that `advise` tries: first those that need to know least of the contacts.
 
     >>> import jimpact as ji
     >>> from jimpact.core.registry import simplest_first
@@ -126,7 +126,7 @@ def register(
     check_kind("name", name, str)
 
     def enter(law: Any) -> Any:
-        """The class, entered."""
+        """Enter the class in `REGISTRY` under its name, after checks, and return it."""
         if not (isinstance(law, type) and issubclass(law, Law)):
             raise TypeError(f"Argument `law` must be a class of Law, but is {law!r}.")
         if name != name.lower() or not name:
@@ -140,15 +140,15 @@ def register(
                 f"{other.law.__module__}."
             )
         row = Row(
-            law,
-            summary,
-            right_when,
-            fails_when,
-            frozenset(promises),
-            source,
-            bibtex,
-            make,
-            simplicity,
+            law=law,
+            summary=summary,
+            right_when=right_when,
+            fails_when=fails_when,
+            promises=frozenset(promises),
+            source=source,
+            bibtex=bibtex,
+            make=make,
+            simplicity=simplicity,
         )
         unknown = [key for key in row.required if key not in ADVISED]
         if simplicity is not None and unknown:
@@ -170,9 +170,10 @@ def _place(law: type[Law]) -> tuple[str, str]:
 def registered_laws(
     values: Mapping[str, Any], names: Iterable[str] | None = None
 ) -> tuple[dict[str, Law], dict[str, str]]:
-    """Laws of these names, from parameters by name; and why others are left out.
+    """Laws by name, made from `values` of parameters by name, and the reasons others are left out.
 
-    `names`: in the registry, in their order; None: all. A parameter that no law has is refused.
+    `names`: those in the registry to make, in this order; None: all. A law without a value for a
+    required parameter is left out. Raise a ValueError for a parameter that no law has.
 
     >>> import jimpact as ji
     >>> from jimpact.core.registry import registered_laws

@@ -1,4 +1,4 @@
-"""Scenes: what an impact depends on of a mechanical system at one instant.
+"""Scenes: mass matrix, contact normals and gaps of a mechanical system at one instant.
 
 # notation, used in every file:
 #   n, m             velocity coordinates, contacts
@@ -43,7 +43,7 @@ _SYMMETRY_TOLERANCE = 1e-6
 
 # Part of the length of a normal by which tangents may miss right angles, or its length, before a
 # warning. Ten times more would pass a tilt of half a degree.
-_SQUARE = 1e-3
+_ORTHONORMAL_WITHIN = 1e-3
 
 # Least eigenvalue of the products of a contact's directions, of length 1 in the metric of the mass,
 # below which they depend on each other. Ten times more reports bodies that turn very easily.
@@ -79,15 +79,15 @@ class PairNormals(eqx.Module):
         return self.neighbours.count * self.directions.shape[2]
 
     def _at_bodies(self, v: jax.Array) -> jax.Array:
-        """Velocities (m, 2, d) of the bodies of each contact."""
+        """Entries (m, 2, d) of v (n,) that belong to the two bodies of each contact."""
         return v.reshape(self.neighbours.count, -1)[self.neighbours.bodies]
 
     def rates(self, v: jax.Array) -> jax.Array:
-        """`N^T v` (m,)."""
+        """Gap velocities `N^T v` (m,) [m/s] of v (n,)."""
         return jnp.sum(self.directions * self._at_bodies(v), axis=(1, 2))
 
     def push(self, p: jax.Array) -> jax.Array:
-        """`N p` (n,)."""
+        """Generalized impulses `N p` (n,) of contact impulses p (m,) [N s]."""
         d = self.directions.shape[2]
         forces = (self.directions * p[:, None, None]).reshape(-1, d)
         bodies = self.neighbours.bodies.reshape(-1)
@@ -97,11 +97,16 @@ class PairNormals(eqx.Module):
 
     @full_precision
     def delassus(self, mass: jax.Array) -> Sparse:
-        """W for masses (n,)."""
-        moved = self.directions / self._at_bodies(mass)
+        """W = N^T M^-1 N [1/kg] for a diagonal M = `mass` (n,).
+
+        Equation: `W_jk = sum d_js . d_kt / m` over bodies s of contact j that are body t of contact
+        k, d_js the direction of contact j at its body s.
+        """
+        moved = self.directions / self._at_bodies(mass)  # M^-1 N
         table, shared = self.neighbours.of_contacts, self.neighbours.shared
-        other = jnp.einsum("msd,mktd->mkst", moved, self.directions[table])
-        entries = jnp.sum(jnp.where(shared, other, 0.0), axis=(2, 3))
+        # (contact, neighbour, own body, the neighbour's body)
+        products = jnp.einsum("msd,mktd->mkst", moved, self.directions[table])
+        entries = jnp.sum(jnp.where(shared, products, 0.0), axis=(2, 3))
         return Sparse(jnp.sum(moved * self.directions, axis=(1, 2)), entries, self.neighbours)
 
     def dense(self) -> jax.Array:
@@ -150,6 +155,7 @@ class Scene(eqx.Module):
         gaps: Any = None,
         constraints: Any = None,
     ):
+        """Set the fields, arrays of floats, and check shapes and values."""
         self.mass = as_float_array("mass", mass)
         self._normals = as_float_array("normals", normals)
         self.tangents = None if tangents is None else as_float_array("tangents", tangents)
@@ -167,7 +173,7 @@ class Scene(eqx.Module):
         return " A body has a scene at each configuration: `.scene(q)`." if body else ""
 
     def __str__(self) -> str:
-        """Sizes, masses and gaps, in numbers."""
+        """Lines with the sizes n and m, masses, normals and gaps."""
         kind = "scene"
         if self.walls is not None:
             walls = next(name for name, sides in WALLS.items() if sides == self.walls)
@@ -201,7 +207,7 @@ class Scene(eqx.Module):
 
     @property
     def normals(self) -> jax.Array:
-        """`grad f`, shape (n, m); a chain and a packing build it on demand."""
+        """`N = grad f` (n, m); a chain and a packing build it on demand."""
         if isinstance(self._normals, PairNormals):
             return self._normals.dense()
         if self._normals is not None:
@@ -279,16 +285,17 @@ def rounded_gaps(gaps: Any) -> jax.Array:
 
 
 def with_gaps(scene: Scene, gaps: jax.Array) -> Scene:
-    """The scene with these gaps (m,) [m], without their rounding."""
+    """The scene with these gaps (m,) [m]; those below `GAP_ROUNDING` become 0."""
     gaps = rounded_gaps(gaps)
     return eqx.tree_at(lambda tree: tree.gaps, scene, gaps, is_leaf=lambda x: x is None)
 
 
 def stackable(scenes: Sequence[Scene]) -> tuple[list[Scene], int]:
-    """The scenes padded to equal structure and sizes, and the number of added coordinates.
+    """The scenes padded to one number of contacts and of coordinates, and how many are added.
 
-    Scenes with fewer contacts than the largest one get open contacts, each between coordinates of
-    its own at the end: where these move at unit speed, the contact separates.
+    Scenes with fewer contacts than the largest one get open contacts, each with coordinates of its
+    own at the end: where these move at unit speed, the contact separates. Equal ones stay as they
+    are.
 
     Raises:
         ValueError: tangents in some scenes only, planar and spatial ones, or other numbers of
@@ -310,24 +317,25 @@ def stackable(scenes: Sequence[Scene]) -> tuple[list[Scene], int]:
                 f"Argument `scenes` must have equally many {what} in all shots, but have "
                 f"{' and '.join(map(str, sorted(numbers)))}."
             )
-    (each,) = tangents
+    (each,) = tangents  # of a contact
     most = max(s.contacts for s in scenes)
-    extra = (most - min(s.contacts for s in scenes)) * (1 + each)
+    extra = (most - min(s.contacts for s in scenes)) * (1 + each)  # a coordinate for each direction
     dense = any(s.mass.ndim == 2 for s in scenes)
     return [_with_open_contacts(s, most, s.size + extra, dense) for s in scenes], extra
 
 
 def _with_open_contacts(scene: Scene, contacts: int, size: int, dense_mass: bool) -> Scene:
-    """The scene padded on the host to this number of contacts and of coordinates.
+    """The scene padded on the host to a number of `contacts` and of coordinates (`size`).
 
-    The contacts that are added come last: they are open, as heavy as the last one, and between
-    coordinates of their own, so that they do not change units and tolerances.
+    The contacts that are added come last and are open. Each has a coordinate of its own for each
+    direction, of mass 1; their W_jj is that of the last contact (without constraints), so that they
+    do not change units and tolerances. With `dense_mass` M is (n, n) in any case.
     """
     n, m, missing = scene.size, scene.contacts, contacts - scene.contacts
     mass, normals = np.asarray(scene.mass), np.asarray(scene.normals)
     last = normals[:, -1]
     moved = last / mass if mass.ndim == 1 else np.linalg.solve(mass, last)
-    columns = np.sqrt(last @ moved) * np.eye(size, dtype=mass.dtype)[:, n:]
+    columns = np.sqrt(last @ moved) * np.eye(size, dtype=mass.dtype)[:, n:]  # added directions
     if dense_mass or mass.ndim == 2:
         padded_mass = np.eye(size, dtype=mass.dtype)
         padded_mass[:n, :n] = np.diag(mass) if mass.ndim == 1 else mass
@@ -335,7 +343,7 @@ def _with_open_contacts(scene: Scene, contacts: int, size: int, dense_mass: bool
         padded_mass = np.pad(mass, (0, size - n), constant_values=1)
 
     def padded(matrix: Any, first: int, count: int) -> np.ndarray:
-        """A matrix (n, k) with rows of 0 below, and `count` of the new columns from `first`."""
+        """A matrix (n, k) with rows of 0 below, and `count` added directions from `first` on."""
         above = np.pad(np.asarray(matrix), ((0, size - n), (0, 0)))
         return np.concatenate([above, columns[:, first : first + count]], axis=1)
 
@@ -358,17 +366,20 @@ def _padded_gaps(scene: Scene, missing: int) -> Any:
 
 
 class PaddedScene(NamedTuple):
-    """A scene with open contacts added, where its own coordinates and contacts are in it, and the
-    index (contacts,) of the contact whose parameters each one takes."""
+    """A scene with open contacts added."""
 
     scene: Scene
-    coordinates: slice
-    contacts: slice
-    copied: Any
+    coordinates: slice  # of its own coordinates among all
+    contacts: slice  # of its own contacts among all
+    copied: Any  # array (contacts,), own contact whose parameters each contact takes
 
 
 def pad_scene(scene: Scene, contacts: int) -> PaddedScene:
-    """The scene with this number of contacts, on the host: scenes of other sizes share programs."""
+    """The scene with a number of `contacts`, on the host: scenes of many sizes share programs.
+
+    A chain stays a chain, with bodies added at one end that repeat its masses there; other scenes
+    get coordinates of their own for the contacts that are added.
+    """
     n, m = scene.size, scene.contacts
     missing = contacts - m
     copied = np.minimum(np.arange(contacts), m - 1)
@@ -378,7 +389,7 @@ def pad_scene(scene: Scene, contacts: int) -> PaddedScene:
         return PaddedScene(padded, slice(n), slice(m), copied)
     mass: Any = np.asarray(scene.mass)
     gaps = _padded_gaps(scene, missing)
-    if scene.walls[1]:  # what is added comes before it, in mirror image
+    if scene.walls[1]:  # bodies are added on the left, as the chain must end at its right wall
         mass = np.concatenate([np.resize(mass[1::-1], missing)[::-1], mass])
         padded = chain_scene(mass, scene.walls, np.roll(gaps, missing))
         inside = slice(missing, None)
@@ -401,7 +412,7 @@ def as_velocity(scene: Scene, velocity: Any, finite: bool = False) -> jax.Array:
 
 
 def velocity_unit(scene: Scene) -> str:
-    """Of the velocities: m/s of a chain; others may turn.
+    """Unit of the velocities: m/s of a chain; those of other scenes may be angular, too.
 
     >>> import jimpact as ji
     >>> from jimpact.core import velocity_unit
@@ -492,7 +503,10 @@ def dense_mass(scene: Scene) -> np.ndarray:
 
 @full_precision
 def solve_mass(scene: Scene, right: jax.Array) -> jax.Array:
-    """`M^-1 right`, with the reactions of bilateral constraints if the scene has any."""
+    """`M^-1 b` of `right` b (n,) or (n, k), with the reactions of bilateral constraints.
+
+    Equation: `y = x - M^-1 h (h^T M^-1 h)^-1 h^T x`, `x = M^-1 b`, with constraints h: `h^T y = 0`.
+    """
     free = solve_mass_matrix(scene.mass, right)
     if scene.constraints is None:
         return free
@@ -547,7 +561,7 @@ def chain_scene(masses: jax.Array, walls: tuple[bool, bool], gaps: jax.Array | N
     return _unchecked(mass=masses, walls=walls, gaps=gaps)
 
 
-def sparse_scene(mass: jax.Array, directions: jax.Array, bodies: Any, count: int) -> Scene:
+def sparse_scene(mass: jax.Array, directions: jax.Array, bodies: np.ndarray, count: int) -> Scene:
     """A packing: m frictionless contacts between two of `count` bodies each.
 
     `mass` (n,), `directions` (m, 2, n / count) of `bodies` (m, 2), where -1 is none (a wall): its
@@ -565,7 +579,7 @@ def _unchecked(**fields: Any) -> Scene:
 
 
 def _check_scene(scene: Scene) -> None:
-    """Raise a ValueError for shapes or values that no scene has."""
+    """Raise a ValueError unless shapes and values are those that `Scene` documents."""
     mass, normals = scene.mass, scene.normals
     if mass.ndim not in (1, 2) or (mass.ndim == 2 and mass.shape[0] != mass.shape[1]):
         raise ValueError(
@@ -645,7 +659,7 @@ def _check_directions(scene: Scene) -> None:
 
 
 def _is_oblique(mass: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Contacts (m,) whose directions (m, n, d) are not orthonormal in the bodies' positions.
+    """True (m,) for contacts whose directions (m, n, d) are not orthonormal in bodies' positions.
 
     A scene does not say which coordinates are positions. The candidates are the uncoupled
     coordinates of one and the same mass. Let D be the rows of the d directions for them, b the
@@ -662,24 +676,24 @@ def _is_oblique(mass: np.ndarray, directions: np.ndarray) -> np.ndarray:
         part = directions[:, position]
         gram = np.swapaxes(part, 1, 2) @ part
         bodies, moved = gram[:, 0, 0], moves[:, position].sum(axis=1)  # b, of unit normals
-        are_positions = np.isclose(moved, count * bodies, rtol=_SQUARE) & (bodies > 0)
+        are_positions = np.isclose(moved, count * bodies, rtol=_ORTHONORMAL_WITHIN) & (bodies > 0)
         error = np.abs(gram - bodies[:, None, None] * np.eye(count)).max(axis=(1, 2))
-        oblique |= are_positions & (error > _SQUARE * bodies)
+        oblique |= are_positions & (error > _ORTHONORMAL_WITHIN * bodies)
     return oblique
 
 
 def _has_body(normals: Any) -> Any:
-    """Contacts (m,) whose normal is not zero."""
+    """True (m,) for contacts whose normal, a column of `normals` (n, m), is not zero."""
     return (normals != 0).any(axis=0)
 
 
 def _is_symmetric(mass: Any) -> Any:
-    """Whether () M (n, n) is symmetric but for rounding."""
+    """True () if M (n, n) is symmetric but for rounding."""
     return abs(mass - mass.T).max() <= _SYMMETRY_TOLERANCE * abs(mass).max()
 
 
 def is_allowed(scene: Scene) -> jax.Array:
-    """Whether () the values of a traced scene are those that `Scene` allows on the host.
+    """True () if the values of a traced scene are those that `Scene` allows on the host.
 
     NaN is not looked for; a dense M that is not positive definite gives energies without a value,
     a normal that is zero gives a contact without a scale.

@@ -93,13 +93,17 @@ class Binary(Law):
         friction: Any = None,
         tangential_restitution: Any = 0.0,
     ):
+        """Set the fields; their declarations check them. Without friction e_t must be 0."""
         self.restitution, self.order, self.max_collisions = restitution, order, max_collisions
         self.friction, self.tangential_restitution = friction_fields(
             friction, tangential_restitution
         )
 
     def check(self, scene: Scene, dtype: jnp.dtype) -> None:
-        """An order that names no such contact, or leaves one out, is an error."""
+        """Raise a ValueError for an `order` with contacts that do not exist, are missing or repeat.
+
+        A contact may be named several times, but not twice in a row: it separates at once.
+        """
         if isinstance(self.order, str):
             return
         m = scene.contacts
@@ -122,18 +126,18 @@ class Binary(Law):
 
     @full_precision
     def impulses(self, contact: Contact) -> Impulses:
-        """Sum of the impulses of all collisions; gaps matter in the order 'earliest'."""
+        """Sums p (m,), p_t (t,) [N s] of the impulses of all collisions, and status."""
         p, tangential, end = self._solve(contact)
         return Impulses(p, tangential, end.code)
 
     def _cycle(self, m: int) -> tuple[int, ...] | None:
-        """The contacts in turn; None: the fastest or the earliest one is next."""
+        """Indices of the m contacts in cyclic order; None: the fastest or earliest one is next."""
         if isinstance(self.order, tuple):
             return self.order
         return tuple(range(m)) if self.order == "left_to_right" else None
 
     def _gaps(self, gaps: jax.Array | None, gamma: jax.Array) -> jax.Array | None:
-        """Gaps (m,) where they decide the order, else None."""
+        """Gaps (m,) [m] in the order 'earliest', 0 where none are given; None in other orders."""
         if self.order != "earliest":
             return None
         return jnp.zeros_like(gamma) if gaps is None else gaps
@@ -150,7 +154,7 @@ class Binary(Law):
     def _solve(
         self, contact: Contact
     ) -> tuple[jax.Array, jax.Array | None, collisions.SequenceEnd]:
-        """Impulses, and how the sequence ended."""
+        """Impulses p (m,), p_t (t,) [N s], with the status code and number of collisions."""
         gamma = contact.gap_velocity
         return collisions.solve(
             contact.delassus,
@@ -208,14 +212,14 @@ class Binary(Law):
         steps: list[tuple[int, float | None, np.ndarray]] = []
         while len(steps) < min(limit, self.max_collisions) and collisions.approaches(inputs, at):
             before, at = at, _collide(inputs, options, g, at)
-            j = int(jnp.argmax(at.p - before.p))
+            j = int(jnp.argmax(at.p - before.p))  # only this contact gained an impulse
             time = float(at.time) if law.order == "earliest" else None
             p, tangential = collisions.impulses_of(at.p, at.tangential, inputs.root)
             steps.append((j, time, np.asarray(v + velocity_change(scene, p, tangential))))
         return steps
 
     def _prepared(self, scene: Scene, velocity: Any) -> tuple["Binary", Scene, jax.Array]:
-        """Law, scene and velocity checked and in one dtype."""
+        """The law, the scene and v- (n,) [m/s], checked and in one floating-point type."""
         v = as_velocity(scene, velocity)
         check_values("velocity", v)
         law, scene, v = in_common_dtype(self, scene, v)
@@ -226,7 +230,7 @@ class Binary(Law):
 
 @precise_jit
 def _count(law: Binary, scene: Scene, velocity: jax.Array) -> jax.Array:
-    """Number of collisions."""
+    """Number of collisions () int32; -1: endless."""
     return law._solve(law.contact(scene, velocity))[2].number
 
 

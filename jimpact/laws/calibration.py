@@ -4,6 +4,7 @@ A pair's coefficient of restitution does not determine what a chain does: forces
 the same speed spread an impact differently (docs/compliant.md).
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -94,42 +95,50 @@ def calibrate(force: Force, restitution: Any, mass: Any, speed: Any) -> Force:
 
 
 @precise_jit
-def _each(function: Any, force: Force, *values: jax.Array) -> jax.Array:
-    """`function(force, *values)` of scalars, over their common shape."""
+def _each(function: Callable[..., jax.Array], force: Force, *values: jax.Array) -> jax.Array:
+    """`function(force, *values)`, a function of scalars, for each entry of their common shape.
+
+    Arrays of the force are broadcast with `values`, but those of a `UserForce` are passed on as
+    they are: they need not belong to contacts.
+    """
     arrays = eqx.filter(force, eqx.is_array)
-    if isinstance(force, UserForce):  # its arrays are not contact by contact
+    if isinstance(force, UserForce):
         arrays = None
     shapes = [leaf.shape for leaf in jax.tree.leaves(arrays)]
-    shape = jnp.broadcast_shapes(*shapes, *(jnp.shape(z) for z in values))
-    spread = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, shape).ravel(), (arrays, values))
+    shape = jnp.broadcast_shapes(*shapes, *(jnp.shape(value) for value in values))
+    flat = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, shape).ravel(), (arrays, values))
     fixed = force if arrays is None else eqx.filter(force, eqx.is_array, inverse=True)
-    run = jax.vmap(lambda leaves, rest: function(eqx.combine(leaves, fixed), *rest))
-    return run(*spread).reshape(shape)
+    run = jax.vmap(lambda leaves, scalars: function(eqx.combine(leaves, fixed), *scalars))
+    return run(*flat).reshape(shape)
 
 
 def _integrated(force: Force, mass: jax.Array, speed: jax.Array) -> jax.Array:
-    """e of one pair by its impact against a wall; NaN where it does not end."""
+    """e = -v+ / v- () of a mass [kg] that hits a wall at a speed [m/s]; NaN where it has no end."""
     law = Compliant(force, rtol=RTOL.get(str(jnp.result_type(mass, speed))))
     out = impact(law, chain(mass[None], wall=True), speed[None])
     return jnp.where(out.status == 0, -out.velocity[0] / speed, jnp.nan)
 
 
 def _damping(force: Force, mass: jax.Array, speed: jax.Array, e: jax.Array) -> jax.Array:
-    """The damping with which one pair has the restitution e, all arguments scalars."""
-    unit = force.damping_scale(mass, speed)
-    assert unit is not None  # `calibrate` has looked
+    """Damping () with which a pair of reduced `mass` [kg] has the restitution e at a speed [m/s].
+
+    Equation: `damping = scale s / (1 - s)` of the force's `damping_scale`, s in [0, 1) the root of
+    `e - e(s)`, by bisection; derivatives by the implicit function theorem.
+    """
+    scale = force.damping_scale(mass, speed)
+    assert scale is not None  # `calibrate` has checked
 
     def excess(s: jax.Array) -> jax.Array:
-        """e less that of the damping `unit s / (1 - s)`: from 0 on, s from 0 to 1."""
-        damped = with_parameter(force, "damping", unit * s / (1 - s))
+        """`e - e(s)` (), increasing: restitution asked for less that of this damping."""
+        damped = with_parameter(force, "damping", scale * s / (1 - s))
         known = damped.pair_restitution(mass, speed)
         return e - (_integrated(damped, mass, speed) if known is None else known)
 
-    def halved(f: Any, guess: jax.Array) -> jax.Array:
-        """The root of an increasing function between 0 and `STRONGEST`."""
+    def bisected(f: Callable[[jax.Array], jax.Array], guess: jax.Array) -> jax.Array:
+        """The root () of an increasing function f between 0 and `STRONGEST`."""
 
         def half(_: Any, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-            """The half of an interval in which the sign changes."""
+            """The half of an interval (low, high) in which f changes sign."""
             low, high = ends
             middle = (low + high) / 2
             below = f(middle) < 0
@@ -139,5 +148,9 @@ def _damping(force: Force, mass: jax.Array, speed: jax.Array, e: jax.Array) -> j
         low, high = jax.lax.fori_loop(0, BISECTIONS, half, ends)
         return (low + high) / 2
 
-    s = jax.lax.custom_root(excess, jnp.zeros_like(e), halved, lambda g, y: y / g(jnp.ones_like(y)))
-    return unit * s / (1 - s)
+    def scalar_solve(linear: Callable[[jax.Array], jax.Array], right: jax.Array) -> jax.Array:
+        """x with `linear(x) = right`, a linear function of a scalar."""
+        return right / linear(jnp.ones_like(right))
+
+    s = jax.lax.custom_root(excess, jnp.zeros_like(e), bisected, scalar_solve)
+    return scale * s / (1 - s)

@@ -39,21 +39,21 @@ DECAYED = {"float64": 1e-9, "float32": 3e-4}
 
 
 class CoulombFriction(NamedTuple):
-    """The tangential block, normalized by the `sqrt(W_jj)` of each contact, and its parameters."""
+    """Coulomb friction of m contacts with t tangents."""
 
-    block: TangentialBlock
+    block: TangentialBlock  # normalized by the `sqrt(W_jj)` of each contact in `Inputs`
     coefficient: jax.Array  # mu (m,)
     restitution: jax.Array  # e_t (m,)
 
 
 class Inputs(NamedTuple):
-    """The normalized problem; `coupling` holds the entries of G off its unit diagonal."""
+    """The normalized problem of a sequence of collisions."""
 
-    coupling: jax.Array
-    restitution: jax.Array  # () or (m,): a scalar costs one tangent, not m
-    qn: jax.Array
-    root: jax.Array  # sqrt(W_jj), only compared
-    gaps: jax.Array | None  # None: no free flight
+    coupling: jax.Array  # entries of G above its unit diagonal, row by row; of a chain beside it
+    restitution: jax.Array  # e () or (m,): a scalar costs one tangent, not m
+    qn: jax.Array  # normalized gap velocities (m,)
+    root: jax.Array  # sqrt(W_jj) (m,), only for comparisons
+    gaps: jax.Array | None  # (m,) [m]; None: no free flight
     friction: CoulombFriction | None = None
     # p_j of contacts beside the one that collides, over its p_i: (), (m,), or (m, m) in row i
     ratio: jax.Array | None = None
@@ -68,35 +68,35 @@ class Options(NamedTuple):
 
 
 class CollisionState(NamedTuple):
-    """State of the sequence between two collisions; `place`: next entry of a cyclic order."""
+    """State of the sequence between two collisions."""
 
-    qn: jax.Array
-    p: jax.Array
-    number: jax.Array
-    place: jax.Array
-    speed: jax.Array  # normalized approach velocity of the last collision
-    tied: jax.Array
-    gaps: jax.Array | None
-    time: jax.Array
-    slip: jax.Array | None  # (t,) with friction
-    tangential: jax.Array | None  # impulses (t,)
-    code: jax.Array  # the worst status of a collision with friction
+    qn: jax.Array  # normalized gap velocities (m,)
+    p: jax.Array  # normalized impulses so far (m,)
+    number: jax.Array  # () of collisions so far
+    place: jax.Array  # () next entry of a cyclic order
+    speed: jax.Array  # () normalized approach velocity of the last collision
+    tied: jax.Array  # () True if some choice of the next collision was tied
+    gaps: jax.Array | None  # (m,) [m]
+    time: jax.Array  # () [s] of free flight so far
+    slip: jax.Array | None  # normalized slip velocities (t,) with friction
+    tangential: jax.Array | None  # normalized tangential impulses so far (t,)
+    code: jax.Array  # () the worst status of a collision with friction or correlation
 
 
 class NextCollision(NamedTuple):
-    """The next collision: contact, next place in the cycle, time until then, tied or not."""
+    """The contact that collides next."""
 
-    contact: jax.Array
-    place: jax.Array
-    wait: jax.Array
-    tied: jax.Array
+    contact: jax.Array  # () its index
+    place: jax.Array  # () entry of a cyclic order after it
+    wait: jax.Array  # () [s] of free flight until then
+    tied: jax.Array  # () True if a contact coupled with it could as well be the next one
 
 
 class SequenceEnd(NamedTuple):
-    """Integers of a finished run: status code and number of collisions (-1: endless)."""
+    """Status and number of collisions of a finished sequence."""
 
-    code: jax.Array
-    number: jax.Array
+    code: jax.Array  # () status
+    number: jax.Array  # () of collisions; -1: endless
 
 
 def solve(
@@ -109,7 +109,20 @@ def solve(
     friction: CoulombFriction | None = None,
     ratio: jax.Array | None = None,
 ) -> tuple[jax.Array, jax.Array | None, SequenceEnd]:
-    """Impulses p (m,), p_t (t,) [N s] and how it ended, differentiable in both modes."""
+    """Impulses p (m,), p_t (t,) [N s] of a sequence of collisions, and its end.
+
+    Args:
+        delassus: W (m, m) [1/kg].
+        gamma: gap velocities before the impact (m,) [m/s].
+        restitution: e, () or (m,).
+        gaps: (m,) [m], which decide the order; None: no free flight.
+        cycle: contacts in cyclic order; None: the fastest one, with gaps the first to close.
+        max_collisions: largest number of collisions.
+        friction: friction in SI units; None: none.
+        ratio: impulse correlation ratios, see `Inputs`; None: a collision is one contact's.
+
+    Differentiable in both modes.
+    """
     inputs = to_inputs(delassus, gamma, restitution, gaps, friction)._replace(ratio=ratio)
     options = Options(cycle, max_collisions, isinstance(delassus, Tridiagonal))
     (p, tangential), end = by_jacobian(lambda problem: run(problem, options), inputs)
@@ -119,7 +132,7 @@ def solve(
 def impulses_of(
     p: jax.Array, tangential: jax.Array | None, root: jax.Array
 ) -> tuple[jax.Array, jax.Array | None]:
-    """p (m,) and p_t (t,) [N s] of normalized ones."""
+    """Impulses p (m,), p_t (t,) [N s] of normalized ones: `p_j = pbar_j / root_j`."""
     if tangential is None:
         return p / root, None
     return p / root, tangential / per_tangent(root, tangential)
@@ -132,7 +145,10 @@ def to_inputs(
     gaps: jax.Array | None,
     friction: CoulombFriction | None = None,
 ) -> Inputs:
-    """The normalized problem. Gaps and `sqrt(W_jj)` only order the collisions: no derivatives."""
+    """The normalized problem: `qn = gamma / d`, `G = W / (d d^T)`, `d_j = sqrt(W_jj)` (root).
+
+    The fields `gaps` and `root` only decide the order of collisions, and have no derivatives.
+    """
     root = jnp.sqrt(diagonal(delassus))
     g = scaled(delassus, 1 / root)
     coupling = off_diagonal(g if isinstance(g, Tridiagonal) else as_matrix(g))
@@ -150,7 +166,11 @@ def to_inputs(
 
 
 def run(inputs: Inputs, options: Options) -> tuple[tuple[jax.Array, jax.Array | None], SequenceEnd]:
-    """Normalized impulses and the end of the sequence."""
+    """Normalized impulses (p (m,), p_t (t,)) of all collisions, and the end of the sequence.
+
+    Endless sequences end in the plastic limit, gamma = 0: of two contacts by `endless_pair`, of
+    more where speeds of collisions have decayed (`DECAYED`).
+    """
     g = coupling_matrix(inputs, options)
     start = begin(inputs)
     pair = inputs.qn.shape[0] == 2 and inputs.friction is None and inputs.ratio is None
@@ -161,7 +181,7 @@ def run(inputs: Inputs, options: Options) -> tuple[tuple[jax.Array, jax.Array | 
         endless = endless & approaches(inputs, start)
 
     def unfinished(at: CollisionState) -> jax.Array:
-        """Whether there is a collision to come, and the limit is not reached."""
+        """True () if another collision follows, and the largest number is not reached."""
         return ~endless & approaches(inputs, at) & (at.number < options.max_collisions)
 
     end = while_loop(unfinished, lambda at: collide(inputs, options, g, at), start)
@@ -178,7 +198,7 @@ def run(inputs: Inputs, options: Options) -> tuple[tuple[jax.Array, jax.Array | 
 
 
 def coupling_matrix(inputs: Inputs, options: Options) -> Symmetric:
-    """G with its unit diagonal, tridiagonal for a chain."""
+    """G (m, m) of its entries off the unit diagonal, `inputs.coupling`; tridiagonal for a chain."""
     m, dtype = inputs.qn.shape[0], inputs.qn.dtype
     if options.chain:
         return Tridiagonal(jnp.ones(m, dtype), inputs.coupling)
@@ -188,22 +208,22 @@ def coupling_matrix(inputs: Inputs, options: Options) -> Symmetric:
 
 
 def scale_of(inputs: Inputs) -> jax.Array:
-    """Largest normalized approach velocity at the start."""
+    """Largest normalized approach velocity at the start () [sqrt(J)]."""
     return jax.lax.stop_gradient(jnp.max(jnp.maximum(-inputs.qn, 0.0)))
 
 
 def rest_of(inputs: Inputs) -> jax.Array:
-    """Normalized approach velocities up to this are rounding."""
+    """Largest normalized approach velocity () [sqrt(J)] that counts as rounding."""
     return REST * precision(inputs.qn.dtype).eps * scale_of(inputs)
 
 
 def approaches(inputs: Inputs, at: CollisionState) -> jax.Array:
-    """Whether a contact approaches by more than rounding."""
+    """True () if a contact approaches by more than rounding."""
     return jnp.any(at.qn < -rest_of(inputs))
 
 
 def begin(inputs: Inputs) -> CollisionState:
-    """Before the first collision."""
+    """State before the first collision."""
     dtype = inputs.qn.dtype
     zero = jnp.array(0, jnp.int32)
     return CollisionState(
@@ -222,14 +242,19 @@ def begin(inputs: Inputs) -> CollisionState:
 
 
 def choose(inputs: Inputs, options: Options, g: Symmetric, at: CollisionState) -> NextCollision:
-    """The next contact to collide; some contact approaches."""
+    """The contact that collides next, at a state with contacts that approach.
+
+    In a cyclic order it is the next one that approaches. Else it is the fastest one [m/s], with
+    gaps among those that close first; the lowest index among equals within rounding, and `tied` if
+    one of these is coupled with it (G_ij != 0).
+    """
     rest = rest_of(inputs)
     approaching = at.qn < -rest
     if options.cycle is not None:
         cycle = jnp.array(options.cycle, jnp.int32)
-        turn = approaching[cycle]
-        ahead = turn & (jnp.arange(len(options.cycle), dtype=jnp.int32) >= at.place)
-        k = jnp.where(jnp.any(ahead), jnp.argmax(ahead), jnp.argmax(turn)).astype(jnp.int32)
+        ready = approaching[cycle]  # entries whose contact approaches
+        ahead = ready & (jnp.arange(len(options.cycle), dtype=jnp.int32) >= at.place)
+        k = jnp.where(jnp.any(ahead), jnp.argmax(ahead), jnp.argmax(ready)).astype(jnp.int32)
         return NextCollision(cycle[k], k + 1, jnp.zeros_like(at.time), jnp.array(False))
     speed = jnp.where(approaching, -at.qn * inputs.root, 0.0)  # m/s
     rivals, wait = approaching, jnp.zeros_like(speed)
@@ -237,19 +262,22 @@ def choose(inputs: Inputs, options: Options, g: Symmetric, at: CollisionState) -
         rivals, wait = first_to_close(inputs, at, approaching, speed)
     noise = rest * inputs.root
     fastest = jnp.max(jnp.where(rivals, speed - noise, -jnp.inf))
-    level = rivals & (speed + noise >= fastest)
-    j = jnp.argmax(level).astype(jnp.int32)  # the lowest index among equals
+    equally_fast = rivals & (speed + noise >= fastest)
+    j = jnp.argmax(equally_fast).astype(jnp.int32)
     chosen = jnp.arange(speed.shape[0], dtype=jnp.int32) == j
     floor = precision(speed.dtype).noise
     coupled = jnp.abs(times(g, chosen.astype(speed.dtype))) > floor
-    equals = rivals if at.gaps is not None else level
+    equals = rivals if at.gaps is not None else equally_fast
     return NextCollision(j, at.place, wait[j], jnp.any(equals & coupled & ~chosen))
 
 
 def first_to_close(
     inputs: Inputs, at: CollisionState, approaching: jax.Array, speed: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Contacts that close first, within rounding, and the time (m,) until each closes."""
+    """True (m,) for the contacts that close first, within rounding, and times (m,) [s] until then.
+
+    Equation: `t_j = gap_j / speed_j`, infinite for contacts that do not approach.
+    """
     assert at.gaps is not None
     assert inputs.gaps is not None
     safe = jnp.where(approaching, speed, 1.0)
@@ -267,31 +295,35 @@ def times(g: Symmetric, vector: jax.Array) -> jax.Array:
 
 
 def collide(inputs: Inputs, options: Options, g: Symmetric, at: CollisionState) -> CollisionState:
-    """One collision, after the free flight that leads to it."""
+    """State after the free flight to the next collision and this collision.
+
+    Equation: impulse `s = -(1 + e_j) qn_j` at the contact j that collides, `qn += G_j s`; with
+    friction or correlation ratios impulses of `_with_friction`, `_correlated`.
+    """
     choice = choose(inputs, options, g, jax.lax.stop_gradient(at))
     chosen = jnp.arange(at.qn.shape[0], dtype=jnp.int32) == choice.contact
     slip, tangential, code = at.slip, at.tangential, at.code
     if inputs.ratio is not None:
-        jump, status = _correlated(inputs, inputs.ratio, g, at, chosen)
-        after, code = at.qn + times(g, jump), jnp.maximum(code, status)
+        p, status = _correlated(inputs, inputs.ratio, g, at, chosen)
+        after, code = at.qn + times(g, p), jnp.maximum(code, status)
     elif inputs.friction is None:
-        jump = jnp.where(chosen, -(1 + inputs.restitution) * at.qn, 0.0)
-        after = jnp.where(chosen, -inputs.restitution * at.qn, at.qn + times(g, jump))
+        p = jnp.where(chosen, -(1 + inputs.restitution) * at.qn, 0.0)
+        after = jnp.where(chosen, -inputs.restitution * at.qn, at.qn + times(g, p))
     else:
         assert slip is not None
         assert tangential is not None
-        jump, jump_t, status = _with_friction(inputs, inputs.friction, at, choice.contact)
+        p, p_t, status = _with_friction(inputs, inputs.friction, at, choice.contact)
         cross, tangent, _ = inputs.friction.block
-        after = at.qn + times(g, jump) + cross @ jump_t
-        slip = slip + cross.T @ jump + tangent @ jump_t
-        tangential, code = tangential + jump_t, jnp.maximum(code, status)
+        after = at.qn + times(g, p) + cross @ p_t
+        slip = slip + cross.T @ p + tangent @ p_t
+        tangential, code = tangential + p_t, jnp.maximum(code, status)
     gaps = at.gaps
     if gaps is not None:
         flown = gaps + jax.lax.stop_gradient(at.qn) * inputs.root * choice.wait
         gaps = jnp.where(chosen, 0.0, jnp.maximum(flown, 0.0))
     return CollisionState(
         qn=after,
-        p=at.p + jump,
+        p=at.p + p,
         number=at.number + jnp.array(1, jnp.int32),
         place=choice.place,
         speed=jax.lax.stop_gradient(-at.qn[choice.contact]),
@@ -307,12 +339,14 @@ def collide(inputs: Inputs, options: Options, g: Symmetric, at: CollisionState) 
 def _correlated(
     inputs: Inputs, ratio: jax.Array, g: Symmetric, at: CollisionState, chosen: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Impulses (m,) of a collision that contacts beside the `chosen` one share, and its status.
+    """Normalized impulses (m,) of a collision at the `chosen` contact and at those it presses.
 
-    They grow as `pbar = s d`, d_j = 1 at the chosen contact. With a = G d contact j is compressed
-    while `qn_j + a_j s < 0`, and returns e_j^2 of the work of that. What is lost,
-    `L = sum (1 - e_j^2) d_j qn_j^2 / (2 a_j)`, is what kinetic energy loses:
-    `d.a s^2 / 2 + d.qn s + L = 0`, of which s is the larger root.
+    They grow in constant ratios, `pbar = s d`: d_i = 1 at the chosen contact i (True in (m,)),
+    `d_j = r_j sqrt(W_jj / W_ii)` beside it, r = `ratio`. With a = G d contact j is compressed while
+    `qn_j + a_j s < 0`, and returns e_j^2 of this work. The loss
+    `L = sum (1 - e_j^2) d_j qn_j^2 / (2 a_j)` is that of kinetic energy:
+    `d.a s^2 / 2 + d.qn s + L = 0`, and s is the larger root. The status is `infeasible` where there
+    is none, or a contact is left approaching; then the chosen contact collides alone.
     """
     noise = precision(at.qn.dtype).noise
     own = jnp.sum(jnp.where(chosen, inputs.root, 0.0))
@@ -334,17 +368,21 @@ def _correlated(
     left = at.qn + s * a
     allowed = allowed & ~jnp.any(((d > 0) | beside) & (left < -rest_of(inputs)))
     alone = jnp.where(chosen, -(1 + inputs.restitution) * at.qn, 0.0)
-    jump = jnp.where(allowed & jnp.any(beside), s * d, alone)
-    return jump, jnp.where(allowed, CODE["ok"], CODE["infeasible"])
+    p = jnp.where(allowed & jnp.any(beside), s * d, alone)
+    return p, jnp.where(allowed, CODE["ok"], CODE["infeasible"])
 
 
 def _with_friction(
     inputs: Inputs, friction: CoulombFriction, at: CollisionState, contact: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Impulses (m,) and (t,) of a collision at one contact, and its status."""
+    """Normalized impulses (m,), (t,) of a collision at one `contact` () with friction, and status.
+
+    Equation: `qn+ = -e qn-` where this needs an impulse `p >= 0`, and
+    `p_t in -mu p Sgn(u+ + e_t u-)`; impulses of other contacts are 0.
+    """
     m, t = friction.block.normal_tangent.shape
     each = t // m
-    rows = contact * each + jnp.arange(each, dtype=contact.dtype)
+    rows = contact * each + jnp.arange(each, dtype=contact.dtype)  # its tangents
     cross = friction.block.normal_tangent[contact, rows][None]
     tangent = friction.block.tangent[rows[:, None], rows[None]]
     matrix = jnp.block([[jnp.ones((1, 1), cross.dtype), cross], [cross.T, tangent]])
@@ -357,13 +395,13 @@ def _with_friction(
         friction.coefficient[contact][None],
         complementary=True,
     )
-    jump = jnp.zeros_like(at.qn).at[contact].set(impulses.normal[0])
-    jump_t = jnp.zeros_like(at.slip).at[rows].set(impulses.tangential)
-    return jump, jump_t, impulses.status
+    p = jnp.zeros_like(at.qn).at[contact].set(impulses.normal[0])
+    p_t = jnp.zeros_like(at.slip).at[rows].set(impulses.tangential)
+    return p, p_t, impulses.status
 
 
 def endless_pair(inputs: Inputs, first: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Whether two contacts collide without end, `first` to begin, and the impulses of that limit.
+    """True () if two contacts collide without end, `first` to begin, and the limit impulses (2,).
 
     Approach speeds of successive collisions at j, k, j, ... obey, c = -G_12,
 
@@ -378,19 +416,19 @@ def endless_pair(inputs: Inputs, first: jax.Array) -> tuple[jax.Array, jax.Array
     noise = precision(qn.dtype).noise
     e_j, e_k, s_1 = e[first], e[1 - first], -qn[first]
     s_2 = c * (1 + e_j) * s_1 - qn[1 - first]
-    both = e_j * e_k
+    det = e_j * e_k
     trace = c**2 * (1 + e_j) * (1 + e_k) - e_j - e_k
-    ratio = c * (1 + e_k) * s_2 / s_1 - e_j
-    chi = ratio**2 - trace * ratio + both
-    above = (ratio >= trace / 2) | (chi <= noise * (ratio**2 + trace * ratio + both))
-    possible = (c > 0) & (trace >= 2 * jnp.sqrt(jax.lax.stop_gradient(both)))
+    ratio = c * (1 + e_k) * s_2 / s_1 - e_j  # s_3 / s_1
+    chi = ratio**2 - trace * ratio + det
+    above = (ratio >= trace / 2) | (chi <= noise * (ratio**2 + trace * ratio + det))
+    possible = (c > 0) & (trace >= 2 * jnp.sqrt(jax.lax.stop_gradient(det)))
     endless = possible & (s_2 > 0) & (ratio >= 0) & above
     # redundant contacts (c = 1) have no inverse: there s_3 = e_1 e_2 s_1, a geometric series
-    free = 1 - c**2
-    redundant = free <= noise
-    other = -(qn + c * jnp.flip(qn)) / jnp.where(redundant, 1.0, free)
-    decay = jnp.where(both < 1, 1 - both, 1.0)
+    det_g = 1 - c**2
+    redundant = det_g <= noise
+    inverse = -(qn + c * jnp.flip(qn)) / jnp.where(redundant, 1.0, det_g)  # -G^-1 qn
+    decay = jnp.where(det < 1, 1 - det, 1.0)
     series_j, series_k = (1 + e_j) * s_1 / decay, (1 + e_k) * s_2 / decay
     chosen = jnp.arange(2, dtype=jnp.int32) == first
-    p = jnp.where(redundant, jnp.where(chosen, series_j, series_k), other)
-    return endless & ~(redundant & (both >= 1)), p
+    p = jnp.where(redundant, jnp.where(chosen, series_j, series_k), inverse)
+    return endless & ~(redundant & (det >= 1)), p

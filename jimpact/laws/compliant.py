@@ -79,7 +79,11 @@ class Compliant(Law):
     adjoint: str = option("jacobian", ADJOINTS)
 
     def __check_init__(self) -> None:
-        """Raise where `force` is not a force, or has no energy to store."""
+        """Raise a TypeError for a `force` that is none, a ValueError for what it does not allow.
+
+        A viscous or yielding force allows no `initial_energy`, a yielding one no friction and no
+        method 'implicit'.
+        """
         if not isinstance(self.force, Force):
             raise TypeError(
                 "Argument `force` must be a contact force such as Hertz(k), "
@@ -96,7 +100,7 @@ class Compliant(Law):
 
     @property
     def contact_force(self) -> Force:
-        """The force."""
+        """The contact force, its argument `force`."""
         return self.force
 
     @property
@@ -105,7 +109,7 @@ class Compliant(Law):
         return self.force.bistiffness is not None
 
     def check(self, scene: Scene, dtype: jnp.dtype) -> None:
-        """Raise for a tolerance finer than the precision can hold, and too many contacts."""
+        """Raise a ValueError for an `rtol` below rounding, or too many contacts with friction."""
         if self.rtol is not None:
             check_rtol(self.rtol, dtype)
         if self.friction is not None:
@@ -116,12 +120,17 @@ class Compliant(Law):
         return solver_of(self, contact)[1]
 
     def dynamics(self, contact: Contact) -> Dynamics:
-        """The dimensionless dynamics of the whole encounter."""
+        """The dimensionless dynamics of the whole encounter, gaps included.
+
+        Units are those of a power law k x^eta: of the `Bistiffness`, or, for other forces, of the
+        linear spring k = q^2 / x^2 that stores the energy q^2 / 2 of the fastest approach q
+        [sqrt(J)] at the indentation x at which the force does, too (`indentation_scale`).
+        """
         gamma, force, viscous = contact.gap_velocity, self.force, None
         bistiffness = force.bistiffness
         if bistiffness is not None:
             k, e, exponent = bistiffness.stiffness, bistiffness.restitution, bistiffness.exponent
-        else:  # in units of a spring that stores the impact's energy at the force's indentation
+        else:
             q = jnp.max(jnp.where(gamma < 0, -gamma, 0.0) / jnp.sqrt(diagonal(contact.delassus)))
             k = (q / force.indentation_scale(0.5 * q**2 * jnp.ones_like(gamma))) ** 2
             k, e, exponent = jax.lax.stop_gradient(k), jnp.ones_like(gamma), 1.0
@@ -141,7 +150,7 @@ class Compliant(Law):
             onset = jax.lax.stop_gradient(force.onset_scale(depth, speed))
             viscous = Viscous(force, depth, speed, units.momentum / units.time, onset)
         problem = problem._replace(viscous=viscous)
-        if bistiffness is not None and force.bound is not None:
+        if bistiffness is not None and force.bound is not None:  # yields where k x^eta = F_y
             depth = (force.bound / k) ** (1 / jnp.asarray(exponent, k.dtype))
             problem = problem._replace(limit=depth / units.indentation)
         if self.friction is not None:
@@ -151,7 +160,7 @@ class Compliant(Law):
 
     @full_precision
     def impulses(self, contact: Contact) -> Impulses:
-        """Impulses over the whole encounter, gaps included."""
+        """Impulses p (m,), p_t (t,) [N s] over the whole encounter, gaps included, and status."""
         checked = contact if self.check_conditioning else None
         return Impulses(*solve(self.dynamics(contact), checked))
 
@@ -167,7 +176,16 @@ def make_compliant(
     damping: Any = None,
     friction: Any = None,
 ) -> Compliant:
-    """`Compliant` from plain parameters, as in a study file."""
+    """`Compliant` from plain parameters, as in a study file.
+
+    Args:
+        stiffness: k > 0 [N / m^eta].
+        exponent: eta >= 1 of a bistiffness and of Hunt and Crossley's force.
+        restitution: e in [0, 1] of a bistiffness.
+        rheology: one of `RHEOLOGIES`.
+        damping: of a viscous rheology, in the unit of its force; None for a bistiffness.
+        friction: Coulomb's mu; None: none.
+    """
     viscous: dict[str, Callable[..., Force]] = {
         "kelvin-voigt": KelvinVoigt,
         "hunt-crossley": partial(HuntCrossley, exponent=exponent),

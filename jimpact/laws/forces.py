@@ -77,17 +77,20 @@ class Force(Declared):
         return None
 
     def indentation_scale(self, energy: jax.Array) -> jax.Array:
-        """Indentation (m,) [m] at which about `energy` (m,) [J] is stored: x F(x, 0) = 2 energy."""
+        """Indentation (m,) [m] at which about `energy` (m,) [J] is stored: x F(x, 0) = 2 energy.
+
+        By bisection of log10(x); no derivatives.
+        """
 
         def excess(log_x: jax.Array) -> jax.Array:
-            """x F less twice the energy."""
+            """`x F(x, 0) - 2 energy` (m,) [J] at decades log10(x) (m,)."""
             x = 10.0**log_x
             return x * self.force(x, jnp.zeros_like(x)) - 2 * energy
 
         low, high = (jnp.full_like(energy, end) for end in _SEARCH)
 
         def halve(_: int, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-            """The half in which the excess changes sign."""
+            """The half of the intervals (low, high) in which the excess changes sign."""
             middle = 0.5 * (ends[0] + ends[1])
             above = excess(middle) > 0
             return jnp.where(above, ends[0], middle), jnp.where(above, middle, ends[1])
@@ -133,7 +136,7 @@ class Bistiffness(Force):
         return jnp.broadcast_to(self.restitution, shape)
 
     def force(self, x: jax.Array, rate: jax.Array) -> jax.Array:
-        """Loading branch."""
+        """Force of the loading branch, `k x^eta` (m,) [N], 0 at x <= 0."""
         positive = x > 0
         power = jnp.where(positive, x, 1.0) ** jnp.asarray(self.exponent, x.dtype)
         return self.stiffness * jnp.where(positive, power, 0.0)
@@ -183,13 +186,13 @@ class ElastoPlastic(Force):
         return self.yield_force
 
     def pair_restitution(self, mass: jax.Array, speed: jax.Array) -> jax.Array:
-        """min(1, v_y / v)."""
+        """`e = min(1, v_y / v)` with `m v_y^2 / 2` the elastic energy at the yield force."""
         eta = jnp.asarray(self.exponent, mass.dtype)
         energy = self.yield_force ** ((eta + 1) / eta) / (eta + 1) / self.stiffness ** (1 / eta)
         return jnp.minimum(1.0, jnp.sqrt(2 * energy / mass) / speed)
 
     def force(self, x: jax.Array, rate: jax.Array) -> jax.Array:
-        """Of a first loading."""
+        """Force of a first loading, `min(k x^eta, F_y)` (m,) [N]."""
         return jnp.minimum(self.bistiffness.force(x, rate), self.yield_force)
 
 
@@ -277,7 +280,7 @@ class KelvinVoigt(Force):
         return 2 * jnp.sqrt(self.stiffness * mass)
 
     def pair_restitution(self, mass: jax.Array, speed: jax.Array) -> jax.Array:
-        """e of the damped spring, at every speed."""
+        """e of the damped spring with `zeta = c / (2 sqrt(k m))`, at every speed."""
         zeta = self.damping / (2 * jnp.sqrt(self.stiffness * mass))
         return _damped_spring(zeta) + jnp.zeros_like(speed)
 
@@ -315,7 +318,7 @@ class HuntCrossley(Force):
         return 1 / speed
 
     def force(self, x: jax.Array, rate: jax.Array) -> jax.Array:
-        """`k x^eta (1 + d x')`."""
+        """Force `k x^eta (1 + d x')` (m,) [N], 0 at x <= 0."""
         positive = x > 0
         eta = jnp.asarray(self.exponent, x.dtype)
         power = jnp.where(positive, jnp.where(positive, x, 1.0) ** eta, 0.0)
@@ -393,22 +396,25 @@ class UserForce(Force):
 
 
 def _damped_spring(zeta: jax.Array) -> jax.Array:
-    """e of `k x + c x'`, cut where it would pull: Schwager and Poeschel (2007), (17)-(19).
+    """e of the force `k x + c x'`, cut where it would pull, by the damping ratio zeta.
 
-    `log e = -2 zeta arccos(zeta) / sqrt(1 - zeta^2)`, with arcosh and zeta^2 - 1 above 1. About 1,
-    with y = 1 - zeta, the quotient is `1 + y/3 (1 + 2 y/5 (1 + 3 y/7 (1 + ...)))`.
+    Equation: `log e = -2 zeta Q`, `Q = arccos(zeta) / sqrt(1 - zeta^2)` for zeta < 1,
+    `arcosh(zeta) / sqrt(zeta^2 - 1)` above; about 1, with y = 1 - zeta,
+    `Q = 1 + y/3 (1 + 2 y/5 (1 + 3 y/7 (1 + ...)))`.
+
+    Source: Schwager and Poeschel (2007), (17)-(19).
     """
     near = jnp.abs(zeta - 1) < _CRITICAL
     away = jnp.where(near, 0.5, zeta)  # any harmless value
     under = away < 1
     z = jnp.where(under, away, 0.5)
-    w = jnp.sqrt(1 - z**2)
-    swinging = jnp.arctan2(w, z) / w
+    root = jnp.sqrt(1 - z**2)
+    underdamped = jnp.arctan2(root, z) / root  # Q
     z = jnp.where(under, 2.0, away)
-    w = jnp.sqrt(z**2 - 1)
-    creeping = jnp.log(z + w) / w
+    root = jnp.sqrt(z**2 - 1)
+    overdamped = jnp.log(z + root) / root  # Q
     series, y = jnp.ones_like(zeta), jnp.where(near, 1 - zeta, 0.0)
     for n in range(_CRITICAL_TERMS, 0, -1):
         series = 1 + n / (2 * n + 1) * y * series
-    quotient = jnp.where(near, series, jnp.where(under, swinging, creeping))
+    quotient = jnp.where(near, series, jnp.where(under, underdamped, overdamped))
     return jnp.exp(-2 * zeta * quotient)

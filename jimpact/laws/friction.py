@@ -13,7 +13,10 @@ from jimpact.tools.checks import is_traced
 
 
 def friction_fields(friction: Any, tangential_restitution: Any) -> tuple[Any, Any]:
-    """`(mu, e_t)`, or `(None, None)` without friction."""
+    """The fields `(mu, e_t)` of a law, `(None, None)` without friction.
+
+    Raise a ValueError for an e_t that is not 0, or traced, without friction.
+    """
     if friction is not None:
         return friction, tangential_restitution
     if is_traced(tangential_restitution) or np.any(np.asarray(tangential_restitution) != 0):
@@ -32,10 +35,11 @@ def frictional_impulses(
     *,
     complementary: bool,
 ) -> Impulses:
-    """p (m,) and p_t (t,) with `p_t in -mu p Sgn(u+ + e_t u-)`.
+    """Impulses p (m,), p_t (t,) [N s] of a law that prescribes gap velocities, with friction.
 
-    `normal` (m,) [m/s] is what gamma+ - gamma- must make up for: `gamma+ - gamma- + normal` is 0,
-    or (`complementary`) >= 0 and 0 where p > 0.
+    Equation: `W p + W_nt p_t + b = 0`, or (`complementary`) `0 <= W p + W_nt p_t + b  _|_  p >= 0`,
+    b = `normal` (m,) [m/s], and `p_t in -mu p Sgn(u+ + e_t u-)`, mu = `friction`,
+    e_t = `tangential_restitution`, () or (m,).
     """
     assert contact.slip is not None  # see `check_law`
     ones = jnp.ones_like(contact.gap_velocity)

@@ -32,7 +32,7 @@ class GapScale(eqx.Module):
         return self.gaps / self.delta
 
     def __str__(self) -> str:
-        """A line for each gap, and what delta_c is."""
+        """A line for each gap, and the definition of delta_c."""
         if is_traced(self.delta):
             return repr(self)
         rows = enumerate(zip(np.asarray(self.gaps), np.asarray(self.delta)))
@@ -41,7 +41,7 @@ class GapScale(eqx.Module):
 
 
 def _in_words(gap: float, delta: float) -> str:
-    """A gap in units of delta_c, and what that means."""
+    """A gap [m] in units of the indentation `delta` [m], and its effect, in words."""
     if delta == 0:
         return f"{_length(gap)}: nothing approaches"
     scale = f"delta_c = {_length(delta)}"
@@ -58,7 +58,7 @@ def _in_words(gap: float, delta: float) -> str:
 
 
 def _length(metres: float) -> str:
-    """A length in the unit that it is read best in."""
+    """A length [m] as text, in a unit with one to three digits before the point."""
     unit, size = readable_unit("m", metres or 1.0)
     return f"{metres / size:.3g} {unit}"
 

@@ -1,4 +1,4 @@
-"""What happens during an impact: forces, indentations, energies and velocities over its time."""
+"""Histories of an impact: forces, indentations, energies and velocities over its time."""
 
 import dataclasses
 from typing import Any
@@ -94,57 +94,63 @@ def history(law: Law, scene: Scene, velocity: Any, samples: int = 200) -> Histor
 
 @quick_jit
 def _history(law: Law, scene: Scene, v: jax.Array, samples: int, traced: Traced) -> History:
-    """The samples of the dimensionless flow, in SI units."""
+    """`History` of s = `samples` rows in SI units, from the dimensionless dynamics of the law.
+
+    Where nothing happens, the dynamics run from gamma- = -1 m/s, and their samples are replaced by
+    values before the impact.
+    """
     contact = law.contact(scene, v)
     happens, gamma = contact.happens, contact.gap_velocity
     harmless = jnp.where(happens, gamma, -jnp.ones_like(gamma))
     dynamics = law.dynamics(eqx.tree_at(lambda c: c.gap_velocity, contact, harmless))
     t, units = dynamics.tangents, dynamics.units
     program, leaves = dynamics.program(with_end_time=True), dynamics.columns()[0]
-    walked = dataclasses.replace(program, checkpoints=dynamics.adjoint == "checkpoints")
-    values, fine = history_program(program, samples), history_program(walked, samples)
-    time, energy, *rest = in_lanes(values, fine, *leaves, adjoint=dynamics.adjoint)
+    differentiated = dataclasses.replace(program, checkpoints=dynamics.adjoint == "checkpoints")
+    programs = history_program(program, samples), history_program(differentiated, samples)
+    time, energy, *rest = in_lanes(*programs, *leaves, adjoint=dynamics.adjoint)
     *rows, maximum, code = (x[..., 0] for x in rest)
     states = ContactStates(*rows)
-    force, root = units.momentum / units.time, jnp.repeat(units.root, t // len(gamma))
+    unit_force, root = units.momentum / units.time, jnp.repeat(units.root, t // len(gamma))
 
-    def live(x: jax.Array, before: Any = 0.0) -> jax.Array:
-        """Sampled values; where nothing happens those before the impact."""
+    def sampled(x: jax.Array, before: Any = 0.0) -> jax.Array:
+        """Samples x; where nothing happens the value `before` the impact."""
         return jnp.where(happens, x, before)
 
-    impulse = live(states.impulse * units.momentum[None])
-    tangential = live(states.tangential_impulse * (units.velocity / root)[None])
-    change = jax.vmap(lambda p, q: velocity_change(scene, p, q if t else None))
+    impulse = sampled(states.impulse * units.momentum[None])
+    tangential = sampled(states.tangential_impulse * (units.velocity / root)[None])
+    change = jax.vmap(lambda p, p_t: velocity_change(scene, p, p_t if t else None))
     slip = jnp.zeros(0, v.dtype) if contact.slip is None or not t else contact.slip
-    at = live(time[:, 0, 0] * units.time)
-    pressed = live(states.force * force[None])
-    rubbed = live(states.tangential_force * (units.velocity / root / units.time)[None])
-    rates = live(states.gap_velocity * (units.velocity * units.root)[None], gamma[None])
-    growth = jax.vmap(lambda dv: gap_velocity(scene, dv))(change(pressed, rubbed))
+    seconds = sampled(time[:, 0, 0] * units.time)
+    force = sampled(states.force * unit_force[None])
+    friction = sampled(states.tangential_force * (units.velocity / root / units.time)[None])
+    rates = sampled(states.gap_velocity * (units.velocity * units.root)[None], gamma[None])
+    # gap accelerations N^T M^-1 (N F + H F_t)
+    growth = jax.vmap(lambda dv: gap_velocity(scene, dv))(change(force, friction))
     size = jnp.where(happens, contact.size, 1.0)
-    finite = jnp.all(jnp.isfinite(impulse)) & jnp.all(jnp.isfinite(at))
+    finite = jnp.all(jnp.isfinite(impulse)) & jnp.all(jnp.isfinite(seconds))
     return History(
-        time=at,
-        force=pressed,
-        indentation=live(states.indentation * units.indentation[None]),
-        energy=live(0.5 * units.velocity**2 * energy[..., 0]),
+        time=seconds,
+        force=force,
+        indentation=sampled(states.indentation * units.indentation[None]),
+        energy=sampled(0.5 * units.velocity**2 * energy[..., 0]),
         impulse=impulse,
         gap_velocity=rates,
-        approach=-_integral(at, rates, growth),
+        approach=-_integral(seconds, rates, growth),
         velocity=v[None] + change(impulse, tangential),
-        tangential_force=rubbed,
+        tangential_force=friction,
         tangential_impulse=tangential,
-        slip=live(states.slip * (units.velocity * root)[None], slip[None]),
-        duration=live(time[-1, 0, 0] * units.time),
-        maximum_force=live(maximum * force),
-        status=traced.status((law, scene, v, NOTHING_GIVEN), live(code[0]), size, finite),
+        slip=sampled(states.slip * (units.velocity * root)[None], slip[None]),
+        duration=sampled(time[-1, 0, 0] * units.time),
+        maximum_force=sampled(maximum * unit_force),
+        status=traced.status((law, scene, v, NOTHING_GIVEN), sampled(code[0]), size, finite),
     )
 
 
 def _integral(time: jax.Array, values: jax.Array, rates: jax.Array) -> jax.Array:
-    """Integrals (s, m) of `values` from the first time on; `rates`: their derivatives.
+    """Integrals (s, m) of `values` y (s, m) over `time` t (s,) from the first one on.
 
-    The trapezoidal rule with the correction of its ends: exact for cubics.
+    Equation: per step h, `h (y_1 + y_2) / 2 + h^2 (y'_1 - y'_2) / 12` with their derivatives y' =
+    `rates` (s, m): exact for cubics.
     """
     step = jnp.diff(time)[:, None]
     pieces = step / 2 * (values[1:] + values[:-1]) + step**2 / 12 * (rates[:-1] - rates[1:])

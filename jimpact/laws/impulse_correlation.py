@@ -66,7 +66,7 @@ class ImpulseCorrelation(Law):
     max_collisions: int = option(10_000, low=1)
 
     def check(self, scene: Scene, dtype: jnp.dtype) -> None:
-        """Raise a ValueError where a ratio is outside its interval for a pair of contacts."""
+        """Raise a ValueError where a ratio of two closed contacts is outside its `interval`."""
         if is_traced((scene, self.restitution, self.ratio)):
             return
         m = scene.contacts
@@ -84,7 +84,7 @@ class ImpulseCorrelation(Law):
 
     @full_precision
     def impulses(self, contact: Contact) -> Impulses:
-        """Sum of the impulses of all collisions."""
+        """Sums p (m,) [N s] of the impulses of all collisions, and status."""
         p, _, end = collisions.solve(
             contact.delassus,
             contact.gap_velocity,
@@ -98,12 +98,17 @@ class ImpulseCorrelation(Law):
 
 
 def interval(scene: Scene, restitution: jax.Array) -> tuple[np.ndarray, np.ndarray]:
-    """Both ends (m, m) on the host; the upper one is a root of the quadratic inequality."""
+    """Least and largest ratios r (m, m) of contact j beside contact i, on the host.
+
+    Equation: `r >= -W_ij / W_jj`, so that j does not approach after the collision, and
+    `W_jj r^2 + (1 - e_i^2) W_ij r - e_i^2 W_ii <= 0`, so that i does not. NaN where i does not
+    press j (`W_ij >= 0`).
+    """
     w = np.asarray(as_matrix(delassus_matrix(scene)), float)
-    own, other = np.diag(w)[:, None], np.diag(w)[None, :]
-    kept = np.broadcast_to(np.asarray(restitution, float) ** 2, (len(w),))[:, None]
+    own, other = np.diag(w)[:, None], np.diag(w)[None, :]  # W_ii, W_jj
+    square = np.broadcast_to(np.asarray(restitution, float) ** 2, (len(w),))[:, None]  # e_i^2
     presses = w < -precision(float).noise * np.sqrt(own * other)
     off = np.where(presses, w, np.nan)
-    linear = (1 - kept) * off  # other r^2 + linear r - kept own <= 0
-    high = (-linear + np.sqrt(linear**2 + 4 * other * kept * own)) / (2 * other)
+    linear = (1 - square) * off
+    high = (-linear + np.sqrt(linear**2 + 4 * other * square * own)) / (2 * other)
     return -off / other, high

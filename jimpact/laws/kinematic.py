@@ -47,7 +47,7 @@ class Kinematic(Law):
         """E: (), its diagonal (m,), or (m, m)."""
 
     def required(self, contact: Contact) -> jax.Array:
-        """b (m,) [m/s]: what gamma+ - gamma- must make up for."""
+        """`b = |grad f| (I + E) qn-` (m,) [m/s]: W p + b is `gamma+ + e gamma-` of a diagonal E."""
         e, gamma = self.coefficients, contact.gap_velocity
         if e.ndim < 2:
             return (1 + e) * gamma
@@ -55,7 +55,7 @@ class Kinematic(Law):
 
     @full_precision
     def impulses(self, contact: Contact) -> Impulses:
-        """One linear system, one complementarity problem, or the friction problem."""
+        """Impulses by a linear system, a complementarity problem, or a friction problem."""
         required = self.required(contact)
         mu, e_t = self.friction, self.tangential_restitution
         if mu is not None and e_t is not None:
@@ -68,13 +68,17 @@ class Kinematic(Law):
 
 
 def prescribed_impulses(contact: Contact, required: jax.Array) -> Impulses:
-    """p (m,) with `W p + b = 0`."""
+    """Impulses p (m,) [N s] with `W p + b = 0`, b = `required` (m,) [m/s].
+
+    Solved in normalized ones: `G pbar = -b / d`, `pbar = d p`, `G = W / (d d^T)`,
+    `d_j = sqrt(W_jj)`; of redundant contacts those of least |pbar|.
+    """
     w = contact.delassus
     norm = jnp.sqrt(diagonal(w))
     g = as_matrix(w) / (norm[:, None] * norm[None, :])
-    pbar, singular, missed = solve_symmetric(g, -required / norm, regular=is_regular(w))
+    pbar, singular, unsolved = solve_symmetric(g, -required / norm, regular=is_regular(w))
     code = jnp.where(singular, CODE["impulse_not_unique"], CODE["ok"])
-    return Impulses(pbar / norm, None, jnp.where(missed, CODE["infeasible"], code))
+    return Impulses(pbar / norm, None, jnp.where(unsolved, CODE["infeasible"], code))
 
 
 class _WithCoefficient(Kinematic):
@@ -234,6 +238,7 @@ class RestitutionMatrix(Kinematic):
         friction: Any = None,
         tangential_restitution: Any = 0.0,
     ):
+        """Set the fields; raise a ValueError unless E is square, or for e_t without friction."""
         self.matrix, self.admissible = matrix, admissible
         shape = np.shape(matrix)
         if len(shape) != 2 or shape[0] != shape[1] or shape[0] == 0:
@@ -251,7 +256,10 @@ class RestitutionMatrix(Kinematic):
         return self.matrix
 
     def check(self, scene: Scene, dtype: jnp.dtype) -> None:
-        """Raise where E does not fit the scene."""
+        """Raise a ValueError where the size of E, or its tangential blocks, does not fit the scene.
+
+        Tangential blocks need tangents, closed contacts and no `friction`.
+        """
         m, size = scene.contacts, self.matrix.shape[0]
         if size == m:
             return
@@ -283,7 +291,7 @@ class RestitutionMatrix(Kinematic):
 
     @full_precision
     def contact(self, scene: Scene, velocity: jax.Array) -> Contact:
-        """With tangential blocks the tangential quasi-velocities, too."""
+        """The contact; for an E with tangential blocks with qt- = t_q^T M v- and t_q^T H, too."""
         contact = super().contact(scene, velocity)
         if self.matrix.shape[0] == scene.contacts:
             return contact
@@ -293,18 +301,23 @@ class RestitutionMatrix(Kinematic):
 
     @full_precision
     def impulses(self, contact: Contact) -> Impulses:
-        """Impulses of either form of E."""
+        """Impulses p (m,), p_t (t,) [N s] of either form of E, and status.
+
+        Equation, with tangential blocks: `t_q^T H p_t = qt+ - qt-`, then
+        `W p + |grad f| (qn- - qn+) + W_nt p_t = 0`.
+        """
         if not isinstance(contact, QuasiContact):
             return super().impulses(contact)
         assert contact.cross is not None
         m = contact.contacts
         quasi = jnp.concatenate([contact.normalized_gap_velocity, contact.quasi])
         change = quasi + self.matrix @ quasi  # qn- - qn+, qt- - qt+
-        tangential, missed = _least(contact.directions, -change[m:], jnp.abs(quasi).max())
+        size = jnp.abs(quasi).max()
+        tangential, unsolved = _least_squares(contact.directions, -change[m:], size)
         required = contact.norm * change[:m] + contact.cross @ tangential
         p, _, code = prescribed_impulses(contact, required)
-        lost = missed | ~jnp.all(contact.closed)
-        return Impulses(p, tangential, jnp.where(lost, CODE["infeasible"], code))
+        infeasible = unsolved | ~jnp.all(contact.closed)
+        return Impulses(p, tangential, jnp.where(infeasible, CODE["infeasible"], code))
 
 
 class QuasiContact(Contact):
@@ -319,8 +332,14 @@ class QuasiContact(Contact):
         self.quasi, self.directions = quasi, directions
 
 
-def _least(matrix: jax.Array, right: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Least x with `A x = right`, and whether none has, compared to velocities of this size."""
+def _least_squares(
+    matrix: jax.Array, right: jax.Array, size: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """The x (t,) of least |x| that minimizes |A x - b|, A (k, t), b = `right` (k,).
+
+    And True () where no x solves `A x = b`: the residual is not rounding, beside velocities of this
+    `size` ().
+    """
     x = jnp.linalg.pinv(matrix) @ right
-    off = jnp.abs(matrix @ x - right).max()
-    return x, off > precision(x.dtype).root * size
+    residual = jnp.abs(matrix @ x - right).max()
+    return x, residual > precision(x.dtype).root * size

@@ -42,13 +42,16 @@ MOST_WITH_FRICTION = 200
 
 
 def default_rtol(method: str, dtype: jnp.dtype) -> float:
-    """Tolerance if the law has no `rtol`."""
+    """Tolerance of v+, relative to max |v-|, if the law has no `rtol`."""
     table = DEFAULT_RTOL_IMPLICIT if method == "implicit" else DEFAULT_RTOL
     return table.get(str(dtype), table["float32"])
 
 
-def solver_of(law: Any, contact: Contact) -> tuple[str, Any]:
-    """The method of a law with impact dynamics at these contacts, and its tolerance there."""
+def solver_of(law: Any, contact: Contact) -> tuple[str, Any]:  # law: LZB, Compliant
+    """The `method` of a law with impact dynamics at these contacts, 'auto' decided, and its rtol.
+
+    The tolerance is the law's, else the contact's, else the default of the method.
+    """
     method = method_for(law.method, contact, law.friction is not None)
     if law.rtol is not None:
         return method, law.rtol
@@ -57,7 +60,7 @@ def solver_of(law: Any, contact: Contact) -> tuple[str, Any]:
 
 
 def check_few_contacts(scene: Scene) -> None:
-    """Raise a ValueError where too many contacts have friction."""
+    """Raise a ValueError for a scene of more than `MOST_WITH_FRICTION` contacts, with friction."""
     if scene.contacts > MOST_WITH_FRICTION:
         raise ValueError(
             f"Argument `scene` must have at most {MOST_WITH_FRICTION} contacts for impact dynamics "
@@ -137,7 +140,7 @@ class LZB(Law):
     adjoint: str = option("jacobian", ADJOINTS)
 
     def check(self, scene: Scene, dtype: jnp.dtype) -> None:
-        """Raise for a tolerance finer than the precision can hold, and too many contacts."""
+        """Raise a ValueError for an `rtol` below rounding, or too many contacts with friction."""
         if self.rtol is not None:
             check_rtol(self.rtol, dtype)
         if self.friction is not None:
@@ -182,6 +185,6 @@ class LZB(Law):
 
     @full_precision
     def impulses(self, contact: Contact) -> Impulses:
-        """Impulses at the end of the impact dynamics."""
+        """Impulses p (m,), p_t (t,) [N s] at the end of the impact dynamics, and status."""
         checked = contact if self.check_conditioning else None
         return Impulses(*solve(self.dynamics(contact), checked))

@@ -135,7 +135,7 @@ def mujoco_solref(
     stiffness = (np.pi / duration) ** 2
 
     def excess(damping: float) -> float:
-        """The mean coefficient with this damping over what it should be."""
+        """Mean coefficient of restitution with this damping [1/s], less the one asked for."""
         e = _restitution((-stiffness, -damping), timestep, solimp, speed)
         return float(e.mean()) - restitution
 
@@ -152,7 +152,7 @@ def mujoco_solref(
 
 
 def _check(timestep: float, solimp: tuple[float, ...], speed: float) -> None:
-    """Raise a ValueError for values out of range."""
+    """Raise a ValueError for a time step, an impedance or a speed out of range."""
     check_values("timestep", timestep, low=0.0, open_low=True)
     check_values("speed", speed, low=0.0, open_low=True)
     check_shape("solimp", np.asarray(solimp), (5,), "dmin, dmax, width, midpoint, power")
@@ -162,7 +162,11 @@ def _check(timestep: float, solimp: tuple[float, ...], speed: float) -> None:
 def _stiffness_and_damping(
     solref: tuple[float, float], timestep: float, largest: float
 ) -> tuple[float, float]:
-    """k and b of the reference acceleration `-b r' - k d r`; `largest` is dmax."""
+    """k [1/s^2] and b [1/s] of the reference acceleration `-b r' - k d r`.
+
+    Equation: for solref (T, z) `k = 1 / (D T z)^2`, `b = 2 / (D T)`, T at least two time steps [s];
+    for (-K, -B) `k = K / D^2`, `b = B / D`; D = `largest`, the impedance dmax.
+    """
     check_shape("solref", np.asarray(solref), (2,), "timeconst and dampratio")
     first, second = solref
     if first > 0 and second > 0:
@@ -176,36 +180,53 @@ def _stiffness_and_damping(
     )
 
 
-def _clipped(solimp: tuple[float, ...]) -> tuple[float, float, float, float, float]:
-    """dmin, dmax, width, midpoint and power in the ranges to which MuJoCo confines them."""
-    least, most, width, middle, power = solimp
-    low, high = _LEAST_IMPEDANCE, 1 - _LEAST_IMPEDANCE
-    least, most, middle = (min(max(x, low), high) for x in (least, most, middle))
-    return least, most, width, middle, max(power, 1.0)
+class _Impedance(NamedTuple):
+    """MuJoCo's `solimp`: the impedance d rises from dmin to dmax over a width of penetration."""
 
+    dmin: float
+    dmax: float
+    width: float  # [m]
+    midpoint: float  # of the rise, over the width
+    power: float
 
-def _impedance(depth: np.ndarray, solimp: tuple[float, ...]) -> np.ndarray:
-    """d by the depth of penetration: a smooth step from dmin to dmax over the width."""
-    least, most, width, middle, power = solimp
-    if least == most or width == 0:
-        return np.full_like(depth, (least + most) / 2)
-    x = np.minimum(depth / width, 1.0)
-    rising = x**power / middle ** (power - 1)
-    falling = 1 - (1 - x) ** power / (1 - middle) ** (power - 1)
-    return least + np.where(x <= middle, rising, falling) * (most - least)
+    def clipped(self) -> "_Impedance":
+        """The impedance with numbers confined to the ranges that MuJoCo allows."""
+        low, high = _LEAST_IMPEDANCE, 1 - _LEAST_IMPEDANCE
+        dmin, dmax, midpoint = (
+            min(max(x, low), high) for x in (self.dmin, self.dmax, self.midpoint)
+        )
+        return _Impedance(dmin, dmax, self.width, midpoint, max(self.power, 1.0))
+
+    def at(self, depth: np.ndarray) -> np.ndarray:
+        """Impedance d at depths of penetration [m], a smooth step.
+
+        Equation: `d = dmin + y (dmax - dmin)` with `x = min(depth / width, 1)`, the midpoint c and
+        the power p: `y = x^p / c^(p - 1)` up to c, beyond `1 - (1 - x)^p / (1 - c)^(p - 1)`.
+        """
+        if self.dmin == self.dmax or self.width == 0:
+            return np.full_like(depth, (self.dmin + self.dmax) / 2)
+        x, c, p = np.minimum(depth / self.width, 1.0), self.midpoint, self.power
+        begin = x**p / c ** (p - 1)
+        end = 1 - (1 - x) ** p / (1 - c) ** (p - 1)
+        return self.dmin + np.where(x <= c, begin, end) * (self.dmax - self.dmin)
 
 
 def _restitution(
     solref: tuple[float, float], timestep: float, solimp: tuple[float, ...], speed: float
 ) -> np.ndarray:
-    """e for each instant within a step at which the contact may begin."""
-    solimp = _clipped(solimp)
-    stiffness, damping = _stiffness_and_damping(solref, timestep, largest=solimp[1])
+    """e = v+ / speed for each of `_PHASES` instants within a step at which the contact may begin.
+
+    Semi-implicit Euler steps of `r'' = max(0, -d (b r' + k d r))` until the contact opens, see
+    `mujoco_restitution`.
+    """
+    impedance = _Impedance(*solimp).clipped()
+    stiffness, damping = _stiffness_and_damping(solref, timestep, largest=impedance.dmax)
     v = np.full(_PHASES, -speed)
+    # depths at the end of the step in which contact begins, at equally likely instants
     r = -speed * timestep * (np.arange(_PHASES) + 0.5) / _PHASES
     in_contact = np.ones(_PHASES, bool)
     for _ in range(_MOST_STEPS):
-        d = _impedance(-r, solimp)
+        d = impedance.at(-r)
         push = np.maximum(-d * (damping * v + stiffness * d * r), 0.0)
         in_contact &= (r < 0) & ((push > 0) | (v < 0))  # without push they part at this speed
         if not in_contact.any():

@@ -69,6 +69,7 @@ class Poisson(Law):
         *,
         allow_above_one: bool = False,
     ):
+        """Set the fields; their declarations check them. Without friction e_t must be 0."""
         self.restitution, self.allow_above_one = restitution, allow_above_one
         self.friction, self.tangential_restitution = friction_fields(
             friction, tangential_restitution
@@ -76,7 +77,7 @@ class Poisson(Law):
 
     @full_precision
     def impulses(self, contact: Contact) -> Impulses:
-        """Two complementarity problems."""
+        """Impulses `p = (1 + e) p_c + s`, p_c and s each by a complementarity problem."""
         mu, e_t = self.friction, self.tangential_restitution
         if mu is not None and e_t is not None:
             return self._with_friction(contact, mu, e_t)
@@ -86,13 +87,16 @@ class Poisson(Law):
         supplement = solve_lcp(w, compression.w + w @ returned)
         code = jnp.maximum(compression.code, supplement.code)
         if self.restitution.ndim == 1 and not is_regular(w):
-            free = _free(as_matrix(w), compression.z > 0)
-            shared = _depends_on_sharing(as_matrix(w), self.restitution, free)
-            code = jnp.maximum(code, jnp.where(shared, CODE["several_outcomes"], CODE["ok"]))
+            free = _free_columns(as_matrix(w), compression.z > 0)
+            ambiguous = _depends_on_sharing(as_matrix(w), self.restitution, free)
+            code = jnp.maximum(code, jnp.where(ambiguous, CODE["several_outcomes"], CODE["ok"]))
         return Impulses(compression.z + returned + supplement.z, None, code)
 
     def _with_friction(self, contact: Contact, mu: jax.Array, e_t: jax.Array) -> Impulses:
-        """Two friction problems."""
+        """Impulses of compression and of expansion, each by a friction problem, see the class.
+
+        Equation: `p = (1 + e) p_c + s`, `p_t = p_tc + p_te`.
+        """
         assert contact.slip is not None  # see `check_law`
         a, gamma = contact.whole_delassus, contact.gap_velocity
         mu, e = mu * jnp.ones_like(gamma), self.restitution * jnp.ones_like(gamma)
@@ -100,71 +104,84 @@ class Poisson(Law):
         first = solve(a, gamma, contact.slip, mu, complementary=True)
         expansion = _Expansion(a, jnp.concatenate([gamma, (1 + e_t) * contact.slip]), mu, e)
         compression = jnp.concatenate([first.normal, first.tangential])
-        second, rate = expansion.after(compression)
+        second, velocity = expansion.after(compression)
         code = jnp.maximum(first.status, second.status)
-        shared = jnp.asarray(False)
+        ambiguous = jnp.asarray(False)
         if self.restitution.ndim == 1:
             both = jnp.concatenate([e, jnp.zeros_like(contact.slip)])
-            shared = _depends_on_sharing(a, both, first.free)
+            ambiguous = _depends_on_sharing(a, both, first.free)
         if first.shares is not None:
-            shared = shared | _expands_otherwise(expansion, compression, rate, first.shares)
-        code = jnp.maximum(code, jnp.where(shared, CODE["several_outcomes"], CODE["ok"]))
+            other = _expands_otherwise(expansion, compression, velocity, first.shares)
+            ambiguous = ambiguous | other
+        code = jnp.maximum(code, jnp.where(ambiguous, CODE["several_outcomes"], CODE["ok"]))
         p = (1 + e) * first.normal + second.normal
         return Impulses(p, first.tangential + second.tangential, code)
 
 
 class _Expansion(NamedTuple):
-    """The second friction problem, of the impulses of the first."""
+    """The friction problem of expansion, posed by the impulses of compression."""
 
-    matrix: jax.Array  # (m + t, m + t)
-    rate: jax.Array  # (m + t,) gamma- and (1 + e_t) u-
+    matrix: jax.Array  # [[W, W_nt], [W_tn, W_tt]] (m + t, m + t)
+    before: jax.Array  # (m + t,) gamma- and (1 + e_t) u-
     friction: jax.Array  # mu (m,)
     restitution: jax.Array  # e (m,)
 
     def after(self, compression: jax.Array) -> tuple[FrictionImpulses, jax.Array]:
-        """Impulses s and p_te after those of `compression` (m + t,), and the rates (m + t,)."""
-        m, zero = len(self.friction), precision(self.rate.dtype)
+        """Impulses (s, p_te) of expansion after (p_c, p_tc) of `compression` (m + t,).
+
+        Also returns the velocities `gamma+` and `u+ + e_t u-` (m + t,) to which they lead.
+        """
+        m, zero = len(self.friction), precision(self.before.dtype)
         p_c = compression[:m]
         returned = self.restitution * p_c
         impulse = compression + jnp.pad(returned, (0, len(compression) - m))
-        size = jnp.abs(self.rate) + jnp.abs(self.matrix) @ jnp.abs(impulse)
-        # what compression has brought to rest must not be moved by what is left of rounding
-        rate = without_rounding(self.rate + self.matrix @ impulse, zero.accumulated * size)
-        # also at e = 0, where it begins with e
+        size = jnp.abs(self.before) + jnp.abs(self.matrix) @ jnp.abs(impulse)
+        # rounding must not move contacts that compression has brought to rest
+        velocity = without_rounding(self.before + self.matrix @ impulse, zero.accumulated * size)
+        # e p_c loads friction; eps^2 p_c keeps its slope in e at e = 0
         load = returned + zero.eps**2 * p_c
-        x = solve(self.matrix, rate[:m], rate[m:], self.friction, complementary=True, load=load)
-        return x, rate + self.matrix @ jnp.concatenate([x.normal, x.tangential])
+        x = solve(
+            self.matrix, velocity[:m], velocity[m:], self.friction, complementary=True, load=load
+        )
+        return x, velocity + self.matrix @ jnp.concatenate([x.normal, x.tangential])
 
 
 def _expands_otherwise(
-    expansion: _Expansion, compression: jax.Array, rate: jax.Array, shares: jax.Array
+    expansion: _Expansion, compression: jax.Array, velocity: jax.Array, shares: jax.Array
 ) -> jax.Array:
-    """Whether () other `shares` (k, m + t) of the impulses of compression expand to another v+.
+    """True () where other `shares` (k, m + t) of the impulses of compression lead to another v+.
 
-    `rate` (m + t,): the rates to which the impulses of `compression` (m + t,) expand.
+    `velocity` (m + t,) is that to which the impulses of `compression` (m + t,) expand, see
+    `_Expansion.after`. Redundant contacts can share the impulse of compression in several ways.
     """
-    expansion, x, rate, shares = jax.lax.stop_gradient((expansion, compression, rate, shares))
+    expansion, x, velocity, shares = jax.lax.stop_gradient(
+        (expansion, compression, velocity, shares)
+    )
     m, root = len(expansion.friction), precision(x.dtype).root
     returned = expansion.restitution[None] * (shares - x[None])[:, :m]
     needed = jnp.any(jnp.abs(returned) > root * jnp.abs(x).max())
 
-    def compared() -> jax.Array:
-        """Whether rates differ at any of these shares."""
+    def any_differs() -> jax.Array:
+        """True () where velocities differ for any of these shares."""
 
         def differs(share: jax.Array) -> jax.Array:
-            """Whether they differ where compression is shared like this."""
+            """True () where velocities differ after this share (m + t,), if it has a solution."""
             other, after = expansion.after(share)
-            apart = jnp.abs(after - rate) > root * jnp.abs(expansion.rate).max()
+            apart = jnp.abs(after - velocity) > root * jnp.abs(expansion.before).max()
             return jnp.any(apart) & (other.status < CODE["infeasible"])
 
         return jnp.any(jax.lax.map(differs, shares))
 
-    none = jnp.zeros_like(needed)
-    return needed & cond(any_lane(needed), compared, lambda: none)
+    no = jnp.zeros_like(needed)
+    return needed & cond(any_lane(needed), any_differs, lambda: no)
 
 
-def _free(w: jax.Array, loaded: jax.Array) -> jax.Array:
-    """Columns (m, m) of changes of loaded impulses that leave W p as it is."""
+def _free_columns(w: jax.Array, loaded: jax.Array) -> jax.Array:
+    """Columns (m, m) that span the changes of loaded impulses (m,) that leave W p as it is.
+
+    Equation: `D^-1 P`, P the projector on the null space of `D^-1 W D^-1` between loaded contacts,
+    `D = diag(sqrt(W_jj))`.
+    """
     norm = jax.lax.stop_gradient(jnp.sqrt(jnp.diagonal(w)))
     both = loaded[:, None] & loaded[None, :]
     unit = jnp.eye(len(loaded), dtype=w.dtype)
@@ -173,7 +190,10 @@ def _free(w: jax.Array, loaded: jax.Array) -> jax.Array:
 
 
 def _depends_on_sharing(w: jax.Array, e: jax.Array, free: jax.Array) -> jax.Array:
-    """Whether `W diag(e) p_c` differs among p_c that differ by `free` columns."""
+    """True () where `W diag(e) p_c` differs among p_c (m,) that differ by columns of `free` (m, m).
+
+    Equation: an entry of `D^-1 W diag(e) free`, `D = diag(sqrt(W_jj))`, is more than rounding.
+    """
     w, e = jax.lax.stop_gradient((w, e))
     norm = jnp.sqrt(jnp.diagonal(w))
     returned = w @ (e[:, None] * free) / jnp.where(norm > 0, norm, 1.0)[:, None]

@@ -42,15 +42,15 @@ class Routh(Law):
 
     @full_precision
     def impulses(self, contact: Contact) -> Impulses:
-        """The impulse of compression, 1 + e times."""
+        """`p = (1 + e) p_c` (m,) [N s] with the impulses p_c of compression, e of all contacts."""
         w, gamma, e = contact.delassus, contact.gap_velocity, self.restitution
         compression = solve_lcp(w, gamma)
         if e.ndim:
-            work = compression.z * jnp.maximum(-gamma, 0.0)
+            work = compression.z * jnp.maximum(-gamma, 0.0)  # twice that taken up by each contact
             total = jnp.sum(work)
             share = work / jnp.where(total > 0, total, 1.0)
-            kept = jnp.sum(e**2 * share)
+            returned = jnp.sum(e**2 * share)  # e^2 of the whole impact
             root = jnp.sqrt(jnp.where(share > 0, share, 1.0))
             at_zero = jnp.sum(jnp.where(share > 0, root * e, 0.0))  # 0, with its slopes
-            e = jnp.where(kept > 0, jnp.sqrt(jnp.where(kept > 0, kept, 1.0)), at_zero)
+            e = jnp.where(returned > 0, jnp.sqrt(jnp.where(returned > 0, returned, 1.0)), at_zero)
         return Impulses((1 + e) * compression.z, None, compression.code)

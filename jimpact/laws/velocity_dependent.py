@@ -33,7 +33,11 @@ TRIED = (0.1, 1.0, 10.0)
 
 
 def _curve(value: Any) -> Any:
-    """A function of the speed, or a table of it as two tuples: speeds, values."""
+    """The argument `curve`: None, a function, or a table as two tuples, speeds [m/s] and values.
+
+    Raise a ValueError for a table of other shapes, with negative entries or speeds that do not
+    rise.
+    """
     if value is None or callable(value):
         return value
     pair = [np.asarray(as_float_array("curve", each), float) for each in value]
@@ -125,31 +129,31 @@ class VelocityDependent(Law):
         return self._at(as_float_array("speed", speed))
 
     def _at(self, v: jax.Array) -> jax.Array:
-        """e at speeds v."""
+        """e (m,) at speeds v [m/s]: `e^2 = y^2 + (1 - y^2) f^2`, y and f as of the class."""
         e = free_parameters_of(self.law)["restitution"].value
         moving = v > 0
         safe = jnp.where(moving, v, self.reference_speed)  # at rest e is that of the law
-        # of two that are equal one is taken, whole: min() would halve the derivative
-        most = jnp.where(e > 1, e, 1.0)
-        power = e * jnp.ones_like(v)
+        # comparisons, as min() of two equal numbers would halve the derivative
+        largest = jnp.where(e > 1, e, 1.0)  # of f: 1, or an e above 1 itself
+        f = e * jnp.ones_like(v)
         if self.speed_exponent is not None:
             ratio = safe / self.reference_speed
-            falls = e * ratio**-self.speed_exponent <= most
+            falls = e * ratio**-self.speed_exponent <= largest
             falling = e * jnp.where(falls, ratio, 1.0) ** -self.speed_exponent
-            power = jnp.where(falls, falling, most)
+            f = jnp.where(falls, falling, largest)
         elif self.curve is not None:
-            power = e * self._curve_at(safe)
-            power = jnp.where(power <= most, power, most)
+            f = e * self._curve_at(safe)
+            f = jnp.where(f <= largest, f, largest)
         if self.yield_speed is None:
-            return power
+            return f
         yields = safe >= self.yield_speed
         y = jnp.where(yields, self.yield_speed / jnp.where(yields, safe, 1.0), 1.0)
-        some = moving & (y > 0)  # the root has no slope at 0
-        square = jnp.where(some, y**2 + (1 - y**2) * power**2, 1.0)
-        return jnp.where(some, jnp.sqrt(square), power)
+        smooth = moving & (y > 0)  # the root has no slope at 0
+        square = jnp.where(smooth, y**2 + (1 - y**2) * f**2, 1.0)
+        return jnp.where(smooth, jnp.sqrt(square), f)
 
     def _curve_at(self, v: jax.Array) -> jax.Array:
-        """The curve at speeds v."""
+        """Values of the curve at speeds v [m/s]; a table is linear between its rows."""
         if callable(self.curve):
             return jnp.asarray(self.curve(v), v.dtype)
         speeds, values = (jnp.asarray(each, v.dtype) for each in self.curve)
@@ -157,22 +161,22 @@ class VelocityDependent(Law):
 
     @full_precision
     def impulses(self, contact: Contact) -> Impulses:
-        """Those of the law with e at this speed."""
+        """Impulses of the law with e at the speeds of approach of these contacts."""
         return self._law_at(contact).impulses(contact)
 
     def dynamics(self, contact: Contact) -> Dynamics:
-        """Those of the law with e at this speed."""
+        """Dynamics of the law with e at the speeds of approach of these contacts."""
         return self._law_at(contact).dynamics(contact)
 
     def _law_at(self, contact: Contact) -> Law:
-        """The law with e (m,) at the speed of approach."""
+        """The law with the restitution e (m,) at the speeds of approach of these contacts."""
         restitution = self._at(approach_speed(contact))
         law: Law = with_parameter(self.law, "restitution", restitution)
         return law
 
 
 def _check_function(curve: Callable[[Any], Any]) -> None:
-    """Raise a ValueError for a function that gives no e at some speeds."""
+    """Raise a ValueError for a function of other shapes, or negative, at the speeds `TRIED`."""
     speeds = jnp.asarray(TRIED)
     values = as_float_array("curve", curve(speeds))
     if values.shape != speeds.shape:
@@ -184,9 +188,10 @@ def _check_function(curve: Callable[[Any], Any]) -> None:
 
 
 def approach_speed(contact: Contact) -> jax.Array:
-    """For each contact the fastest approach (m,) [m/s] among those it is coupled with.
+    """Largest approach speed (m,) [m/s] among the contacts that each contact is coupled with.
 
-    Differentiable in the speeds: the fastest contact is determined first, on constants.
+    Equation: `v_j = max(max(-gamma_i, 0))` over contacts i that a path of entries `W_ab != 0`
+    joins to j. Differentiable: the fastest contact is found first, on constants.
 
     >>> import jimpact as ji
     >>> from jimpact.laws.velocity_dependent import approach_speed
@@ -197,21 +202,21 @@ def approach_speed(contact: Contact) -> jax.Array:
     w = as_matrix(contact.delassus)
     root = jnp.sqrt(diagonal(contact.delassus))
     least = precision(speed.dtype).accumulated  # of normals and of M^-1
-    joined, known = jax.lax.stop_gradient(
+    coupled, constant = jax.lax.stop_gradient(
         (jnp.abs(w) > least * root[:, None] * root[None, :], speed)
     )
 
-    def passed_on(state: tuple[jax.Array, Any]) -> tuple[jax.Array, jax.Array]:
-        """Each contact takes the fastest one that its neighbours know of."""
-        leader, _ = state
-        around = jnp.where(joined, known[leader][None, :], -1.0)
-        other = leader[jnp.argmax(around, axis=1)]
-        faster = known[other] > known[leader]
-        return jnp.where(faster, other, leader), jnp.any(faster)
+    def passed_on(state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        """Fastest contact (m,) known to each one or to its neighbours; True () if one changed."""
+        fastest, _ = state
+        around = jnp.where(coupled, constant[fastest][None, :], -1.0)
+        other = fastest[jnp.argmax(around, axis=1)]
+        faster = constant[other] > constant[fastest]
+        return jnp.where(faster, other, fastest), jnp.any(faster)
 
     first = jnp.arange(len(speed)), jnp.asarray(True)
-    leader, _ = while_loop(lambda state: state[1], passed_on, first)
-    return speed[leader]
+    fastest, _ = while_loop(lambda state: state[1], passed_on, first)
+    return speed[fastest]
 
 
 def make_velocity_dependent(

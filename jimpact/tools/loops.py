@@ -1,4 +1,4 @@
-"""Loops that `shard_map` takes with its default check of what varies among devices.
+"""Loops that `shard_map` takes with its default check of which values vary among devices.
 
 Inside `shard_map` the type of an array names the mesh axes that it varies over, and a loop must
 begin with the types that its passes end with. A state that starts from constants varies over no
@@ -17,7 +17,7 @@ State = TypeVar("State")
 
 @jax.custom_batching.custom_vmap
 def over_lanes(count: jax.Array) -> jax.Array:
-    """The sum of whole numbers over all lanes that `vmap` makes of this program.
+    """The sum of a whole number () over all lanes of `vmap`, that is its batch entries.
 
     It is the same in all lanes: a condition or a loop on it is not turned into a selection.
     """
@@ -26,26 +26,26 @@ def over_lanes(count: jax.Array) -> jax.Array:
 
 @over_lanes.def_vmap
 def _over_lanes(size: int, batched: Any, count: jax.Array) -> tuple[jax.Array, bool]:
-    """Rule of `vmap`: the sum over its lanes."""
+    """Rule of `vmap` for `over_lanes`: the sum over its lanes (size,), the same in each."""
     return over_lanes(jnp.sum(count, axis=0, dtype=count.dtype)), False
 
 
 def any_lane(happens: jax.Array) -> jax.Array:
-    """Whether it happens in any lane."""
+    """True () if `happens` () is true in any lane of `vmap`."""
     return over_lanes(happens.astype(jnp.int32)) > 0
 
 
 def while_loop(
     goes_on: Callable[[State], jax.Array], one_pass: Callable[[State], State], start: State
 ) -> State:
-    """As `jax.lax.while_loop`, from a start of the types that its passes end with."""
+    """`jax.lax.while_loop` whose start varies over all mesh axes that a pass adds."""
     return jax.lax.while_loop(goes_on, one_pass, _begin(one_pass, start))
 
 
 def fori_loop(
     first: int, last: Any, one_pass: Callable[[Any, State], State], start: State
 ) -> State:
-    """As `jax.lax.fori_loop`, from a start of the types that its passes end with."""
+    """`jax.lax.fori_loop` whose start varies over all mesh axes that a pass adds."""
     return jax.lax.fori_loop(first, last, one_pass, _begin(lambda s: one_pass(first, s), start))
 
 
@@ -55,22 +55,23 @@ def scan(
     rows: Any,
     length: int | None = None,
 ) -> tuple[State, Any]:
-    """As `jax.lax.scan`, from a start of the types that its passes end with."""
+    """`jax.lax.scan` over `rows` whose start varies over all mesh axes that a pass adds."""
     first = jax.tree.map(lambda x: x[0], rows)
     return jax.lax.scan(one, _begin(lambda s: one(s, first)[0], start), rows, length)
 
 
 def cond(which: jax.Array, then: Callable[[], State], otherwise: Callable[[], State]) -> State:
-    """As `jax.lax.cond` of branches that may vary over different mesh axes."""
+    """`jax.lax.cond` of branches whose results may vary over different mesh axes."""
     if not jax.sharding.get_abstract_mesh().manual_axes:
         return jax.lax.cond(which, then, otherwise)
     both = [jax.make_jaxpr(branch)().out_avals for branch in (then, otherwise)]
     axes = [axes_of(a) | axes_of(b) for a, b in zip(*both)]
 
     def varying(branch: Callable[[], State]) -> Callable[[], State]:
-        """The branch, whose results vary over the axes of both."""
+        """The branch with results that vary over the mesh axes of both branches."""
 
         def call() -> State:
+            """Results of the branch, marked as varying."""
             leaves, tree = jax.tree.flatten(branch())
             return jax.tree.unflatten(tree, map(_varying, leaves, axes))
 
@@ -80,15 +81,17 @@ def cond(which: jax.Array, then: Callable[[], State], otherwise: Callable[[], St
 
 
 def _begin(one_pass: Callable[[Any], Any], start: Any) -> Any:
-    """The start of a loop, varying over all mesh axes that its passes make it vary over."""
+    """The start of a loop, marked as varying over all mesh axes that its passes make it vary over.
+
+    Repeated until nothing changes: an array that varies may make others of the state vary.
+    """
     if not jax.sharding.get_abstract_mesh().manual_axes:
         return start
     leaves, tree = jax.tree.flatten(start)
     kinds = jax.make_jaxpr(one_pass)(start).out_avals
-    begun = [_varying(x, axes_of(kind)) for x, kind in zip(leaves, kinds)]
-    # what varies now may make other parts of the state vary
-    same = all(a is b for a, b in zip(begun, leaves))
-    return start if same else _begin(one_pass, jax.tree.unflatten(tree, begun))
+    marked = [_varying(x, axes_of(kind)) for x, kind in zip(leaves, kinds)]
+    same = all(a is b for a, b in zip(marked, leaves))
+    return start if same else _begin(one_pass, jax.tree.unflatten(tree, marked))
 
 
 def varying_like(tree: Any, *like: Any) -> Any:
@@ -99,15 +102,15 @@ def varying_like(tree: Any, *like: Any) -> Any:
 
 
 def _varying(x: Any, axes: frozenset[Any]) -> Any:
-    """x, varying over these axes, too."""
+    """The array x, marked as varying over these mesh axes, too."""
     missing = axes and axes - axes_of(jax.typeof(x))
     return jax.lax.pcast(x, tuple(missing), to="varying") if missing else x
 
 
 def axes_of(kind: Any) -> frozenset[Any]:
-    """The mesh axes that arrays of this abstract kind vary over.
+    """Mesh axes over which arrays of an abstract value (`jax.typeof(x)`) vary.
 
-    Some versions of JAX have the axes themselves, under another name.
+    Versions of JAX keep them under one of two names.
     """
     manual = getattr(kind, "manual_axis_type", None)
     return getattr(kind, "vma", frozenset()) if manual is None else manual.varying

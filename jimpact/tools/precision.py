@@ -1,4 +1,4 @@
-"""How small is zero: what counts as rounding in each floating-point type.
+"""Sizes below which a number counts as 0 in each floating-point type.
 
 A velocity, a cosine or an eigenvalue that should be 0 rarely is. Here are the five answers of the
 library to how large it may be, relative to the numbers that it was computed from. Ten times more of
@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 
 class Precision(NamedTuple):
-    """What counts as 0, relative to the numbers that it was computed from.
+    """Sizes that count as 0, relative to the numbers that they were computed from.
 
     `rounding`: one sum of products. `noise`: several of them, one after the other; an error
     estimate below it says nothing. `accumulated`: many of them, over a long sum or many steps.
@@ -39,7 +39,7 @@ def without_rounding(values: jax.Array, noise: jax.Array) -> jax.Array:
 
 @functools.cache
 def precision(dtype: Any) -> Precision:
-    """What counts as 0 in a floating-point type.
+    """Sizes that count as 0 in a floating-point type: multiples of its eps, see `Precision`.
 
     >>> import numpy as np
     >>> from jimpact.tools.precision import precision
@@ -52,7 +52,7 @@ def precision(dtype: Any) -> Precision:
 
 
 def check_rtol(rtol: float, dtype: jnp.dtype) -> None:
-    """Raise a ValueError where the precision cannot hold this tolerance."""
+    """Raise a ValueError for a relative tolerance below the `noise` of this floating-point type."""
     finest = precision(dtype).noise
     if rtol < finest:
         raise ValueError(

@@ -16,7 +16,7 @@ LINE_EVERY = 10.0  # seconds between two lines about one step, a few for each mi
 
 FIRST = "compiling"  # the step until the work reports one
 
-Show = Callable[[str, float, float | None], None]
+Show = Callable[[str, float, float | None], None]  # show(step, done, total), total None: unknown
 
 
 class Patience(float):
@@ -44,7 +44,7 @@ def progress_bar(progress: float | None) -> Iterator[Show]:
 
 
 def _has_bars() -> bool:
-    """Whether rich is there; a long run does not fail without it."""
+    """True if the package rich is installed; a long run does not fail without it."""
     try:
         import rich.progress  # noqa: F401
     except ImportError:
@@ -54,7 +54,7 @@ def _has_bars() -> bool:
 
 @contextlib.contextmanager
 def _bar(after: float) -> Iterator[Show]:
-    """A bar that appears after so many seconds."""
+    """Yield `show` of a bar of the package rich, which appears `after` this time [s]."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -81,23 +81,26 @@ def _bar(after: float) -> Iterator[Show]:
 
 @contextlib.contextmanager
 def _lines(after: float) -> Iterator[Show]:
-    """A line after so many seconds, then now and then; one at the end where `after` is 0."""
+    """Yield `show` of lines on stderr with the latest step: the first one `after` this time [s].
+
+    Others follow each `LINE_EVERY`; where `after` is 0 one more is printed at the end.
+    """
     begun, ended = getattr(after, "begun", time.monotonic()), threading.Event()
     latest = FIRST
 
     def report() -> None:
-        """Print the latest step."""
+        """Print the latest step and the seconds since the work began."""
         print(f"{latest}, {time.monotonic() - begun:.0f} s", file=sys.stderr)
 
     def run() -> None:
-        """Report until the work has ended."""
+        """Print reports in a thread, until the work has ended."""
         wait = after or LINE_EVERY
         while not ended.wait(wait):
             report()
             wait = LINE_EVERY
 
     def show(step: str, done: float, total: float | None) -> None:
-        """Remember the step."""
+        """Keep the step for the next line."""
         nonlocal latest
         latest = step
 
@@ -124,15 +127,16 @@ def waiting(step: str, progress: float | None = None) -> Iterator[None]:
 def counting_bar(
     total: int, unit: str, progress: float | None, done: int = 0
 ) -> Iterator[Callable[[int], None]]:
-    """Yield `advance(more)`, which counts up to a total.
+    """Yield `advance(more)`, which counts `more` of a `unit` up to a `total` and shows the rate.
 
-    The rate counts from the first advance on, which waits for a program to be compiled.
+    `progress` as of `progress_bar`, `done` are finished before. The rate counts from the first
+    advance on, which waits for a program to be compiled.
     """
     began, finished = None, done  # when the first advance came, and what was finished then
     with progress_bar(progress) as show:
 
         def advance(more: int) -> None:
-            """Count so many more."""
+            """Add `more` to what is finished, and show it with the rate and the time left."""
             nonlocal began, finished
             finished += more
             now = time.perf_counter()
@@ -141,7 +145,7 @@ def counting_bar(
             text = f"{finished:,} of {total:,} {unit}"
             if rate >= 10:
                 text += f", {rate:,.0f}/s"
-            if rate and not sys.stderr.isatty():  # a bar says it itself
+            if rate and not sys.stderr.isatty():  # a bar shows the time left itself
                 text += f", {(total - finished) / rate:,.0f} s left"
             show(text, finished, total)
 
@@ -158,7 +162,7 @@ class Steps:
         self.show_finished: Callable[[], None] | None = None
 
     def __call__(self, step: str) -> None:
-        """Record a step that is done."""
+        """Record a `step` that is done; print it where the command has run longer than `LONG`."""
         self.done.append(step)
         seconds = time.monotonic() - self.patience.begun
         if seconds > LONG:
@@ -168,15 +172,15 @@ class Steps:
 def wrapped(text: str) -> str:
     """The text with its sentences wrapped to the terminal's width; tables are left unchanged.
 
-    A sentence may stand behind a word or two and spaces: it stays in its column.
+    A sentence behind a word or two and spaces, such as "status   ok", is wrapped within its column.
     """
     width = shutil.get_terminal_size((len(text), 0)).columns
     lines = []
     for line in text.splitlines():
         indent = re.match(r" *(- )?", line)[0]  # type: ignore[index]
-        head = re.match(r"\S+(?: \S+)?  +", line)
+        head = re.match(r"\S+(?: \S+)?  +", line)  # one or two words and spaces
         start = indent if head is None else head[0]
-        if len(line) > width and "  " not in line[len(start) :]:
+        if len(line) > width and "  " not in line[len(start) :]:  # no columns: no table
             line = textwrap.fill(line, width, subsequent_indent=" " * len(start))
         lines.append(line)
     return "\n".join(lines)

@@ -23,7 +23,7 @@ _LEAST_WIDTH = 20  # characters of a column whose text is wrapped; narrower ones
 
 
 def as_data(value: Any) -> Any:
-    """Records, arrays and mappings as what a JSON file can hold; numbers not finite are None.
+    """Records, arrays and mappings as dicts, lists and numbers of a JSON file; NaN, inf as None.
 
     >>> import numpy as np
     >>> from jimpact.tools.records import as_data
@@ -51,7 +51,7 @@ def fields_as_data(record: Any, *left_out: str) -> dict[str, Any]:
 
 
 def number(value: float | None, form: str) -> str:
-    """The number in this format, '' for None and NaN.
+    """A number as text in the format `form`, '' for None and NaN.
 
     >>> from jimpact.tools.records import number
     >>> number(0.25, ".1f"), number(float("nan"), ".1f"), number(None, ".1f")
@@ -61,7 +61,7 @@ def number(value: float | None, form: str) -> str:
 
 
 def microseconds(time: float | None) -> str:
-    """A time [s] in microseconds, '' for None.
+    """A time [s] in microseconds as text, '' for None.
 
     >>> from jimpact.tools.records import microseconds
     >>> microseconds(1.234e-5)
@@ -71,7 +71,7 @@ def microseconds(time: float | None) -> str:
 
 
 def listed(labels: Sequence[str], most: int = 6) -> str:
-    """The first labels of a list, and whether there are more.
+    """The first labels of a list as text, "..." in the place of the others; at most `most`.
 
     >>> from jimpact.tools.records import listed
     >>> listed(["1", "2"]), listed("abcd", 3)
@@ -81,7 +81,7 @@ def listed(labels: Sequence[str], most: int = 6) -> str:
 
 
 def readable_unit(unit: str, largest: float) -> tuple[str, float]:
-    """The multiple of an SI unit in which a quantity has 1 to 3 digits before the point, its size.
+    """Multiple of an SI unit in which `largest` has 1 to 3 digits before the point, and its size.
 
     >>> from jimpact.tools.records import readable_unit
     >>> readable_unit("m", 3e-5), readable_unit("s", 2.0)
@@ -92,7 +92,9 @@ def readable_unit(unit: str, largest: float) -> tuple[str, float]:
 
 
 def counted(count: int, noun: str, plural: str = "") -> str:
-    """So many of a thing, in words; `plural`: of a noun whose plural is not its s.
+    """A number of things in words: `count` and the noun, in the plural unless it is 1.
+
+    `plural`: the plural of a noun where this is not the noun and s.
 
     >>> from jimpact.tools.records import counted
     >>> counted(1, "shot"), counted(2000, "sample"), counted(2, "body", "bodies")
@@ -102,7 +104,7 @@ def counted(count: int, noun: str, plural: str = "") -> str:
 
 
 def degrees(count: int) -> str:
-    """So many degrees of freedom, in words.
+    """A number of degrees of freedom, in words.
 
     >>> from jimpact.tools.records import degrees
     >>> degrees(1), degrees(2)
@@ -112,7 +114,7 @@ def degrees(count: int) -> str:
 
 
 def formatted(value: Any, form: str) -> str:
-    """A number or words as of `format`; a number that rounds to 0 has no minus sign.
+    """A number or text by Python's `format`; a number that rounds to 0 has no minus sign.
 
     >>> from jimpact.tools.records import formatted
     >>> formatted(-0.0, "6g"), formatted(-4e-9, ".5f"), formatted(-0.01, ".1e")
@@ -129,7 +131,7 @@ def formatted(value: Any, form: str) -> str:
 
 
 def plain(value: float, scale: float = 1.0) -> float:
-    """0 in the place of what is rounding beside `scale`, so that no report has a -0.
+    """The value, 0 where it is rounding beside `scale`, so that no report has a -0.
 
     >>> from jimpact.tools.records import plain
     >>> plain(-0.0), plain(-1e-17), plain(-0.5)
@@ -139,7 +141,7 @@ def plain(value: float, scale: float = 1.0) -> float:
 
 
 def with_error(value: float, error: float) -> str:
-    """A value and its standard error, to the digits that count.
+    """A value and its standard error as text, to the error's first digit (two if this is 1).
 
     >>> from jimpact.tools.records import with_error
     >>> with_error(0.99123, 0.0042), with_error(131.7, 18.2), with_error(0.4, 0.0)
@@ -164,15 +166,15 @@ def table(
     >>> table(["law", "e", "status"], [["newton", "0.5", "ok"]], left=["status"])
     ['law       e  status', 'newton  0.5  ok']
     """
-    whole = [list(heads), *map(list, rows)]
-    widths = [max(map(len, column)) for column in zip(*whole)]
+    all_rows = [list(heads), *map(list, rows)]
+    widths = [max(map(len, column)) for column in zip(*all_rows)]
     is_text = [i == 0 or head in left for i, head in enumerate(heads)]
     room = shutil.get_terminal_size((sum(widths) + 2 * len(widths), 0)).columns  # no terminal: all
     lines: list[str] = []
     for part in _parts(widths, keys, room):
         lines += [""] if lines else []
-        before = sum(widths[i] + 2 for i in part[:-1])
-        for row in whole:
+        before = sum(widths[i] + 2 for i in part[:-1])  # characters before the last column
+        for row in all_rows:
             cells = (
                 row[i].ljust(widths[i]) if is_text[i] else row[i].rjust(widths[i]) for i in part
             )
@@ -235,7 +237,7 @@ class Table:
     def __str__(self) -> str:
         """The table with its head and notes."""
         cells = [[c.cell(x) for c, x in zip(self.columns, row)] for row in self.rows]
-        used = [i for i in range(len(self.columns)) if any(row[i] for row in cells)]
+        used = [i for i in range(len(self.columns)) if any(row[i] for row in cells)]  # not empty
         text = [any(isinstance(x, str) for x in column) for column in zip(*self.rows)]
         left = [c.title for c, is_text in zip(self.columns, text) if is_text]
         titles = [self.columns[i].title for i in used]
@@ -286,7 +288,7 @@ class Tabular:
         return self.table.to_pandas()
 
     def plot(self, title: str = "") -> "Figure":
-        """The result's picture of `ji.plot`."""
+        """The figure that `ji.plot` draws of the result; raise a TypeError if there is none."""
         if not self.picture:
             raise TypeError(f"{type(self).__name__} has no picture, only a `table`.")
         pictures = import_module("jimpact.plot")  # late: matplotlib takes long to import
@@ -294,7 +296,9 @@ class Tabular:
 
 
 def _parts(widths: Sequence[int], keys: int, room: int) -> list[list[int]]:
-    """Columns of tables side by side that fit the room, each with the first `keys`.
+    """Numbers of the columns of tables that fit the `room` [characters], the first `keys` in each.
+
+    `widths` are those of the columns; two spaces stand between them.
 
     >>> from jimpact.tools.records import _parts
     >>> _parts([6, 6, 6, 6], 1, 22), _parts([6, 60], 1, 22)

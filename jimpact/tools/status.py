@@ -72,19 +72,26 @@ SIGN_TOLERANCE = {"float64": 1e-7, "float32": 2e-3}
 def raise_for(
     codes: Any, table: Sequence[Status], what: str, more: Callable[[Status, np.ndarray], str]
 ) -> None:
-    """Raise a RuntimeError with all failures among codes of a table; `more` of those at (k,)."""
+    """Raise a RuntimeError that lists the failures among status codes, or return.
+
+    Args:
+        codes: numbers of rows of the table, of any shape.
+        table: rows, as `STATUS`.
+        what: plural of what has a code, for the message.
+        more: text to add for a row of the table, and the places (k,) of its code in flat `codes`.
+    """
     codes, lines = np.atleast_1d(np.asarray(codes)), []
     for code in np.unique(codes):
         row, at = table[code], np.argwhere(codes == code)
         if row.failure:
             first = ", ".join(str(tuple(map(int, i)) if len(i) > 1 else int(i[0])) for i in at[:5])
             where = f" at {first}{', ...' if len(at) > 5 else ''}" if codes.size > 1 else ""
-            said = more(row, np.flatnonzero(codes == code))
-            lines.append(f"{row.name}: {row.message} ({len(at)}{where}){said}")
+            added = more(row, np.flatnonzero(codes == code))
+            lines.append(f"{row.name}: {row.message} ({len(at)}{where}){added}")
     if lines:
         raise RuntimeError(f"Failed {what} among {codes.size}:\n  " + "\n  ".join(lines))
 
 
 def sign_tolerance(dtype: Any) -> float:
-    """Beyond which part of the impact's size a sign is violated, in this precision."""
+    """Part of the impact's size beyond which a sign counts as violated, in this precision."""
     return SIGN_TOLERANCE.get(str(dtype), SIGN_TOLERANCE["float32"])

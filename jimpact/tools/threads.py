@@ -74,7 +74,7 @@ def in_threads(
     as_here = _settings()
 
     def one(task: Task) -> Result:
-        """The task with the caller's settings, which belong to its thread."""
+        """Result of a task with the caller's settings of JAX, which belong to a thread."""
         with as_here():
             return function(task)
 
@@ -100,7 +100,7 @@ def in_parts(
     workers: int | None = None,
     compiles: bool = True,
 ) -> Iterator[tuple[np.ndarray, Any]]:
-    """`function` of rows of arrays, so many at a time: one program for all parts.
+    """`function` applied to rows of arrays, `size` rows at a time: one program for all parts.
 
     Args:
         function: of trees like these, with `size` rows each.
@@ -122,11 +122,11 @@ def in_parts(
         which = np.arange(len(jax.tree.leaves(trees)[0]))
 
     def rows(first: int) -> np.ndarray:
-        """Those of the part from `which[first]` on."""
+        """Numbers (size,) of the rows of the part from `which[first]` on, the last one repeated."""
         return which[np.minimum(np.arange(first, first + size), len(which) - 1)]
 
     def result(first: int) -> Any:
-        """What the function makes of this part."""
+        """Result of the function for the part from `which[first]` on, on the host."""
         chosen = rows(first)
         pick = partial(jax.tree.map, lambda x: x[chosen] if eqx.is_array(x) else x)
         return jax.device_get(function(*map(pick, trees)))
@@ -136,15 +136,19 @@ def in_parts(
 
 
 def _settings() -> Callable[[], Any]:
-    """A context with the precision and the device that are set where this is called."""
+    """A context manager that sets JAX's precision and device as they are at this call.
+
+    JAX keeps both for each thread by itself.
+    """
     x64, device = jax.config.jax_enable_x64, jax.config.jax_default_device  # type: ignore[attr-defined]
 
     @contextmanager
-    def as_there() -> Iterator[None]:
+    def as_at_call() -> Iterator[None]:
+        """Set the precision and the device, and restore both at the end."""
         with ExitStack() as stack:
             stack.enter_context(jax.enable_x64(x64))
             if device is not None:
                 stack.enter_context(jax.default_device(device))
             yield
 
-    return as_there
+    return as_at_call
