@@ -30,7 +30,9 @@ class InclusionOutcome(NamedTuple):
 
 @full_precision
 def contact_coupling(scene: Scene) -> jax.Array:
-    """`Gbar = [[G, n_q^T H], [0, t_q^T H]]` (n, m + t): what (pbar, p_t) do to (qn, qt).
+    """Matrix Gbar (n, m + t) from impulses (pbar, p_t) to changes of quasi-velocities (qn, qt).
+
+    Equation: `Gbar = [[G, n_q^T H], [0, t_q^T H]]`, H the tangents (n, t), `pbar = |grad f| p`.
 
     Args:
         scene: n coordinates, m contacts, t tangents.
@@ -50,11 +52,11 @@ def contact_coupling(scene: Scene) -> jax.Array:
     """
     n_q, t_q = quasi_basis(scene)
     g = as_matrix(normalized_delassus(scene))
-    left = jnp.concatenate([g, jnp.zeros((t_q.shape[1], g.shape[1]), g.dtype)])
+    of_normal = jnp.concatenate([g, jnp.zeros((t_q.shape[1], g.shape[1]), g.dtype)])
     if scene.tangents is None:
-        return left
-    right = jnp.concatenate([n_q.T @ scene.tangents, t_q.T @ scene.tangents])
-    return jnp.concatenate([left, right], axis=1)
+        return of_normal
+    of_tangential = jnp.concatenate([n_q.T @ scene.tangents, t_q.T @ scene.tangents])
+    return jnp.concatenate([of_normal, of_tangential], axis=1)
 
 
 @full_precision
@@ -104,14 +106,19 @@ def restitution_inclusion(
     )
     gamma = gbar.T @ p
     y = gamma @ (v + lam @ v)
-    percussion, code = _in_box(gamma @ gbar, y, low, high)
+    percussion, code = _box_multipliers(gamma @ gbar, y, low, high)
     return InclusionOutcome(v + gbar @ percussion, percussion, code.astype(jnp.int32))
 
 
-def _in_box(
+def _box_multipliers(
     s: jax.Array, y: jax.Array, low: jax.Array, high: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Multipliers that bring `y + S p` into the box; S symmetric positive semidefinite."""
+    """Multipliers p (c,) with `low <= y + S p <= high`, and the code of the status.
+
+    Equation: `p = p_low - p_high`, `0 <= p_low _|_ y + S p - low >= 0`,
+    `0 <= p_high _|_ high - y - S p >= 0`: one LCP in (p_low, p_high) (2 c,). S (c, c) is symmetric
+    positive semidefinite.
+    """
     bounded = jnp.isfinite(jnp.concatenate([low, high]))
     slack = jnp.concatenate([y - low, high - y])
     slack = jnp.where(bounded, slack, 1.0)  # a bound at infinity never binds
@@ -148,15 +155,14 @@ class FrictionBounds(NamedTuple):
         return self.m_bar_least > self.k_largest
 
     def dissipates(self, scene: Scene, velocity: Any) -> bool:
-        """Whether Theorem 6.2 (sufficient) promises T+ <= T- in a scene, at a velocity v- (n,)."""
+        """True where Theorem 6.2 (sufficient) promises T+ <= T- of a scene at v- (n,) [m/s]."""
         qn, qt = to_quasi_velocities(scene, velocity)
         return self.condition_i and bool(
             jnp.linalg.norm(qn) >= self.least_ratio * jnp.linalg.norm(qt)
         )
 
     def __str__(self) -> str:
-        """The four conditions, a line each."""
-
+        """Report: the four conditions with their numbers, a line each."""
         words = {True: "holds", False: "does not hold, which decides nothing"}
         first, third = words[self.g_mu_bound < 1], words[self.restitution_bound < 1]
         ratio = f"|qn-| / |qt-| >= {self.least_ratio:.6g}" if self.condition_i else "no bound"
@@ -170,16 +176,16 @@ class FrictionBounds(NamedTuple):
 
 
 class _Coupling(NamedTuple):
-    """The matrices of friction of a scene: G, n_q^T H_t, t_q^T H_t, mubar xi, with m columns."""
+    """Matrices of a planar scene with m closed contacts and as many tangents H_t."""
 
-    delassus: jax.Array
-    normal: jax.Array
-    tangential: jax.Array
+    delassus: jax.Array  # G (m, m)
+    normal: jax.Array  # n_q^T H_t (m, m)
+    tangential: jax.Array  # t_q^T H_t (n - m - b, m)
     friction: jax.Array  # mu_j xi_j / |grad f_j| (m,)
 
     @property
     def g_mu(self) -> jax.Array:
-        """G^mu (m, m)."""
+        """G^mu = G - n_q^T H_t [mubar][xi] (m, m)."""
         return self.delassus - self.normal * self.friction[None, :]
 
 
@@ -234,6 +240,7 @@ def friction_bounds(scene: Scene, matrix: Any, friction: Any, slip: Any = 1.0) -
     least = float(np.linalg.eigvalsh(0.5 * (m_bar + m_bar.T))[0])
     largest = float(np.linalg.eigvalsh(k)[-1])
     largest_mu = float(jnp.abs(mu).max())
+    # numerator of Theorem 6.2 (ii)
     reach = 2 * _norm(coupling.tangential) * largest_mu
     reach *= _norm(np.linalg.inv(g_mu)) * _norm(one_plus)
     return FrictionBounds(
@@ -331,13 +338,13 @@ def _norm(matrix: Any) -> float:
 
 
 def _restitution(scene: Scene, matrix: Any) -> np.ndarray:
-    """E (m, m) on the host, checked."""
+    """Restitution matrix E (m, m) as a NumPy array, checked."""
     e = as_numbers("matrix", matrix, (scene.contacts,) * 2, "one row and one column per contact")
     return np.asarray(e, float)
 
 
 def _coupling(scene: Scene, friction: Any, slip: Any) -> _Coupling:
-    """The matrices of a planar scene of closed contacts, checked."""
+    """Matrices of friction of a planar scene of closed contacts at slip xi; arguments checked."""
     m = scene.contacts
     if scene.tangents is None or scene.tangents.shape[1] != m:
         raise ValueError(
@@ -350,6 +357,7 @@ def _coupling(scene: Scene, friction: Any, slip: Any) -> _Coupling:
     _, tangent = quasi_basis(scene)
     unit = jnp.eye(m, dtype=scene.mass.dtype)
     none = jnp.zeros(m, scene.mass.dtype)
+    # M^-1 H_t (n, m): column j is v+ - v- of a unit tangential impulse at contact j
     pushed = jax.vmap(lambda p_t: velocity_change(scene, none, p_t), 1, 1)(unit)
     return _Coupling(
         delassus=as_matrix(normalized_delassus(scene)),

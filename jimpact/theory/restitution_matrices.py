@@ -84,7 +84,9 @@ def margin(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
 def copositivity(
     matrix: Any, tolerance: float | None = None, scale: float | None = None
 ) -> Copositivity:
-    """Whether Q is copositive: "yes", "no" with a violating x >= 0, or "boundary".
+    """Decide if Q is copositive: "yes", "no" with a violating x >= 0, or "boundary".
+
+    Equation: copositive is `x^T Q x >= 0` for all x >= 0: `margin(Q) >= 0`.
 
     Args:
         matrix: Q (m, m), m <= 12.
@@ -117,7 +119,7 @@ def copositivity(
 
 
 def _size(matrix: jax.Array) -> int:
-    """m, checked."""
+    """Number m of rows of a square matrix, checked: 1 to `LARGEST`."""
     shape = np.shape(matrix)
     if len(shape) != 2 or shape[0] != shape[1] or shape[0] == 0:
         raise ValueError(f"Argument `matrix` must have shape (m, m), but has shape {shape}.")
@@ -133,12 +135,12 @@ _compiled_margin = jax.jit(margin)
 
 
 class Sign(NamedTuple):
-    """Whether a matrix is nonnegative; its least entry and where; the qn- that shows it."""
+    """Verdict on a condition `A >= 0`, entry by entry, on a matrix A (m, m)."""
 
     holds: bool
-    worst: float
-    where: tuple[int, int]
-    velocity: np.ndarray
+    worst: float  # least entry of A
+    where: tuple[int, int]  # its contacts: row and column, from 0
+    velocity: np.ndarray  # qn- (m,): of the approaches of one contact alone, the worst
 
 
 class MatrixAudit(NamedTuple):
@@ -164,7 +166,7 @@ class MatrixAudit(NamedTuple):
 
     @property
     def singular_values(self) -> bool:
-        """Whether the sufficient bound of Prop. 6.5 holds."""
+        """True where the sufficient bound of Prop. 6.5 holds."""
         return self.singular_value <= self.singular_value_bound
 
     @property
@@ -173,7 +175,7 @@ class MatrixAudit(NamedTuple):
         return self.kinematic.holds and self.kinetic.holds and bool(self.energetic)
 
     def __str__(self) -> str:
-        """The verdict and each proposition, a line each."""
+        """Report: the verdict, and each proposition with its numbers, a line each."""
         kinematic, kinetic, energetic = self.kinematic, self.kinetic, self.energetic
         verdict = "admissible" if self.admissible else "NOT admissible"
         lines = [f"restitution matrix: {verdict} for all pre-impact velocities qn- <= 0"]
@@ -324,7 +326,7 @@ def carnot_energy_loss(scene: Scene, jump: Any, restitution: Any = 0.0) -> jax.A
 
 
 def _closed_delassus(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """G of the closed contacts, and which those are (m,)."""
+    """Normalized Delassus matrix G of the closed contacts, and their mask (m,)."""
     closed = np.asarray(scene.closed)
     if not closed.any():
         raise ValueError("Argument `scene` must have a closed contact, but all gaps are open.")
@@ -332,7 +334,7 @@ def _closed_delassus(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _check_independent(scene: Scene, g: np.ndarray) -> None:
-    """Raise a ValueError where the contacts of G are redundant."""
+    """Raise a ValueError if contacts are redundant: G, of the closed ones, is singular."""
     eigenvalues = np.linalg.eigvalsh(g)
     floor = _SINGULAR * np.finfo(scene.mass.dtype).eps * len(g) * eigenvalues[-1]
     if eigenvalues[0] <= floor:
@@ -344,7 +346,11 @@ def _check_independent(scene: Scene, g: np.ndarray) -> None:
 
 
 def _sign(a: np.ndarray, tolerance: float, closed: np.ndarray) -> Sign:
-    """Column j of `a` is what the approach qn- = -(unit vector j) leads to."""
+    """Verdict on `a >= 0`, entry by entry, of a matrix between the closed contacts.
+
+    Column j of `a` is the result (qn+ or pbar) of an approach of contact j alone, qn-_j = -1.
+    `closed` (m,) is the mask of these contacts; entries down to -`tolerance` pass.
+    """
     at = np.unravel_index(np.argmin(a), a.shape)
     contact = np.flatnonzero(closed)
     velocity = np.zeros(len(closed))
@@ -359,10 +365,10 @@ def _row(vector: np.ndarray) -> str:
 
 
 class CoefficientAudit(NamedTuple):
-    """Result of `audit_coefficients`: whether no impact by Moreau's law can gain energy.
+    """Result of `audit_coefficients`: can an impact by Moreau's law gain energy?
 
-    `energetic` is true where none gains, else with a witness pbar >= 0, normalized impulses of an
-    impact that does. `spread` <= `spread_allowed` suffices for that.
+    `energetic` is true where none gains; else its `witness` pbar >= 0 are the normalized impulses
+    of an impact that does. `spread` <= `spread_allowed` is sufficient that none gains.
     """
 
     energetic: Copositivity
@@ -370,7 +376,7 @@ class CoefficientAudit(NamedTuple):
     spread_allowed: float
 
     def __str__(self) -> str:
-        """The verdict, and the sufficient condition."""
+        """Report: the verdict, and the sufficient condition with its numbers."""
         verdict = "no impact gains energy" if self.energetic else "some impacts GAIN energy"
         holds = "holds" if self.spread <= self.spread_allowed else "does not, which decides nothing"
         return (
@@ -380,7 +386,7 @@ class CoefficientAudit(NamedTuple):
 
 
 def audit_coefficients(scene: Scene, restitution: Any) -> CoefficientAudit:
-    """Whether Moreau's law with these e_j can gain energy in any frictionless impact.
+    """Decide if Moreau's law with coefficients e_j can gain energy in a frictionless impact.
 
     Equation: it changes the energy by `-pbar^T D G pbar / 2`, `D = diag(d_j)`,
     `d_j = (1 - e_j) / (1 + e_j)`, and every pbar >= 0 occurs in some impact: none gains exactly
@@ -412,10 +418,10 @@ def audit_coefficients(scene: Scene, restitution: Any) -> CoefficientAudit:
     g, closed = _closed_delassus(scene)
     each = np.broadcast_to(np.asarray(e, float), closed.shape)[closed]
     d = (1 - each) / (1 + each)
-    whole = d[:, None] * g
+    weighted = d[:, None] * g  # D G
     low, high = float(d.min()), float(d.max())
     return CoefficientAudit(
-        energetic=copositivity((whole + whole.T) / 2, scale=float(np.abs(g).max())),
+        energetic=copositivity((weighted + weighted.T) / 2, scale=float(np.abs(g).max())),
         spread=(high - low) / (high + low) if high > 0 else 0.0,
         spread_allowed=1 / float(np.linalg.cond(g)),
     )
