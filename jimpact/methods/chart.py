@@ -122,7 +122,7 @@ class WorkPrecision(Tabular):
 
     @property
     def table(self) -> Table:
-        """A row for each point, and how they were measured."""
+        """Table: errors and times, a row for each point; notes say how they were measured."""
         heads = ("v+", "impulse", "energy", "time", "gradient")
         columns = (
             Column("method"),
@@ -268,7 +268,7 @@ def work_precision(
 
 
 def shared_parameters(law: LZB) -> dict[str, Any]:
-    """What an algebraic law has in common with it: restitution, and friction where there is any."""
+    """Parameters that algebraic laws share with LZB: `restitution`, and `friction` if any."""
     friction = {} if law.friction is None else {"friction": law.friction}
     return {"restitution": law.restitution} | friction
 
@@ -315,7 +315,10 @@ def _chosen(
     settings: Mapping[str, Sequence[float]],
     case: Case,
 ) -> tuple[list[Contender], dict[str, str]]:
-    """Contenders with their settings; without names all that support the law, else why not."""
+    """Contenders with the ladders of settings to run, and reasons why others are left out, by name.
+
+    `methods` None: all that support the law of the case; `settings` replaces ladders by name.
+    """
     left_out: dict[str, str] = {}
     if methods is None:
         reasons = {name: each.supports(case.law) for name, each in CONTENDERS.items()}
@@ -332,7 +335,7 @@ def _chosen(
 
 
 def _supporting(argument: str, methods: Sequence[str | Contender], case: Case) -> list[Contender]:
-    """These contenders, if they support the law."""
+    """Contenders by name, checked that they support the law of the case."""
     chosen = contenders_of(argument, methods, CONTENDERS)
     for contender in chosen:
         reason = contender.supports(case.law)
@@ -345,7 +348,7 @@ def _supporting(argument: str, methods: Sequence[str | Contender], case: Case) -
 
 
 def _reference(name: str | None, case: Case) -> Contender:
-    """The contender that errors are measured from."""
+    """The contender that errors are measured from, one with an rtol; None: 'time'."""
     (contender,) = _supporting("reference", [name or "time"], case)
     if contender.setting != "rtol":
         raise ValueError(f"Argument `reference` must take an rtol, but is {name!r}.")
@@ -381,7 +384,10 @@ class Programs:
 def _climbed(
     programs: Programs, name: str, advance: Callable[[int], None], ladders: Mapping[str, Any]
 ) -> list[Outcomes]:
-    """The sample at every setting of a contender's ladder."""
+    """Outcomes of the sampled impacts at every setting of the ladder of contender `name`.
+
+    `advance` is called with the number of settings, even if the contender raises.
+    """
     try:
         return [programs.at(setting) for setting in ladders[name]]
     finally:
@@ -391,18 +397,18 @@ def _climbed(
 def _method_programs(
     contender: Contender, case: Case, gradients: bool, durations: bool
 ) -> Programs:
-    """Programs of a contender at the stiffnesses of the case."""
+    """Programs of a contender over the stiffnesses (batch, m) of the case, jitted and vmapped."""
     if not contender.jax:
         return _host_programs(contender, case)
     names, apart = tuple(shared_parameters(case.law)), contender.duration_apart
 
     def solve(k: jax.Array, case: Case, setting: jax.Array) -> Outcomes:
-        """The impact with stiffness k (m,)."""
+        """Outcome of the case's impact with stiffness k (m,)."""
         law = with_entries(case.law, ("stiffness",), k)
         return solved(contender, law, case.scene, case.velocity, setting)[1]
 
     def timed(k: jax.Array, case: Case, setting: jax.Array) -> Outcomes:
-        """The same, without a duration that would cost a run of its own."""
+        """The same, with a duration of NaN where it costs a run of its own or is not wanted."""
         solution = solve(k, case, setting)
         return solution._replace(duration=jnp.nan) if apart or not durations else solution
 
@@ -410,7 +416,7 @@ def _method_programs(
         """(d v+ / d ln k, d v+ / d e) (n, 2 m), with friction also d v+ / d mu (n, 3 m)."""
 
         def velocity(at: dict[str, jax.Array]) -> jax.Array:
-            """v+ (n,)."""
+            """v+ (n,) [m/s] at the parameters `at` (m,) by name; 'ln k' is a change of ln k."""
             law = case.law
             for name in names:
                 law = with_entries(law, (name,), at[name])
@@ -424,7 +430,7 @@ def _method_programs(
     k, compile_time = case.stiffness, dict[str, float]()
 
     def batch(name: str, function: Callable[..., Any], rows: int) -> Callable[[Any], Any]:
-        """The function of a setting, over the first stiffnesses."""
+        """Program of a setting: the function at each of the first `rows` stiffnesses."""
         each = jax.vmap(function, in_axes=(0, None, None))
         return _compiled(compile_time, name, each, k[:rows], case)
 
@@ -443,11 +449,14 @@ def _method_programs(
 def _compiled(
     compile_time: dict[str, float], name: str, function: Callable[..., Any], *arguments: Any
 ) -> Callable[[Any], Any]:
-    """The function of a setting; its first call enters the time of compiling."""
+    """`setting -> function(*arguments, setting)`, compiled at its first call.
+
+    That call enters the time of compiling [s] in `compile_time` under `name`.
+    """
 
     @cache
     def compiled() -> Callable[..., Any]:
-        """The compiled function."""
+        """The compiled program of the arguments and a setting."""
         begin = time.perf_counter()
         program = jax.jit(function).lower(*arguments, jnp.ones((), float)).compile()
         compile_time[name] = time.perf_counter() - begin
@@ -459,17 +468,17 @@ def _compiled(
 
 
 def _host_programs(contender: Contender, case: Case) -> Programs:
-    """The same of a contender that runs on the host: loops."""
+    """Programs of a contender that JAX cannot trace: loops over stiffnesses on the host."""
     laws = [with_entries(case.law, ("stiffness",), k) for k in case.stiffness[:SAMPLE]]
     rows = min(HOST_BATCH, len(laws))
 
     def sampled(setting: Any) -> Outcomes:
-        """All outcomes, one after the other."""
+        """Outcomes of the sampled impacts, one after the other."""
         each = [solved(contender, law, case.scene, case.velocity, setting)[1] for law in laws]
         return jax.tree.map(lambda *a: jnp.stack(a), *each)
 
     def alone(setting: Any, count: int = 1) -> list[Any]:
-        """The solver itself, for its time."""
+        """Solutions of the first `count` impacts, without checks: for the time of the solver."""
         return [contender.solve(law, case.scene, case.velocity, setting) for law in laws[:count]]
 
     batched = partial(alone, count=rows)
@@ -477,12 +486,12 @@ def _host_programs(contender: Contender, case: Case) -> Programs:
 
 
 def _law_programs(law: Law, case: Case) -> Programs:
-    """Programs of another law: it has no setting, and its sample is the impact itself."""
+    """Programs of an algebraic law, which has no setting; its sample is the impact itself."""
     law, batch = in_common_dtype(law, case.velocity)[0], len(case.stiffness)
     compile_time: dict[str, float] = {}
 
     def run(v: jax.Array, law: Law, scene: Scene, setting: jax.Array) -> Outcomes:
-        """One impact."""
+        """Outcome of one impact at v (n,); `setting` is not used."""
         return Outcomes.of(impact(law, scene, v))
 
     many, v = jax.vmap(run, in_axes=(0, None, None, None)), case.velocity
@@ -501,7 +510,11 @@ def _law_programs(law: Law, case: Case) -> Programs:
 
 
 def _errors(case: Case, tried: Outcomes, truth: Outcomes) -> dict[str, float]:
-    """Relative errors, the largest over the impacts that were solved."""
+    """Relative errors by quantity, the largest over the sampled impacts; NaN: not computed.
+
+    Equation: `max |dv| / max |v-|`, `max |dp| / max |p|`, `|d(T+ - T-)| / T-`, duration over the
+    longest, Jacobian over `max |v-|`. At rest the largest |v+| and |T+ - T-| take their places.
+    """
     fastest = float(jnp.max(jnp.abs(case.velocity))) or np.abs(truth.velocity).max()
     before = float(kinetic_energy(case.scene, case.velocity)) or np.abs(truth.energy_change).max()
     compared = {
@@ -520,9 +533,13 @@ def _errors(case: Case, tried: Outcomes, truth: Outcomes) -> dict[str, float]:
 
 
 def _point(
-    label: str, setting: float | None, error: dict[str, float], tried: Outcomes, timings: Any
+    label: str,
+    setting: float | None,
+    error: dict[str, float],
+    tried: Outcomes,
+    timings: Sequence[Timing],
 ) -> Point:
-    """A row of the chart."""
+    """Point of the chart: its errors, the gravest status, mean evaluations, times per impact."""
     status = STATUS[int(np.max(tried.status))].name
     return Point(label, setting, error, float(np.mean(tried.evaluations)), status, *timings)
 
@@ -530,8 +547,11 @@ def _point(
 def _times(
     rows: list[tuple[Programs, float | None]], repeats: int, progress: float | None
 ) -> list[list[Timing]]:
-    """Single and batched time of each row, and with its gradient if it has one; all in turns."""
-    tasks = [
+    """Times per impact of each row (programs, setting): alone, in a batch, with gradient if any.
+
+    All are measured in turns, `repeats` times.
+    """
+    tasks = [  # row, impacts of a call, the call
         (row, impacts, partial(run, value))
         for row, (programs, value) in enumerate(rows)
         for run, impacts in (

@@ -42,7 +42,7 @@ class Entry:
 
     @property
     def verdict(self) -> str:
-        """'ok', or what is violated, and a status that is not ok."""
+        """'ok', or the conditions that the audit finds violated, and a status that is not ok."""
         broken = [f"{name} violated" for name in self.audit.broken]
         if self.status != "ok":
             broken.append(self.status)
@@ -79,8 +79,8 @@ class Comparison(Tabular):
     def distances(self) -> dict[str, float]:
         """Root mean square difference [m/s] of each law's v+ from the measured one, if any.
 
-        Velocities of bodies, some of them in rad/s, count by the root of their inertia over that of
-        the largest one: as m/s with as much energy.
+        Equation: `sqrt(mean_i (M_ii / max M_ii) (v_i+ - measured_i)^2)`, weights of 1 in a chain:
+        rotations in rad/s count as m/s with as much energy.
         """
         if self.measured is None:
             return {}
@@ -106,7 +106,7 @@ class Comparison(Tabular):
 
     @property
     def table(self) -> Table:
-        """A row for each law, and the measured velocities."""
+        """Table: a row for each law, and one for the measured velocities."""
         unit = "m/s" if self.scene.walls is not None else ""  # others may be rad/s
         columns = (
             Column("law"),
