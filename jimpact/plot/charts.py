@@ -104,7 +104,7 @@ def work_precision(result: WorkPrecision, title: str = "") -> Figure:
 
 
 def _styles(points: Mapping[str, tuple[Point, ...]]) -> dict[str, dict[str, Any]]:
-    """How each method is drawn: methods by colour, laws (one point each) grey by marker."""
+    """Options of matplotlib by name: methods by colour, laws (one point each) grey by marker."""
     laws = [name for name, row in points.items() if row[0].setting is None]
     methods = [name for name in points if name not in laws]
     styles: dict[str, dict[str, Any]] = {}
@@ -129,8 +129,13 @@ _PANELS = (  # error, and what it is drawn against
 def _draw(
     axes: Axes, row: tuple[Point, ...], quantity: str, against: str, style: dict[str, Any]
 ) -> tuple[float, float] | None:
-    """One line, and where it ends; None where no point has a time or a count, and an error."""
+    """Draw the error of a `quantity` over times [µs] or counts, one point for each setting.
+
+    `against` is the field of `Point` on the x axis. Returns the end (x, y) of the line; None if no
+    point has both an error and a time or a count.
+    """
     given = [getattr(point, against) for point in row]
+    # median and quartiles of a time [µs], or three times the same count
     spans = [
         1e6 * np.array(x) if isinstance(x, Timing) else np.full(3, np.nan if x is None else x)
         for x in given
@@ -169,7 +174,7 @@ def _finish(axes: Axes, uncertainty: float, x: str, y: str) -> None:
 
 
 def _note(result: WorkPrecision) -> str:
-    """How to read the chart."""
+    """Note below the chart: how errors and times were measured, and what grey and hollow mean."""
     return (
         f"errors: largest of {result.sample} impacts, stiffness\nspread over a factor "
         f"{result.spread:g}; times: median\nand quartiles of {result.repeats}, batch of "
@@ -248,7 +253,7 @@ def stability_pairs(result: StabilityMap, method: str, title: str = "") -> Figur
 
 
 def _pair(axes: Axes, result: StabilityMap, each: Slice) -> None:
-    """The classes over two axes; a ring marks the base point."""
+    """Draw the classes of a slice over two axes; a ring marks the base point."""
     _draw_classes(axes, each.codes.T)
     axes.invert_yaxis()
     for which, name in zip("xy", each.axes):
@@ -260,7 +265,7 @@ def _pair(axes: Axes, result: StabilityMap, each: Slice) -> None:
 
 
 def _draw_classes(axes: Axes, codes: np.ndarray) -> None:
-    """A coloured cell for each class code (rows, columns)."""
+    """Draw a cell for each code (rows, columns) in the colour of its class, white lines between."""
     axes.imshow(codes, aspect="auto", interpolation="nearest", **by_code(CLASS_COLOURS))
     rows, columns = codes.shape
     axes.set_xticks(np.arange(columns + 1) - 0.5, minor=True)
@@ -272,7 +277,7 @@ def _draw_classes(axes: Axes, codes: np.ndarray) -> None:
 
 
 def _ticks(axes: Axes, which: str, name: str, values: np.ndarray, most: int = _TICKS) -> None:
-    """At most so many values of a map's axis as ticks of a panel's axis 'x' or 'y'."""
+    """Label at most `most` values of a map's axis `name` on a panel's axis 'x' or 'y'."""
     at = range(0, len(values), -(-len(values) // most))
     axis = axes.xaxis if which == "x" else axes.yaxis
     axis.set_ticks(at, [in_words(float(f"{values[i]:.2g}")) for i in at], fontsize=SMALL)
@@ -280,13 +285,13 @@ def _ticks(axes: Axes, which: str, name: str, values: np.ndarray, most: int = _T
 
 
 def _place(result: StabilityMap, name: str) -> float:
-    """Where the base lies among the values of an axis."""
+    """Position of the base point on a panel's axis: its index among the values, interpolated."""
     values = result.axes[name]
     return float(np.interp(result.base[name], values, np.arange(len(values))))
 
 
 def _legend_of_classes(figure: Figure, result: StabilityMap) -> None:
-    """The classes that occur."""
+    """Draw a legend of the classes that occur in the slices."""
     codes = [each.codes.ravel() for name in result.methods for each in result.slices[name]]
     labels = [_CLASS_LABELS.get(name, name) for name in CLASSES]
     occurring = np.unique(np.concatenate(codes))
@@ -366,7 +371,7 @@ def advice(result: Advice, title: str = "", names: Sequence[str] = ()) -> Figure
     verdict = f"{'within' if result.within else 'not within'} {share(result.tolerance)}"
     figure.axes[0].set_title(f"{title}\n{as_code(result.law)}: {verdict}", fontsize="large")
     x = np.arange(len(laws))
-    for top, velocities in tops:
+    for top, velocities in tops:  # a panel for each unit
         for (i, word, factor), offset in zip(velocities, side_by_side(len(velocities))):
             label = word if len(velocities) <= len(COLOURS) else None
             v, low, high = factor * np.array([(c.velocity[i], c.low[i], c.high[i]) for c in rows]).T

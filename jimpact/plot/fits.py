@@ -122,13 +122,13 @@ def contour(result: Contour, title: str = "") -> Figure:
 
 
 def _in_rows(values: np.ndarray) -> np.ndarray:
-    """A row a shot, a sample of a motion, or a value."""
+    """Values as an array of two axes, with a row for each shot, sample of a motion, or value."""
     values = np.asarray(values, float)
     return values.reshape(len(values) if values.ndim else 1, -1)
 
 
 def _error_bars(fit: Fit) -> np.ndarray | None:
-    """Sigma, else the estimated noise, a row a shot; None where neither is known."""
+    """Error bars, in the rows of `_in_rows`: sigma, else the noise; None if neither is known."""
     shape = fit.predicted.shape
     if fit.problem.sigma is not None:
         return _in_rows(np.broadcast_to(np.asarray(fit.problem.sigma, float), shape))
@@ -136,7 +136,10 @@ def _error_bars(fit: Fit) -> np.ndarray | None:
 
 
 def _shot_axis(axes: Axes, fit: Fit, dodge: np.ndarray) -> None:
-    """Bodies on the axis of a single shot; else shots, all labelled or every so many."""
+    """Label the x axis: bodies, at the offsets `dodge`, for a single shot; else shots or values.
+
+    At most `_LABELLED` of them have a label.
+    """
     data, labels = fit.experiments, fit.problem.labels
     if data is not None and len(labels) == 1:
         axes.set_xticks(dodge, [f"{i + 1}" for i in range(len(dodge))])
@@ -151,7 +154,7 @@ def _shot_axis(axes: Axes, fit: Fit, dodge: np.ndarray) -> None:
 
 
 def _legend(figure: Figure, fit: Fit, others: Mapping[str, Fit], has_bars: bool) -> None:
-    """Markers of measured and fitted values, of other fits, and of bodies."""
+    """Draw a legend: markers of measured and fitted values and of other fits, colours of bodies."""
     bars = ""
     if has_bars:
         bars = ", ± noise" if fit.problem.sigma is None else ", ± sigma"

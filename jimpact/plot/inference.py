@@ -48,6 +48,7 @@ def profiles(result: tuple[Profile, ...] | list[Profile]) -> Figure:
         check_kind("result", each, Profile)
     figure, grid = new_panels(len(result), 2.8)
     for axes, each in zip(grid, result):
+        # sqrt(deviance) is linear between computed points: a parabola is drawn as one
         places = np.linspace(0, len(each.value) - 1, _PARTS * (len(each.value) - 1) + 1)
         between = np.interp(places, range(len(each.value)), each.value)
         root = np.interp(between, each.value, np.sqrt(each.deviance))
@@ -213,7 +214,7 @@ def corner(fit: Fit, draws: Any = None, names: Sequence[str] | None = None) -> F
 
 
 def _drawn(fit: Fit, draws: Any) -> np.ndarray:
-    """Draws (N, P) of the parameters of a fit."""
+    """Draws (N, P) of a fit's P parameters, from an array, a bootstrap or ArviZ's posterior."""
     if hasattr(draws, "posterior"):
         columns = [np.ravel(draws.posterior[name]) for name in fit.names]
         return np.stack(columns, axis=1)
@@ -227,7 +228,7 @@ def _drawn(fit: Fit, draws: Any) -> np.ndarray:
 
 
 def _one(axes: Axes, fit: Fit, i: int, values: np.ndarray | None) -> None:
-    """The density of one parameter."""
+    """Draw the normal density of parameter i from value and standard error; draws: a histogram."""
     z, error = np.linspace(-_WIDE, _WIDE, 121), fit.standard_error[i]
     density = np.exp(-0.5 * z**2) / (error * np.sqrt(2 * np.pi))
     if values is not None:
@@ -237,7 +238,11 @@ def _one(axes: Axes, fit: Fit, i: int, values: np.ndarray | None) -> None:
 
 
 def _pair(axes: Axes, fit: Fit, i: int, j: int, values: np.ndarray | None) -> None:
-    """The region of two parameters."""
+    """Draw the ellipses in which parameters i and j lie with 68 and 95 %; draws: points.
+
+    Equation: `(x - x_fit)^T C^-1 (x - x_fit) = chi^2`, C their covariance and chi^2 the quantile
+    of two degrees of freedom; on it `x = x_fit + sqrt(chi^2) L (cos a, sin a)`, `L L^T = C`.
+    """
     if values is not None:
         axes.plot(values[:, i], values[:, j], ".", ms=2, color=COLOURS[4], alpha=0.5)
     factor = np.linalg.cholesky(fit.covariance[np.ix_([i, j], [i, j])])

@@ -88,7 +88,10 @@ def admissible_set(
 def _plane(
     result: AdmissibleSet, marked: Mapping[str, np.ndarray], closed: np.ndarray, title: str
 ) -> Figure:
-    """The set in the plane of kinetic coordinates."""
+    """Draw the set of two contacts in the plane of kinetic coordinates, with marked outcomes.
+
+    Sides are `gamma_k+ = 0` and `p_k = 0`, the arc is T+ = T-; `closed` are both contacts.
+    """
     frame = _Plane(result, closed)
     figure, axes = new_figure(7.6, title)
     circle = np.linspace(0, 2 * np.pi, 400)
@@ -118,11 +121,15 @@ def _plane(
 
 
 class _Plane:
-    """Kinetic coordinates turned so that the outcomes with gamma+ >= 0 open upwards."""
+    """Kinetic coordinates u (2,) [sqrt(J)] turned so that outcomes with gamma+ >= 0 open upwards.
+
+    `push` and `walls` (2, 2): a unit vector for each contact, along the change of u by its impulse,
+    and along the line on which it stays closed and the other contact opens. `before`: u of v-.
+    """
 
     def __init__(self, result: AdmissibleSet, closed: np.ndarray):
-        """Turn the coordinates of a set with two closed contacts."""
-        self._found = result
+        """Turn the coordinates of a set with two closed contacts (indices)."""
+        self._set = result
         self._metric = result.axes.T @ dense_mass(result.scene)
         self.radius = result.coordinates.radius
         normals = np.asarray(result.scene.normals, float)[:, closed].T @ result.axes
@@ -132,15 +139,15 @@ class _Plane:
         if right @ push[0] < 0:
             right = -right
         self._turn = np.stack([right, up])
-        self.push = push @ self._turn.T  # directions of the impulses
-        # along wall k contact k stays closed and the other one opens
+        self.push = push @ self._turn.T
+        # perpendicular to push k, on the side to which the other impulse pushes
         walls = np.stack([[-p[1], p[0]] for p in self.push])
         self.walls = walls * np.sign(np.sum(walls * self.push[::-1], axis=1))[:, None]
         self.before = self(result.velocity)
 
     def __call__(self, velocity: np.ndarray) -> np.ndarray:
-        """(..., n) -> (..., 2)."""
-        return (velocity - self._found.centre) @ self._metric.T @ self._turn.T
+        """Turned coordinates `u = R axes^T M (v - centre)` (..., 2) of velocities v (..., n)."""
+        return (velocity - self._set.centre) @ self._metric.T @ self._turn.T
 
 
 def _line(
@@ -151,7 +158,10 @@ def _line(
     text: str,
     style: str,
 ) -> None:
-    """A side of the set as a ray up to the circle, named along its outer part."""
+    """Draw a side of the set as a ray from `start` (2,) to the circle |u| = r, with its name.
+
+    Equation: `|start + length direction| = r`, direction (2,) of length 1.
+    """
     b = start @ direction
     length = -b + np.sqrt(max(b * b + frame.radius**2 - start @ start, 0.0))
     end = start + length * direction
@@ -168,7 +178,10 @@ def _line(
 def _projections(
     result: AdmissibleSet, marked: Mapping[str, np.ndarray], closed: np.ndarray, title: str
 ) -> Figure:
-    """Samples of the set in pairs of normalized gap velocities."""
+    """Draw samples of the set over pairs of normalized gap velocities qn+ [sqrt(J)].
+
+    Coloured by T+/T-; for one contact T+/T- over its qn+.
+    """
     contacts = closed[:_MOST_CONTACTS]
     samples = result.sample(0, _SAMPLES)
     norm = np.asarray(kinetic_norm(result.scene), float)
@@ -303,7 +316,7 @@ def rocking_domains(domains: Sequence[RockingDomain], title: str = "") -> Figure
 
 
 def _panels(result: RockingDispersion, title: str, label: str) -> tuple[Figure, Any]:
-    """A panel for each mu."""
+    """Figure and panels of rocking blocks, one for each mu, over the kinetic angle [degrees]."""
     figure, panels = new_panels(len(result.friction), 2.8, 0.6, title, sharex=True, sharey=True)
     for axes, mu in zip(panels, np.asarray(result.friction)):
         axes.set_title(f"mu = {mu:g}")
@@ -312,13 +325,13 @@ def _panels(result: RockingDispersion, title: str, label: str) -> tuple[Figure, 
 
 
 def _critical_lines(panels: np.ndarray, result: RockingDispersion) -> None:
-    """The critical angle of each mu."""
+    """Draw the critical kinetic angle of each mu as a dotted line in its panel."""
     for axes, angle in zip(panels, np.degrees(critical_kinetic_angle(result.friction))):
         axes.axvline(float(angle), color="black", ls=":", lw=1)
 
 
 def _label_outer(panels: np.ndarray, x: str, y: str) -> None:
-    """Labels on the left, and below the last panel of each column."""
+    """Label y on the left, and x below the last panel of each column."""
     for axes in panels[::COLUMNS]:
         axes.set_ylabel(y)
     for axes in panels[-COLUMNS:]:
