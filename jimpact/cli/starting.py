@@ -16,7 +16,9 @@ FILES = {"data": "shots.csv", "track": "track.csv"}  # of the tables of a study 
 
 
 def begin(kind: str, folder: Path, like: str | None = None) -> list[Path]:
-    """Write study, data and notebook, as in the study `like`; returns the files.
+    """Write a study, its data and a notebook into a folder; returns the paths of the files.
+
+    `kind` is the command that they are for, `like` the bundled study to copy (None: its default).
 
     Raises:
         FileNotFoundError: there is no such study. ValueError: a file exists already.
@@ -62,7 +64,7 @@ def _notebook(title: str, sources: list[str]) -> str:
 
 
 def laws_as_text(rows: Mapping[str, Mapping[str, Any]]) -> str:
-    """Laws one below the other, in lines that fit the terminal."""
+    """Text on laws one below the other, in lines that fit the terminal, from rows by name."""
     width = min(shutil.get_terminal_size((80, 24)).columns, WIDEST)
     lines = []
     for name, row in rows.items():

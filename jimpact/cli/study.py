@@ -96,7 +96,7 @@ class Study:
         return self._problem(FitProblem.from_shots)
 
     def _problem(self, of_shots: Callable[..., FitProblem]) -> FitProblem:
-        """The same, that of shots made by this function."""
+        """The problem of the study's shots, made by `of_shots` (law, scene, shots, choice)."""
         choice = self.free, self.bounds, self.priors
         if self.experiments is None:
             raise ValueError(NO_DATA)
@@ -159,7 +159,7 @@ def read_study(path: str | Path, law: str | None = None) -> Study | MotionStudy:
     """
 
     def build(tables: dict[str, Any], place: Path) -> Study | MotionStudy:
-        """The study, of whatever kind it is."""
+        """The study of a motion if there is a table [motion], else of an impact."""
         return (motion_study_of if "motion" in tables else _impact_study)(tables, place, law)
 
     return _built(path, "[law]", build)
@@ -178,9 +178,10 @@ def motion_study(path: str | Path) -> MotionStudy:
 def _built(
     path: str | Path, table: str, build: Callable[[dict[str, Any], Path], AnyStudy]
 ) -> AnyStudy:
-    """What is built of the tables of a file; an error names the file.
+    """Study that `build(tables, path)` makes of a TOML file; its errors name the file.
 
-    `table` is the head of a table that all bundled studies of this kind have.
+    `table` is the head of a table that all bundled studies of this kind have: a missing file's
+    error lists these.
     """
     place = located(Path(path), table)
     try:
@@ -190,7 +191,10 @@ def _built(
 
 
 def _impact_study(tables: Mapping[str, Any], place: Path, law_name: str | None) -> Study:
-    """The study of these tables."""
+    """Study of one impact from the tables of the file `place`, checked.
+
+    `law_name`: a law in the place of the study's, None: its own.
+    """
     check_tables(tables, ("scene", "law"), ("fit", *SHOTS, "monte_carlo"))
     scene, body = _scene(tables["scene"])
     law, values, fitted = law_of(tables, law_name, place.parent, scene)
@@ -214,7 +218,7 @@ def _impact_study(tables: Mapping[str, Any], place: Path, law_name: str | None) 
 
 
 def _scene(table: Mapping[str, Any]) -> tuple[Scene, Body | None]:
-    """The scene of a study, and the body whose scene it is."""
+    """Scene of the table [scene], and the body whose scene it is; None: a chain."""
     if "kind" not in table:
         check_keys("[scene]", table, CHAIN, ("masses_kg",))
         return chain(**arguments_of(table, CHAIN)), None
@@ -226,7 +230,10 @@ def _scene(table: Mapping[str, Any]) -> tuple[Scene, Body | None]:
 def _shots(
     tables: Mapping[str, Any], study: Path, place: Scene | Body
 ) -> tuple["Track | None", Experiments | None]:
-    """The shots of a study, if it has any, and the track of which they are."""
+    """Track and shots of a study from the table [track], [bounces] or [data]; None without.
+
+    `study` is the path of its file, `place` the scene or the body of the shots.
+    """
     given = [name for name in SHOTS if name in tables]
     if len(given) > 1:
         raise ValueError(
@@ -241,7 +248,10 @@ def _shots(
 
 
 def _experiments(table: Mapping[str, Any], study: Path, place: Scene | Body) -> Experiments:
-    """The shots of the table [data], with the scenes that they have of their own."""
+    """Shots in the file of the table [data], selected and corrected as the table says.
+
+    `study` is the path of the study, `place` its scene, or its body, which gives each its scene.
+    """
     check_keys("[data]", table, DATA, ("file",))
     check_kind("[data]", "file", table["file"], str, "a path")
     corrected = table.get("momentum_corrected", False)
