@@ -137,17 +137,17 @@ def monte_carlo(
 def _total(
     run: Run, executor: Any, workers: int, store: Store | None, progress: float | None
 ) -> tuple[Chunk, int, float]:
-    """All chunks joined in their order, how many samples were read, and computed a second.
+    """Statistics of all chunks, joined in their order, samples that were read, samples a second.
 
     The first chunk sets the histograms and the tolerance of all. If it is computed it compiles the
     program, and does not count for the rate.
     """
 
     def read(number: int) -> Chunk | None:
-        """The chunk as it is stored, if it is."""
+        """Statistics of a chunk from the folder; None if it is not stored."""
         return store.read(number, run.count(number), run.keep_samples) if store else None
 
-    stored, recorded = set(), None
+    stored, recorded = set(), None  # numbers of stored chunks, and their tolerance
     for number in range(run.chunks):
         if chunk := read(number):
             stored.add(number)
@@ -156,7 +156,7 @@ def _total(
     times = [(resumed, time.perf_counter())]
 
     def new(chunk: Chunk) -> Chunk:
-        """A computed chunk, stored and counted."""
+        """Store a computed chunk, count its samples and note the time; returns it."""
         nonlocal finished
         if store:
             store.write(chunk)
@@ -185,12 +185,16 @@ def _total(
             else f"they are in '{store.folder}': the same call continues from there."
         )
         raise KeyboardInterrupt(text) from None
+    # samples and time after the first computed chunk, and at the end
     (before, begin), (after, end) = times[1 if len(times) > 2 else 0], times[-1]
     return total, resumed, (after - before) / (end - begin) if after > before else 0.0
 
 
 def _gap_scale(sources: Sources, scene: Scene) -> np.ndarray | None:
-    """delta_c (m,), where law and velocity are constant and the law's contacts indent."""
+    """Indentations delta_c (m,) [m] of contacts, see `ji.theory.gap_scale`.
+
+    None if law or velocity is random, or the law has no contact force or does not use gaps.
+    """
     law, velocity = sources.law, sources.velocity
     if not (isinstance(law, Law) and isinstance(velocity, jax.Array)):
         return None
@@ -205,7 +209,7 @@ def _gap_scale(sources: Sources, scene: Scene) -> np.ndarray | None:
 
 
 def _computed(executor: Any, workers: int, run: Run, tasks: Iterable[Task]) -> Generator[Chunk]:
-    """`run(task)` for every task, in order."""
+    """Chunks `run(task)` of all tasks, in their order, by 'threads', 'serial' or an executor."""
     if executor in ("threads", "serial"):
         yield from in_threads(run, tasks, workers if executor == "threads" else 1)
         return
@@ -218,7 +222,10 @@ def _computed(executor: Any, workers: int, run: Run, tasks: Iterable[Task]) -> G
 
 @contextmanager
 def _opened(executor: Any, run: Run) -> Iterator[tuple[Callable[..., Any], Work]]:
-    """The `map` of an executor, and what it maps tasks by."""
+    """The `map` of an executor, and the function to map over tasks, while it is open.
+
+    `executor` is 'devices', 'dask', the address of a Dask scheduler, or an object with a `map`.
+    """
     if executor == "devices":
         devices = jax.devices()  # each compiles the program once
         with ThreadPoolExecutor(len(devices)) as pool:
@@ -234,9 +241,9 @@ def _opened(executor: Any, run: Run) -> Iterator[tuple[Callable[..., Any], Work]
 
 
 def _shipped(run: Run) -> Work:
-    """A run that other processes can compute with; as it is where it cannot be pickled.
+    """Function of a task that other processes can unpickle; the run itself if it refuses pickling.
 
-    Functions in it are pickled where cloudpickle is installed, which Dask brings.
+    Functions in it are pickled if cloudpickle is installed, which Dask brings.
     """
     try:
         from cloudpickle import dumps  # type: ignore[import-untyped]
@@ -249,12 +256,12 @@ def _shipped(run: Run) -> Work:
 
 
 def _compute(run: bytes, x64: bool, task: Task) -> Chunk:
-    """One chunk of a pickled run."""
+    """Statistics of the chunk of a task, by a pickled run in precision x64 or not."""
     return _unpacked(run, x64)(task)
 
 
 @functools.lru_cache(maxsize=4)
 def _unpacked(run: bytes, x64: bool) -> Run:
-    """The same object for the same bytes, so that a worker compiles a run only once."""
+    """The run of these bytes, the same object each time: a worker compiles it only once."""
     with jax.enable_x64(x64):  # else a worker would read float64 arrays as float32
         return pickle.loads(run)
