@@ -71,7 +71,7 @@ class AdmissibleSet:
         ]
         return np.array([[low[i], high[i]] for i, (low, high) in enumerate(ends)])
 
-    def contains(self, velocity: Any, tolerance: float | None = None) -> Any:
+    def contains(self, velocity: Any, tolerance: float | None = None) -> bool | np.ndarray:
         """True for a velocity v+ (n,) [m/s], or each of (k, n), that is admissible up to an error.
 
         Equation: with `v - centre = axes u + w`, `u = axes^T M (v - centre)`, the error is the
@@ -242,7 +242,7 @@ def admissible_set(scene: Scene, velocity: Any) -> AdmissibleSet:
     offset = np.append(np.zeros(normal.shape[1]), facets @ before)
     redundant = basis.shape[1] < unit.shape[1]
     part, centre, axes = capped_polyhedron(rows, offset, float(np.linalg.norm(before)), redundant)
-    rest = y - basis @ before + basis @ centre
+    rest = y - basis @ before + basis @ centre  # impulses leave y - basis z- as it is
     centre, axes = np.linalg.solve(root.T, rest), np.linalg.solve(root.T, basis @ axes)
     return outcomes(centre=centre, axes=axes, coordinates=part)
 

@@ -132,6 +132,7 @@ class CappedPolyhedron(NamedTuple):
         feasible = self.excess(self.on_circle(ends + 0.5 * width)) <= _ROUNDING * self.radius
         if feasible.all():
             return 0.0, 2 * np.pi
+        # the feasible pieces that follow one that is not: from `first` to the next that is not
         first = int(np.argmax(feasible & ~np.roll(feasible, 1)))
         run, widths = np.roll(feasible, -first), np.roll(width, -first)
         length = widths[: np.argmin(run)].sum()

@@ -188,7 +188,9 @@ def nesterenko_speed(stiffness: Any, mass: Any, velocity: Any) -> jax.Array:
     return (16 / 25) ** 0.2 * (k / m) ** 0.4 * v**0.2
 
 
-def reinsch_chain(balls: int, mass: float = 1.0, stiffness: float = 1.0) -> tuple[Any, Any]:
+def reinsch_chain(
+    balls: int, mass: float = 1.0, stiffness: float = 1.0
+) -> tuple[jax.Array, jax.Array]:
     """Masses and stiffnesses of a chain with linear contacts that passes the whole blow on.
 
     The first ball strikes, the last one leaves with its velocity, all others rest. The frequencies
@@ -222,12 +224,12 @@ def reinsch_chain(balls: int, mass: float = 1.0, stiffness: float = 1.0) -> tupl
     for name, value in (("mass", mass), ("stiffness", stiffness)):
         as_numbers(name, value, low=0.0, open_low=True)
     j = np.arange(n + 1)
-    share = np.exp(_log_central(j) + _log_central(n - j) - _log_central(n))
-    springs = share[:-1] * (j[:-1] + 0.5) * (n - j[:-1]) / (n / 2)
+    share = np.exp(_log_central(j) + _log_central(n - j) - _log_central(np.asarray(n)))  # m_j / m_0
+    springs = share[:-1] * (j[:-1] + 0.5) * (n - j[:-1]) / (n / 2)  # k_j / k_0
     return jnp.asarray(mass * share), jnp.asarray(stiffness * springs)
 
 
-def _log_central(j: Any) -> np.ndarray:
+def _log_central(j: np.ndarray) -> np.ndarray:
     """`ln(binom(2 j, j) / 4^j)` of whole numbers j; without logarithms long chains overflow.
 
     Equation: `binom(2 j, j) / 4^j = Gamma(j + 1/2) / (sqrt(pi) Gamma(j + 1))`.

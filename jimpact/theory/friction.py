@@ -155,7 +155,7 @@ class FrictionBounds(NamedTuple):
         return self.m_bar_least > self.k_largest
 
     def dissipates(self, scene: Scene, velocity: Any) -> bool:
-        """True where Theorem 6.2 (sufficient) promises T+ <= T- of a scene at v- (n,) [m/s]."""
+        """True where Theorem 6.2 (sufficient) promises T+ <= T- of a scene at velocity v- (n,)."""
         qn, qt = to_quasi_velocities(scene, velocity)
         return self.condition_i and bool(
             jnp.linalg.norm(qn) >= self.least_ratio * jnp.linalg.norm(qt)
@@ -198,7 +198,8 @@ def friction_bounds(scene: Scene, matrix: Any, friction: Any, slip: Any = 1.0) -
     `lambda_min(Mbar) > lambda_max(K)`,
     `|qn-| / |qt-| >= 2 |t_q^T H_t| |mubar| |(G^mu)^-1| |I + E| / (lambda_min - lambda_max)`,
     where `Mbar = (I - E)^T G^-1 (I + E)` and `K = B^T B`, `B = t_q^T H_t [mubar][xi] (G^mu)^-1
-    (I + E)`. Spectral norms; eigenvalues of symmetric parts.
+    (I + E)`. Spectral norms; eigenvalues of symmetric parts; [x] is the diagonal matrix of x, G the
+    normalized Delassus matrix, n_q and t_q the basis of `quasi_basis`, `pbar = |grad f| p`.
 
     Args:
         scene: n coordinates, m closed contacts, planar tangents H_t (n, m).
@@ -224,8 +225,8 @@ def friction_bounds(scene: Scene, matrix: Any, friction: Any, slip: Any = 1.0) -
     """
     e = _restitution(scene, matrix)
     coupling = _coupling(scene, friction, slip)
-    mu = as_float_array("friction", friction) * jnp.ones(scene.contacts) / kinetic_norm(scene)
-    one_plus = np.eye(len(e)) + e
+    mubar = as_float_array("friction", friction) * jnp.ones(scene.contacts) / kinetic_norm(scene)
+    one_plus = np.eye(len(e)) + e  # I + E
     g, g_mu = np.asarray(coupling.delassus, float), np.asarray(coupling.g_mu, float)
     if np.linalg.cond(g_mu) > 1 / (len(g) * np.finfo(scene.mass.dtype).eps):
         raise ValueError(
@@ -234,15 +235,16 @@ def friction_bounds(scene: Scene, matrix: Any, friction: Any, slip: Any = 1.0) -
         )
     inverse = np.linalg.inv(g)
     m_bar = (np.eye(len(e)) - e).T @ inverse @ one_plus
+    # t_q^T H_t [mubar][xi]
     slide = np.asarray(coupling.tangential, float) * np.asarray(coupling.friction)[None, :]
     b = slide @ np.linalg.solve(g_mu, one_plus)
     k = b.T @ b
     least = float(np.linalg.eigvalsh(0.5 * (m_bar + m_bar.T))[0])
     largest = float(np.linalg.eigvalsh(k)[-1])
-    largest_mu = float(jnp.abs(mu).max())
+    largest_mu = float(jnp.abs(mubar).max())
     # numerator of Theorem 6.2 (ii)
-    reach = 2 * _norm(coupling.tangential) * largest_mu
-    reach *= _norm(np.linalg.inv(g_mu)) * _norm(one_plus)
+    numerator = 2 * _norm(coupling.tangential) * largest_mu
+    numerator *= _norm(np.linalg.inv(g_mu)) * _norm(one_plus)
     return FrictionBounds(
         g_mu=g_mu,
         k=k,
@@ -251,7 +253,7 @@ def friction_bounds(scene: Scene, matrix: Any, friction: Any, slip: Any = 1.0) -
         restitution_bound=_norm(e) ** 2 * float(np.linalg.cond(g)),
         m_bar_least=least,
         k_largest=largest,
-        least_ratio=reach / (least - largest) if least > largest else float("inf"),
+        least_ratio=numerator / (least - largest) if least > largest else float("inf"),
     )
 
 
@@ -261,8 +263,9 @@ def friction_impulses(
 ) -> tuple[jax.Array, jax.Array]:
     """Normal impulses p (m,) and tangential p_t (m,) [N s] of the law for a given slip xi.
 
-    Equation: `pbar = -(G^mu)^-1 (I + E) qn-`, `p_t = -[mubar][xi] pbar`, `p = pbar / |grad f|`.
-    The slip is taken as given: whether it agrees with the sliding after it is the caller's.
+    Equation: `pbar = -(G^mu)^-1 (I + E) qn-`, `p_t = -[mubar][xi] pbar`, `p = pbar / |grad f|`,
+    with G^mu and mubar of `friction_bounds`. The slip is taken as given: whether it agrees with
+    the sliding after it is the caller's.
 
     Args:
         scene: n coordinates, m closed contacts, planar tangents.
@@ -298,7 +301,8 @@ def friction_energy_change(
 ) -> jax.Array:
     """`T+ - T-` [J] of normal and tangential impulses, in kinetic quasi-velocities.
 
-    Equation: `(qn+ + qn-)^T (pbar + G^-1 n_q^T H_t p_t) / 2 + (qt+ + qt-)^T t_q^T H_t p_t / 2`.
+    Equation: `(qn+ + qn-)^T (pbar + G^-1 n_q^T H_t p_t) / 2 + (qt+ + qt-)^T t_q^T H_t p_t / 2`,
+    with `pbar = |grad f| p`, H_t the tangents, and G, n_q, t_q as in `friction_bounds`.
 
     Args:
         scene: m contacts, planar tangents.
@@ -327,12 +331,12 @@ def friction_energy_change(
     qn, qt = to_quasi_velocities(scene, velocity)
     pbar = kinetic_norm(scene) * p
     qn_plus = qn + coupling.delassus @ pbar + coupling.normal @ p_t
-    pushed = coupling.tangential @ p_t  # = qt+ - qt-
+    qt_change = coupling.tangential @ p_t
     normal = pbar + jnp.linalg.solve(coupling.delassus, coupling.normal @ p_t)
-    return 0.5 * (qn_plus + qn) @ normal + 0.5 * (2 * qt + pushed) @ pushed
+    return 0.5 * (qn_plus + qn) @ normal + 0.5 * (2 * qt + qt_change) @ qt_change
 
 
-def _norm(matrix: Any) -> float:
+def _norm(matrix: jax.Array | np.ndarray) -> float:
     """Largest singular value; 0 of an empty matrix."""
     return float(np.linalg.norm(np.asarray(matrix, float), 2)) if np.size(matrix) else 0.0
 
@@ -344,7 +348,7 @@ def _restitution(scene: Scene, matrix: Any) -> np.ndarray:
 
 
 def _coupling(scene: Scene, friction: Any, slip: Any) -> _Coupling:
-    """Matrices of friction of a planar scene of closed contacts at slip xi; arguments checked."""
+    """Matrices of a planar scene of closed contacts with friction mu at slip xi, checked."""
     m = scene.contacts
     if scene.tangents is None or scene.tangents.shape[1] != m:
         raise ValueError(
@@ -358,10 +362,10 @@ def _coupling(scene: Scene, friction: Any, slip: Any) -> _Coupling:
     unit = jnp.eye(m, dtype=scene.mass.dtype)
     none = jnp.zeros(m, scene.mass.dtype)
     # M^-1 H_t (n, m): column j is v+ - v- of a unit tangential impulse at contact j
-    pushed = jax.vmap(lambda p_t: velocity_change(scene, none, p_t), 1, 1)(unit)
+    changes = jax.vmap(lambda p_t: velocity_change(scene, none, p_t), 1, 1)(unit)
     return _Coupling(
         delassus=as_matrix(normalized_delassus(scene)),
-        normal=jax.vmap(partial(normalized_gap_velocity, scene), 1, 1)(pushed),
+        normal=jax.vmap(partial(normalized_gap_velocity, scene), 1, 1)(changes),
         tangential=tangent.T @ scene.tangents,
         friction=(mu * xi * jnp.ones(m, mu.dtype)) / kinetic_norm(scene),
     )

@@ -151,8 +151,8 @@ def han_gilmore(
     if size == 0.0:
         return [HanGilmoreOutcome(v, start.p[:m], (), start.p[m:])]
     start.state = state / size
-    found: list[_Node] = []
-    frontier, visited = [start], Cells()
+    found: list[_Node] = []  # ends of branches: nothing approaches
+    frontier, visited = [start], Cells()  # nodes after equally many impacts, and all so far
     _is_new(start.state, visited)
     while frontier:
         following: list[_Node] = []

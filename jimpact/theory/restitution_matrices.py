@@ -237,10 +237,11 @@ def dissipation_matrix(delassus: jax.Array, matrix: jax.Array) -> jax.Array:
 def audit_matrix(scene: Scene, matrix: Any, tolerance: float | None = None) -> MatrixAudit:
     """Check the law `qn+ = -E qn-` for all pre-impact velocities `qn- <= 0` at once.
 
-    Equation: `E >= 0` (kinematic) and `G^-1 (I + E) >= 0` (kinetic), elementwise, necessary and
-    sufficient (Prop. 6.2); `Q = G^-1 - E^T G^-1 E` copositive (energetic, necessary and
-    sufficient, Prop. 6.3); where `G^-1 E` is symmetric, spectral radius `rho(E) <= 1`
-    (Prop. 6.4, for qn- of any sign); `sigma_max(E) <= 1 / sqrt(cond G)` (Prop. 6.5, sufficient).
+    Equation, with the normalized Delassus matrix G: `E >= 0` (kinematic) and `G^-1 (I + E) >= 0`
+    (kinetic), elementwise, necessary and sufficient (Prop. 6.2); `Q = G^-1 - E^T G^-1 E`
+    copositive (energetic, necessary and sufficient, Prop. 6.3); where `G^-1 E` is symmetric,
+    spectral radius `rho(E) <= 1` (Prop. 6.4, for qn- of any sign);
+    `sigma_max(E) <= 1 / sqrt(cond G)` (Prop. 6.5, sufficient).
 
     Args:
         scene: m contacts; open ones are left out, with their rows and columns of E.
@@ -389,8 +390,9 @@ def audit_coefficients(scene: Scene, restitution: Any) -> CoefficientAudit:
     """Decide if Moreau's law with coefficients e_j can gain energy in a frictionless impact.
 
     Equation: it changes the energy by `-pbar^T D G pbar / 2`, `D = diag(d_j)`,
-    `d_j = (1 - e_j) / (1 + e_j)`, and every pbar >= 0 occurs in some impact: none gains exactly
-    where the symmetric part of D G is copositive. It suffices that
+    `d_j = (1 - e_j) / (1 + e_j)`, G the normalized Delassus matrix, and every `pbar = |grad f| p`
+    >= 0 occurs in some impact: none gains exactly where the symmetric part of D G is copositive.
+    It suffices that
     `(d_max - d_min) / (d_max + d_min) <= 1 / cond(G)`. One e for all contacts never gains.
     (Poisson's law never does up to e = 1: see `Poisson`.)
 
