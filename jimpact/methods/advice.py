@@ -463,21 +463,21 @@ def _outcomes(
     trial: Trial, velocity: np.ndarray, stiffness: np.ndarray, progress: float | None
 ) -> Outcomes:
     """Outcomes of a law at v- (n,) over stiffnesses (r, m); one outcome of a law without them."""
-    varied, lanes = trial.varied(velocity, stiffness)
+    varied, batch = trial.varied(velocity, stiffness)
     count = len(next(iter(varied.values())))
     with counting_bar(count, "impacts", progress) as advance:
-        return in_batches(partial(trial.run, velocity), varied, lanes, advance)
+        return in_batches(partial(trial.run, velocity), varied, batch, advance)
 
 
 def _costs(laws: dict[str, Trial], velocity: np.ndarray, stiffness: np.ndarray) -> dict[str, float]:
     """Median time of one impact in a full batch by each law, over that of the cheapest law."""
     runs, counts = [], []
     for trial in laws.values():
-        varied, lanes = trial.varied(velocity, stiffness)
+        varied, batch = trial.varied(velocity, stiffness)
         # rows repeated until the batch is full
-        full = {name: np.resize(x, (lanes, *x.shape[1:])) for name, x in varied.items()}
+        full = {name: np.resize(x, (batch, *x.shape[1:])) for name, x in varied.items()}
         runs.append(partial(trial.run, velocity, jax.device_put(full)))
-        counts.append(lanes)
+        counts.append(batch)
     each = [np.median(times) / count for times, count in zip(in_turns(runs, ROUNDS), counts)]
     return {name: float(x / min(each)) for name, x in zip(laws, each)}
 

@@ -77,13 +77,13 @@ class Point:
 
 @dataclass(frozen=True)
 class Reference:
-    """What errors are measured from: how it was computed, how uncertain it is (relative)."""
+    """Solution of the impact that errors are measured from."""
 
-    how: str
-    uncertainty: dict[str, float]
-    velocity: np.ndarray
-    impulse: np.ndarray
-    duration: float
+    how: str  # it was computed, in words
+    uncertainty: dict[str, float]  # relative, by quantity
+    velocity: np.ndarray  # v+ (n,) [m/s]
+    impulse: np.ndarray  # p (m,) [N s]
+    duration: float  # [s]
 
 
 @dataclass(frozen=True)
@@ -374,11 +374,14 @@ class Programs:
     compile_time: dict[str, float] = field(default_factory=dict)
 
     def at(self, setting: float | None) -> Outcomes:
-        """Outcomes and Jacobian of the sample, as numpy; evaluations NaN where not counted."""
-        solution = jax.tree.map(np.asarray, self.sampled(setting))
-        work = np.where(solution.evaluations == UNCOUNTED, np.nan, solution.evaluations)
+        """Outcomes (S,) of the sampled impacts at a setting, with Jacobians if known, in NumPy.
+
+        Evaluations are NaN where they are not counted.
+        """
+        outcomes = jax.tree.map(np.asarray, self.sampled(setting))
+        evaluations = np.where(outcomes.evaluations == UNCOUNTED, np.nan, outcomes.evaluations)
         jacobian = None if self.gradient is None else np.asarray(self.gradient(setting))
-        return solution._replace(evaluations=work, jacobian=jacobian)
+        return outcomes._replace(evaluations=evaluations, jacobian=jacobian)
 
 
 def _climbed(
@@ -408,7 +411,7 @@ def _method_programs(
         return solved(contender, law, case.scene, case.velocity, setting)[1]
 
     def timed(k: jax.Array, case: Case, setting: jax.Array) -> Outcomes:
-        """The same, with a duration of NaN where it costs a run of its own or is not wanted."""
+        """Outcome with a duration of NaN where it costs a run of its own or is not wanted."""
         solution = solve(k, case, setting)
         return solution._replace(duration=jnp.nan) if apart or not durations else solution
 

@@ -70,7 +70,7 @@ class Outcomes(NamedTuple):
             raise RuntimeError(f"{what}: {STATUS[int(self.status[0])].message}.")
 
     def where_usable(self) -> "Outcomes":
-        """The same with v+, p and p_t NaN where the impact failed."""
+        """Outcomes with v+, p and p_t NaN where the impact failed."""
         lost = self.failed[:, None]
         parts = self.velocity, self.impulse, self.tangential
         v, p, p_t = (np.where(lost, np.nan, x) for x in parts)
@@ -85,7 +85,7 @@ def varied_impacts(law: Law, scene: Scene, velocity: jax.Array, varied: dict[str
     """
 
     def one(values: dict[str, jax.Array]) -> Outcomes:
-        """Outcome with one row of the arguments."""
+        """Outcome with one row of the arguments `values`."""
         one_scene, one_law, v = scene, law, velocity
         for name, value in values.items():
             if name == "velocity":

@@ -190,7 +190,7 @@ def field_of(problem: Scaled) -> Field:
     coupling: Any = Tridiagonal(one, off)
     if isinstance(dynamics.structure, Neighbours):
         coupling = Sparse(one, off, dynamics.structure)
-    elif dynamics.structure is None:
+    elif dynamics.structure is None:  # dense; its diagonal is 1, `off` the upper triangle by rows
         upper = jnp.zeros((m, m), off.dtype).at[jnp.triu_indices(m, 1)].set(off)
         coupling = unit(upper) + upper + upper.T
     none = jnp.zeros((m, 0), off.dtype)
@@ -402,17 +402,18 @@ def _emptying(
 ) -> jax.Array:
     """Fraction s () of the step at which the primary contact is unloaded; 1 if it is not.
 
-    Equation: `E = (gamma s + dgamma s^2 / 2) dp / e^2`, dgamma the change of its gap velocity in
-    the whole step. The derivative of the outcome depends on ending there, not on a fixed step.
+    Equation: `gamma s + dgamma s^2 / 2 = b`, `b = E e^2 / dp`, dgamma the change of its gap
+    velocity in the whole step: `s = 2 b / (gamma + sqrt(gamma^2 + 2 dgamma b))`. The derivative of
+    the outcome depends on ending there, not on a fixed step.
     """
     values = walk.gamma, walk.energy, increment, field.coupling @ increment, field.restitution
-    # of the primary contact; `bend` is dgamma
-    gamma, energy, dp, bend, e = (jnp.sum(jnp.where(is_primary, x, 0.0)) for x in values)
-    budget = energy * e**2 / dp
-    expands = (gamma + 0.5 * bend > 0) & (energy > 0)
-    root = jnp.sqrt(jnp.maximum(jnp.where(expands, gamma**2 + 2 * bend * budget, 1.0), 0.0))
+    # of the primary contact alone
+    gamma, energy, dp, dgamma, e = (jnp.sum(jnp.where(is_primary, x, 0.0)) for x in values)
+    b = energy * e**2 / dp
+    expands = (gamma + 0.5 * dgamma > 0) & (energy > 0)
+    root = jnp.sqrt(jnp.maximum(jnp.where(expands, gamma**2 + 2 * dgamma * b, 1.0), 0.0))
     denominator = jnp.where(expands, gamma + root, 1.0)
-    fraction = 2 * budget / jnp.where(denominator > 0, denominator, 1.0)
+    fraction = 2 * b / jnp.where(denominator > 0, denominator, 1.0)
     return jnp.where(expands & (denominator > 0) & (fraction < 1), fraction, 1.0)
 
 

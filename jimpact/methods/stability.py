@@ -151,7 +151,7 @@ class StabilityMap(Tabular):
         return dict(zip(CLASSES, np.bincount(codes, minlength=len(CLASSES)).tolist()))
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything, as a JSON file can hold it."""
+        """Axes, classes, errors and counts of classes by method, as a JSON file can hold them."""
         by_method = {
             name: {"counts": self.counts(name), "slices": self.slices[name], "sampled": sampled}
             for name, sampled in self.sampled.items()
@@ -245,14 +245,14 @@ def stability_map(
         raise ValueError("A stability map needs double precision: enable jax_enable_x64.")
     place = _place(scene, velocity)
     chosen = _methods(methods, place)
-    lines = _axis_values(axes, as_whole("resolution", resolution, 2), place.axes)
+    values = _axis_values(axes, as_whole("resolution", resolution, 2), place.axes)
     start = {name: axis.base for name, axis in _AXES.items()}
     start |= {name: float(x) for name, x in _checked("base", base or {}, place.axes).items()}
-    axis_sets: list[tuple[str, ...]] = [(name,) for name in lines]
+    axis_sets: list[tuple[str, ...]] = [(name,) for name in values]
     if slices == "pairs":
-        axis_sets += list(combinations(lines, 2))
-    parts = [_slice_points(start, lines, names) for names in axis_sets]
-    sampled = _sample_points(start, lines, samples, seed)
+        axis_sets += list(combinations(values, 2))
+    parts = [_slice_points(start, values, names) for names in axis_sets]
+    sampled = _sample_points(start, values, samples, seed)
     points = np.concatenate([*(part.reshape(-1, len(AXES)) for part in parts), sampled])
     runners = cache(partial(runner, max_steps, place))
     total = len(points) * (len(chosen) + 1)
@@ -260,7 +260,7 @@ def stability_map(
         exact, confirmation = references(points, place, runners, advance)
         classes = {m.name: partial(classes_of, m, place, exact, runners, advance) for m in chosen}
         classified, left_out = at_points(classes, points)
-    ends = np.cumsum([part[..., 0].size for part in parts])
+    ends = np.cumsum([part[..., 0].size for part in parts])  # of slices among all points
     by_slice, by_sample = {}, {}
     for name, columns in classified.items():
         codes, errors = (np.split(column, ends) for column in columns)
@@ -271,7 +271,7 @@ def stability_map(
         by_sample[name] = Slice(("samples",), codes[-1], errors[-1])
     return StabilityMap(
         methods=tuple(by_slice),
-        axes=lines,
+        axes=values,
         base={name: start[name] for name in place.axes},
         slices=by_slice,
         samples=sampled,
@@ -310,7 +310,7 @@ class Place(NamedTuple):
         return balls if self.scene is None else self.scene.size
 
     def impact_at(self, point: Any, balls: int, max_steps: int) -> tuple[LZB, Scene, jax.Array]:
-        """Law, scene and v- of a point; the law's friction is None where there is none."""
+        """Law, scene and v- (n,) of a point (7,), without its setting; `balls` is N of a chain."""
         _, kappa, eta, e, mass_ratio, _, friction = point
         if self.scene is None:
             mass, stiffness = chain_of(kappa, mass_ratio, balls)
