@@ -371,7 +371,7 @@ def advice(result: Advice, title: str = "", names: Sequence[str] = ()) -> Figure
     verdict = f"{'within' if result.within else 'not within'} {share(result.tolerance)}"
     figure.axes[0].set_title(f"{title}\n{as_code(result.law)}: {verdict}", fontsize="large")
     x = np.arange(len(laws))
-    for top, velocities in tops:  # a panel for each unit
+    for top, velocities in tops:  # a panel for each unit: index, name and factor of each velocity
         for (i, word, factor), offset in zip(velocities, side_by_side(len(velocities))):
             label = word if len(velocities) <= len(COLOURS) else None
             v, low, high = factor * np.array([(c.velocity[i], c.low[i], c.high[i]) for c in rows]).T

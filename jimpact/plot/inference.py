@@ -156,7 +156,10 @@ def residuals(fit: Fit) -> Figure:
 
 
 def _over(fit: Fit) -> tuple[np.ndarray, str]:
-    """The abscissa of residuals: the fastest approach (K, 1) of shots, else the fitted values."""
+    """Values and label of the x axis of residuals.
+
+    The fastest approach (K, 1) [m/s] of K shots; of other data the fitted values.
+    """
     data, scene = fit.experiments, fit.problem.scene
     if data is None:
         return np.asarray(fit.predicted), "fitted"

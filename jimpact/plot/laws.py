@@ -67,7 +67,7 @@ def comparison(
     figure, tops, bottom = panels_of_laws(laws, result.scene, names, title, 1.2)
     at, velocity = np.arange(len(entries)), np.array([x.outcome.velocity for x in entries])
     wrong = ~np.array([bool(entry.audit.consistent) for entry in entries])
-    for top, velocities in tops:
+    for top, velocities in tops:  # a panel for each unit: index, name and factor of each velocity
         for (i, label, factor), offset in zip(velocities, side_by_side(len(velocities))):
             x, y, colour = at + offset, factor * velocity[:, i], colour_of(i)
             top.plot(x, y, "o", color=colour, label=label)

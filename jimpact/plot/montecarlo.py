@@ -97,6 +97,7 @@ def _most_correlated_gaps(result: MonteCarlo, body: int) -> list[int]:
     std = np.sqrt(np.diag(result.gap_covariance))
     varies = std > 0
     correlation = np.abs(result.cross_covariance[body]) / np.where(varies, std, 1.0)
+    # by the last key first
     return sorted(np.lexsort((-std, -np.where(varies, correlation, -1.0)))[:2].tolist())
 
 

@@ -435,8 +435,7 @@ def plane_of(angle: Any, offset: Any) -> tuple[np.ndarray, float]:
 def set_limits(axes: Axes, curves: list[Any], ground: np.ndarray, floors: list[Any]) -> None:
     """Set equal limits that hold the curves of all frames, and a point of each plane.
 
-    Planes are `n^T (x - ground[0]) = offset`; the point is the foot of the perpendicular from the
-    middle of the curves.
+    That is the foot, on `n^T (x - ground[0]) = offset`, of the middle of the curves.
     """
     points = np.concatenate([curve for frame in curves for curve in frame])
     middle = (points.min(axis=0) + points.max(axis=0)) / 2

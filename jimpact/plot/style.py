@@ -173,10 +173,10 @@ def legend_below(
 
 
 class LineEnd(NamedTuple):
-    """Where a line of a panel ends, x and y, its name and its colour."""
+    """End of a line in a panel, for `label_ends`."""
 
     axes: Axes
-    at: tuple[float, float]
+    at: tuple[float, float]  # x, y
     name: str
     colour: str
 

@@ -168,7 +168,7 @@ def _line(
     if length < _SHORTEST * frame.radius:
         return
     axes.plot(*np.stack([start, end]).T, color=GREY, lw=1.0, ls=style)
-    angle = np.degrees(np.arctan2(direction[1], direction[0]))
+    angle = np.degrees(np.arctan2(direction[1], direction[0]))  # of the name, never upside down
     angle = angle - 180 if angle > 90 else angle + 180 if angle < -90 else angle
     share, side = (0.45, "top") if style == "-" else (0.3, "bottom")
     turned: dict[str, Any] = {"rotation": angle, "rotation_mode": "anchor", "va": side}
