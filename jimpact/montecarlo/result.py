@@ -232,7 +232,7 @@ def result_of(
         rate=rate,
         resumed=resumed,
         rtol=float(rtol) or None,
-        rtol_error=float(error * np.sqrt(count)),
+        rtol_error=float(error * np.sqrt(count)),  # from standard deviations to standard errors
         description=run.description,
         run=run,
     )

@@ -188,6 +188,7 @@ class Run:
         number, lane = divmod(index, self.size)
         with self.flags():
             drawn, _ = self._drawn(self.task(number), None)
+        # random sources have an axis of samples
         law, velocity, gaps = (
             jax.tree.map(lambda x: x[lane] if eqx.is_array(x) else x, getattr(drawn, name))
             if random

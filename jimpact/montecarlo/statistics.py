@@ -163,6 +163,7 @@ def reduced(task: Task, samples: Chunk, bins: int, keep_samples: bool) -> Chunk:
     """
     status, n, count = samples["status"], samples["velocity"].shape[1], task.count
     fine = ~FAILURE[status]
+    # (n + m, C): velocities after and random gaps of the C samples
     values = np.concatenate([samples["velocity"].T, samples["gaps"].T]).astype(np.float64)
     ends = task.ends
     if ends is None:  # the first chunk sets the histograms
@@ -186,8 +187,8 @@ def reduced(task: Task, samples: Chunk, bins: int, keep_samples: bool) -> Chunk:
         "ends": ends,
         "counts": bin_counts(used[:n], ends, bins),
         "bad.index": task.number * len(status) + lanes,
-        **{f"bad.{name}": values[lanes] for name, values in samples.items()},
-        **({f"raw.{name}": values[:raw].copy() for name, values in samples.items()} if raw else {}),
+        **{f"bad.{name}": x[lanes] for name, x in samples.items()},
+        **({f"raw.{name}": x[:raw].copy() for name, x in samples.items()} if raw else {}),
     }
 
 

@@ -80,7 +80,7 @@ def _described(value: Any, inside: tuple[int, ...]) -> Any:
 
 
 def _source(function: Any) -> Any:
-    """Source of a function, or its byte code."""
+    """Source text of a function; if there is none, its byte code with names and constants."""
     try:
         return inspect.getsource(function)
     except (OSError, TypeError):
