@@ -73,7 +73,7 @@ def run(command: options.DrawingCommand, steps: Steps) -> str:
 
 
 def _show(command: options.DrawingCommand, result: CommandResult, steps: Steps) -> None:
-    """Write the pictures of a result and print it."""
+    """Write the pictures of a result, and print it as text, CSV or JSON, as the options say."""
     pictures: dict[Path, Any] = {command.picture(): result.picture, **result.more}
     replaced = [path for path in pictures if path.exists()]
     for path, picture in pictures.items():
@@ -284,6 +284,7 @@ def _per_contact(study: Study) -> tuple[Study, Study | None]:
         return study, None
     groups = {}  # labels (m,): 0 fixed, entries of one label are one free value
     for name in fields:
+        # the study's choice: True or False, a mask (m,), or labels (m,)
         value, choice = getattr(law, name), np.asarray(study.free.get(name, False))
         one_each = np.arange(1, contacts + 1) if np.ndim(value) else 1
         labels = np.where(choice, one_each, 0) if choice.dtype == bool else choice
@@ -301,10 +302,10 @@ def _fits_table(fits: dict[str, "Fit"]) -> list[str]:
     for name, fit in fits.items():
         data = "corrected" if name == CORRECTED else RAW
         rms = f"{fit.rms:.4f}" if fit.experiments is not None else f"{fit.rms:.4g}"
-        ends = [type(fit.law).__name__, data, rms, f"{fit.rank} of {len(fit.names)}"]
+        of_fit = [type(fit.law).__name__, data, rms, f"{fit.rank} of {len(fit.names)}"]
         for i, parameter in enumerate(fit.names):
-            rows.append([*ends[:2], parameter, _value(fit, i), *ends[2:]])
-            ends = [""] * 4  # said once
+            rows.append([*of_fit[:2], parameter, _value(fit, i), *of_fit[2:]])
+            of_fit = [""] * 4  # in the first row only
     speeds = all(fit.experiments is not None for fit in fits.values())
     heads = ["law", "data", "parameter", "value", "rms [m/s]" if speeds else "rms", "rank"]
     lines = str(_plain(heads, rows)).splitlines()
@@ -474,7 +475,7 @@ def advise(command: options.AdviseCommand, steps: Steps) -> CommandResult:
 
 
 def _advise_parameters(study: Study) -> dict[str, Any]:
-    """The study's parameters that `ji.advise` takes; others that matter are refused."""
+    """The study's parameters that `ji.advise` takes; a ValueError for others that matter."""
     rheology = study.parameters.get("rheology", "bistiffness")
     if rheology != "bistiffness":
         raise ValueError(

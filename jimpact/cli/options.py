@@ -212,7 +212,7 @@ class ChartCommand(ShotCommand):
 
 @dataclasses.dataclass(frozen=True)
 class StabilityCommand(DrawingCommand):
-    """Where methods of integration are right, wrong, gain energy or do not end."""
+    """Map where methods of integration are right, wrong, gain energy or do not end."""
 
     methods: Names = ()
     """Methods by name; default: time, rk4, verlet and impulse_euler."""
@@ -331,7 +331,7 @@ class NewCommand:
         return ""
 
     def run(self) -> int:
-        """Write the files, and print the next command."""
+        """Write the files of a new study, and print their names and the next command."""
         from jimpact.cli.starting import begin
 
         folder = self.folder or Path(f"my_{self.kind}")
