@@ -216,7 +216,7 @@ def _fits_result(title: str, fits: dict[str, "Fit"]) -> CommandResult:
         for i, parameter in enumerate(x.names)
     ]
     picture = ji.plot.fit(fits[RAW], None, title)
-    return CommandResult(title, {"fits": dict(fits)}, picture, _plain(heads, rows), text)
+    return CommandResult(title, {"fits": dict(fits)}, picture, _plain_table(heads, rows), text)
 
 
 def _with_track(result: CommandResult, study: Study, command: options.FitCommand) -> CommandResult:
@@ -231,7 +231,7 @@ def _with_track(result: CommandResult, study: Study, command: options.FitCommand
     return result._replace(data=data, text=f"{study.track}\n\n{text}", more=picture)
 
 
-def _plain(heads: Iterable[str], rows: Sequence[Sequence[Any]]) -> Table:
+def _plain_table(heads: Iterable[str], rows: Sequence[Sequence[Any]]) -> Table:
     """A table of plain columns, without formats and notes."""
     return Table([Column(name) for name in heads], rows)
 
@@ -304,11 +304,11 @@ def _fits_table(fits: dict[str, "Fit"]) -> list[str]:
         rms = f"{fit.rms:.4f}" if fit.experiments is not None else f"{fit.rms:.4g}"
         of_fit = [type(fit.law).__name__, data, rms, f"{fit.rank} of {len(fit.names)}"]
         for i, parameter in enumerate(fit.names):
-            rows.append([*of_fit[:2], parameter, _value(fit, i), *of_fit[2:]])
+            rows.append([*of_fit[:2], parameter, _value_with_error(fit, i), *of_fit[2:]])
             of_fit = [""] * 4  # in the first row only
     speeds = all(fit.experiments is not None for fit in fits.values())
     heads = ["law", "data", "parameter", "value", "rms [m/s]" if speeds else "rms", "rank"]
-    lines = str(_plain(heads, rows)).splitlines()
+    lines = str(_plain_table(heads, rows)).splitlines()
     if ALL_FREE in fits:
         fit = fits[ALL_FREE]
         names = ", ".join(fit.names)
@@ -319,12 +319,12 @@ def _fits_table(fits: dict[str, "Fit"]) -> list[str]:
 
 def _fit_in_words(name: str, fit: "Fit") -> str:
     """Fitted values with standard errors, and the rms of the residuals, in one line."""
-    values = ", ".join(f"{x} {_value(fit, i)}" for i, x in enumerate(fit.names))
+    values = ", ".join(f"{x} {_value_with_error(fit, i)}" for i, x in enumerate(fit.names))
     unit = "" if fit.experiments is None else " m/s"
     return f"{name}: {values}, rms {fit.rms:.4g}{unit}"
 
 
-def _value(fit: "Fit", i: int) -> str:
+def _value_with_error(fit: "Fit", i: int) -> str:
     """Fitted value i with its standard error, or a word why it has none."""
     error = fit.standard_error[i]
     if not fit.determined[i]:
@@ -516,12 +516,12 @@ def simulate(command: options.SimulateCommand, steps: Steps) -> CommandResult:
             speed=command.speed,
         )
     heads = ("time [s]", *system.body.names, *system.body.velocity_names)
-    table = _plain(heads, np.column_stack([motion.time, motion.q, motion.velocity]).tolist())
+    table = _plain_table(heads, np.column_stack([motion.time, motion.q, motion.velocity]).tolist())
     picture = ji.plot.motion(motion, title, system=system)
-    return CommandResult(title, motion, picture, table, more=more, failure=_failure(motion))
+    return CommandResult(title, motion, picture, table, more=more, failure=_failure_of(motion))
 
 
-def _failure(motion: "Motion") -> str:
+def _failure_of(motion: "Motion") -> str:
     """Message of the failure of a motion, '' if its status is none."""
     try:
         ji.raise_on_failure(motion)

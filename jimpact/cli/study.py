@@ -162,20 +162,20 @@ def read_study(path: str | Path, law: str | None = None) -> Study | MotionStudy:
         """The study of a motion if there is a table [motion], else of an impact."""
         return (motion_study_of if "motion" in tables else _impact_study)(tables, place, law)
 
-    return _built(path, "[law]", build)
+    return _read(path, "[law]", build)
 
 
 def impact_study(path: str | Path, law: str | None = None) -> Study:
     """The study of one impact, see `read_study`; one of a motion is refused."""
-    return _built(path, "[scene]", lambda tables, place: _impact_study(tables, place, law))
+    return _read(path, "[scene]", lambda tables, place: _impact_study(tables, place, law))
 
 
 def motion_study(path: str | Path) -> MotionStudy:
     """The study of a motion, see `read_study`; one of an impact is refused."""
-    return _built(path, "[system]", lambda tables, place: motion_study_of(tables, place, None))
+    return _read(path, "[system]", lambda tables, place: motion_study_of(tables, place, None))
 
 
-def _built(
+def _read(
     path: str | Path, table: str, build: Callable[[dict[str, Any], Path], AnyStudy]
 ) -> AnyStudy:
     """Study that `build(tables, path)` makes of a TOML file; its errors name the file.

@@ -40,12 +40,12 @@ def track_of(table: Mapping[str, Any], study: Path) -> "Track":
     choice |= {key: None for key in ("acceleration", "drag") if choice.get(key) == UNKNOWN}
     _check_kinds("[track]", {key: x for key, x in choice.items() if x is not None})
     try:
-        t, q = ji.tracks.read(study.parent / choice["file"], **_only(choice, READ))
+        t, q = ji.tracks.read(study.parent / choice["file"], **_entries(choice, READ))
         unit = choice["unit"]
         stated = [unit] * q.shape[1] if isinstance(unit, str) else unit
         units = ["rad" if each in ("rad", "deg") else "m" for each in stated]
         of_poses = "quaternion" in choice
-        options = _only(choice, FOUND)
+        options = _entries(choice, FOUND)
         return ji.tracks.find_impacts(t, q, units=None if of_poses else units, **options)
     except (ValueError, TypeError) as error:
         raise ValueError(f"[track]: {error}") from None
@@ -85,6 +85,6 @@ def _check_kinds(where: str, table: Mapping[str, Any]) -> None:
         check_kind(where, key, None if isinstance(value, bool) else value, kind, words)
 
 
-def _only(table: Mapping[str, Any], keys: tuple[str, ...]) -> dict[str, Any]:
+def _entries(table: Mapping[str, Any], keys: tuple[str, ...]) -> dict[str, Any]:
     """The entries of a table with these keys; missing keys are left out."""
     return {key: table[key] for key in keys if key in table}

@@ -202,12 +202,12 @@ def advise(
         raise ValueError(_missing_stiffness(situation))
     nominal = np.broadcast_to(np.asarray(k, v.dtype), (scene.contacts,))
     unknown = _unknown_stiffnesses(situation, nominal, factors, absolute)
-    tried = _samples(nominal, unknown, samples, seed)
+    tried = _stiffnesses_to_try(nominal, unknown, samples, seed)
     laws, options = trials(situation, law), (float(tolerance), timing, progress)
-    return _advice(situation, laws, unknown, tried, slice(-samples, None), *options)
+    return _simplest_law(situation, laws, unknown, tried, slice(-samples, None), *options)
 
 
-def _advice(
+def _simplest_law(
     situation: Situation,
     laws: dict[str, Trial],
     unknown: tuple[Unknown, ...],
@@ -217,10 +217,11 @@ def _advice(
     timing: bool,
     progress: float | None,
 ) -> Advice:
-    """Impacts by every law over stiffnesses k (r, m), nominal first; the simplest law within.
+    """Compare all laws with the reference, and advise the simplest one within `tolerance`.
 
-    `unknown` are the stiffnesses that vary in k, `random` the rows of k drawn at random. The
-    reference is Compliant where gaps count or contacts re-close, else LZB.
+    Each runs over stiffnesses k (r, m), row 0 the nominal ones, in which the `unknown` ones vary;
+    `random` are the rows drawn at random. The reference is Compliant where gaps count or contacts
+    re-close, else LZB.
     """
     v = situation.velocity
     each = {name: partial(_outcomes, law, v, progress=progress) for name, law in laws.items()}
@@ -229,7 +230,7 @@ def _advice(
         if name in left_out:
             raise RuntimeError(f"The reference law {name} {left_out[name]}")
     laws = {name: laws[name] for name in outcomes}
-    apart = _reclosing(situation, outcomes)
+    apart = _reclosing_distance(situation, outcomes)  # of LZB and Compliant
     follows_gaps = situation.gapped.any() or apart > tolerance / SMALL_PART
     name = "compliant" if follows_gaps else "lzb"
     outcomes[name].check_first(f"The reference law {name} fails on this scene")
@@ -242,7 +243,9 @@ def _advice(
     suffice = [key for key, c in candidates.items() if c.usable and c.worst <= tolerance]
     chosen = suffice[0] if suffice else name
     if "rtol" in options_of(type(laws[chosen].law)):
-        candidates[chosen] = _loosened(candidates[chosen], situation, reference, tolerance)
+        candidates[chosen] = _with_coarsest_rtol(
+            candidates[chosen], situation, reference, tolerance
+        )
     gap_ratio = None
     if situation.gapped.any():
         scale = gap_scale(situation.scene, laws["compliant"].law, v)
@@ -257,7 +260,7 @@ def _advice(
         candidates=candidates,
         blocks=_with_simplest_laws(situation, candidates, outcomes, reference, tolerance),
         stiffness=k[0],
-        unknown=_effects(situation, unknown, reference, tolerance),
+        unknown=_with_effects(situation, unknown, reference, tolerance),
         rows=len(k),
         gap_ratio=gap_ratio,
         far=tuple(np.flatnonzero(situation.far).tolist()),
@@ -405,7 +408,7 @@ def _unknown_stiffnesses(
     return tuple(unknown)
 
 
-def _samples(
+def _stiffnesses_to_try(
     stiffness: np.ndarray, unknown: tuple[Unknown, ...], samples: int, seed: int
 ) -> np.ndarray:
     """Stiffnesses (r, m) to try: rows of changes of ln k of the unknown ones from the nominal.
@@ -485,7 +488,7 @@ def _costs(laws: dict[str, Trial], velocity: np.ndarray, stiffness: np.ndarray) 
 # -------------------------------------------------------------------------- the evidence
 
 
-def _reclosing(situation: Situation, outcomes: dict[str, Outcomes]) -> float:
+def _reclosing_distance(situation: Situation, outcomes: dict[str, Outcomes]) -> float:
     """Largest `|v+_LZB - v+_Compliant|_M / |v-|_M` of contacts without gaps; with gaps 0.
 
     The two differ where contacts open and close again.
@@ -524,7 +527,7 @@ def _candidate(
     )
 
 
-def _loosened(
+def _with_coarsest_rtol(
     candidate: Candidate, situation: Situation, reference: Outcomes, tolerance: float
 ) -> Candidate:
     """The candidate with the coarsest rtol, a power of ten, that suffices for this tolerance.
@@ -575,14 +578,14 @@ def _with_simplest_laws(
     return tuple(blocks)
 
 
-def _effects(
+def _with_effects(
     situation: Situation, unknown: tuple[Unknown, ...], reference: Outcomes, tolerance: float
 ) -> tuple[Unknown, ...]:
     """The unknown stiffnesses k with the changes of v+ that each causes by itself.
 
     Equation: `alone = max |v+(k) - v+(nominal)|` over its range, in the energy norm over that of
     v-; `needed = tolerance / |d v+ / d ln k|`, the derivative by central differences. Rows of the
-    reference are in the order of `_samples`.
+    reference are in the order of `_stiffnesses_to_try`.
     """
     each, places = [], len(ALONE) + 2
     for i, u in enumerate(unknown):

@@ -155,7 +155,7 @@ class Advice(Tabular):
         """The advice, its reason, and a row for each law: half a page."""
         verdict = "within" if self.within else "NOT within"
         head = [f"Advice: {as_code(self.law)}, {verdict} {share(self.tolerance)}"]
-        for line in (self.reason, *_contacts(self)):
+        for line in (self.reason, *_block_lines(self)):
             head += textwrap.wrap(line, _WIDTH)
         if self.unknown:
             head += ["", *str(_unknown_table(self.unknown)).splitlines()]
@@ -241,7 +241,7 @@ def _in_code(value: Any) -> str:
     return f"[{', '.join(f'{x:.6g}' for x in array)}]"
 
 
-def _contacts(advice: Advice) -> list[str]:
+def _block_lines(advice: Advice) -> list[str]:
     """Lines of the report: contacts of each block, their kinetic angles, the law that suffices.
 
     Decoupled contacts with the same law share a line.

@@ -238,7 +238,9 @@ def work_precision(
     ladders: dict[str, Any] = {m.name: m.ladder for m in chosen} | dict.fromkeys(laws, (None,))
     truth, other_truth = programs[exact.name].at(FINEST), programs[second.name].at(SECOND)
     with counting_bar(sum(map(len, ladders.values())), "errors", progress) as advance:
-        climbed = {name: partial(_climbed, programs[name], name, advance) for name in ladders}
+        climbed = {
+            name: partial(_outcomes_over_ladder, programs[name], name, advance) for name in ladders
+        }
         solutions, raised = at_points(climbed, ladders)
     rows = [(n, setting, s) for n, row in solutions.items() for setting, s in zip(ladders[n], row)]
     times = _times([(programs[name], setting) for name, setting, _ in rows], repeats, progress)
@@ -384,7 +386,7 @@ class Programs:
         return outcomes._replace(evaluations=evaluations, jacobian=jacobian)
 
 
-def _climbed(
+def _outcomes_over_ladder(
     programs: Programs, name: str, advance: Callable[[int], None], ladders: Mapping[str, Any]
 ) -> list[Outcomes]:
     """Outcomes of the sampled impacts at every setting of the ladder of contender `name`.

@@ -169,12 +169,12 @@ def simplest_scene(
     labels = ("",) * scene.contacts if names is None else tuple(map(str, names))
     check_shape("names", np.empty(len(labels)), (scene.contacts,), "one per contact")
     norm = EnergyNorm.of(scene, np.asarray(v), watched)
-    trial = _Simpler(law, scene, v, norm)
+    trial = _Trial(law, scene, v, norm)
     whole = trial.run([()])
     whole.check_first("The law fails on the whole scene")
-    friction, trial = _frictions(trial, whole, tolerance)
-    working, errors, changes = _alone(trial, runs)
-    kept, error = _together(trial, whole, working, errors, tolerance, runs)
+    friction, trial = _simplest_friction(trial, whole, tolerance)
+    working, errors, changes = _effect_of_each_contact(trial, runs)
+    kept, error = _sufficient_contacts(trial, whole, working, errors, tolerance, runs)
     taking = scene.closed
     if law.uses_gaps and scene.gaps is not None:
         taking = jnp.isfinite(scene.gaps)
@@ -195,7 +195,7 @@ def simplest_scene(
     )
 
 
-class _Simpler(NamedTuple):
+class _Trial(NamedTuple):
     """A law on a scene of which contacts are left out, at v- (n,), with the norm of errors."""
 
     law: Law
@@ -229,9 +229,9 @@ class _Simpler(NamedTuple):
         return self.run(left_out).where_usable().velocity - whole.velocity[0]
 
 
-def _frictions(
-    trial: _Simpler, whole: Outcomes, tolerance: float
-) -> tuple[dict[str, float], _Simpler]:
+def _simplest_friction(
+    trial: _Trial, whole: Outcomes, tolerance: float
+) -> tuple[dict[str, float], _Trial]:
     """Errors of v+ by way to treat friction, and the simplest way that is within tolerance.
 
     Ways are 'none', and 'one direction' of the tangents at each contact in space.
@@ -271,7 +271,7 @@ def _tangents_along_impulses(scene: Scene, whole: Outcomes) -> jax.Array:
     return jnp.asarray(np.sum(tangents * direction[None], axis=2).astype(tangents.dtype))
 
 
-def _alone(trial: _Simpler, runs: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _effect_of_each_contact(trial: _Trial, runs: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Effect of leaving out each contact by itself.
 
     Returns the indices of contacts with an impulse, and for all m contacts the error of v+ in the
@@ -293,8 +293,8 @@ def _alone(trial: _Simpler, runs: int) -> tuple[np.ndarray, np.ndarray, np.ndarr
     return working, errors, changes
 
 
-def _together(
-    trial: _Simpler,
+def _sufficient_contacts(
+    trial: _Trial,
     whole: Outcomes,
     working: np.ndarray,
     errors: np.ndarray,

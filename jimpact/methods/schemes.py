@@ -305,6 +305,7 @@ def rk4(field: Field, h: jax.Array, walk: Walk) -> StepEnd:
         x, p = (a + node * h * rate for a, rate in zip(start, rates))
         rates = field.closing(field.gap_velocity(p, walk.side)), field.force(x)
         total = total[0] + weight * h * rates[0], total[1] + weight * h * rates[1]
+    # p_t and the force at the end are not needed by further steps
     return StepEnd(walk.x + total[0], walk.p + total[1], walk.side, walk.force)
 
 

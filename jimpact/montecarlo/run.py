@@ -115,7 +115,7 @@ def monte_carlo(
     if keep_samples and folder is None:
         raise ValueError("Argument `folder` must be given to keep samples, but is None.")
     store = None if folder is None else Store(folder, run.identity)
-    total, resumed, rate = _total(run, executor, workers, store, progress)
+    total, resumed, rate = _all_chunks(run, executor, workers, store, progress)
     result = result_of(run, total, resumed, rate, _gap_scale(run.sources, scene))
     failed = result.samples - result.count
     if failed:
@@ -134,7 +134,7 @@ def monte_carlo(
     return result
 
 
-def _total(
+def _all_chunks(
     run: Run, executor: Any, workers: int, store: Store | None, progress: float | None
 ) -> tuple[Chunk, int, float]:
     """Statistics of all chunks, joined in their order, samples that were read, samples a second.
@@ -171,7 +171,7 @@ def _total(
             tolerance = Tolerance(*map(float, total["tolerance"]))
             missing = (n for n in range(1, run.chunks) if n not in stored)
             tasks = (run.task(number, tolerance, total["ends"]) for number in missing)
-            with closing(_computed(executor, workers, run, tasks)) as chunks:
+            with closing(_computed_chunks(executor, workers, run, tasks)) as chunks:
                 for number in range(1, run.chunks):
                     chunk = read(number) if number in stored else new(next(chunks))
                     if chunk is None:
@@ -208,20 +208,22 @@ def _gap_scale(sources: Sources, scene: Scene) -> np.ndarray | None:
 # ------------------------------------------ where chunks are computed, which changes no result
 
 
-def _computed(executor: Any, workers: int, run: Run, tasks: Iterable[Task]) -> Generator[Chunk]:
+def _computed_chunks(
+    executor: Any, workers: int, run: Run, tasks: Iterable[Task]
+) -> Generator[Chunk]:
     """Chunks `run(task)` of all tasks, in their order, by 'threads', 'serial' or an executor."""
     if executor in ("threads", "serial"):
         yield from in_threads(run, tasks, workers if executor == "threads" else 1)
         return
     remaining = iter(tasks)
-    with _opened(executor, run) as (mapped, work):
+    with _mapping_of(executor, run) as (mapped, work):
         while window := list(itertools.islice(remaining, WINDOW)):
             for each in mapped(work, window):
                 yield each.result() if hasattr(each, "result") else each  # Dask maps to futures
 
 
 @contextmanager
-def _opened(executor: Any, run: Run) -> Iterator[tuple[Callable[..., Any], Work]]:
+def _mapping_of(executor: Any, run: Run) -> Iterator[tuple[Callable[..., Any], Work]]:
     """The `map` of an executor, and the function to map over tasks, while it is open.
 
     `executor` is 'devices', 'dask', the address of a Dask scheduler, or an object with a `map`.
@@ -235,12 +237,12 @@ def _opened(executor: Any, run: Run) -> Iterator[tuple[Callable[..., Any], Work]
         here = {"threads_per_worker": 1, "dashboard_address": None}  # processes on this machine
         options = here if executor == "dask" else {"address": executor}
         with distributed.Client(**options) as client:
-            yield client.map, _shipped(run)
+            yield client.map, _picklable(run)
     else:
-        yield executor.map, _shipped(run)
+        yield executor.map, _picklable(run)
 
 
-def _shipped(run: Run) -> Work:
+def _picklable(run: Run) -> Work:
     """Function of a task that other processes can unpickle; the run itself if it refuses pickling.
 
     Functions in it are pickled if cloudpickle is installed, which Dask brings.

@@ -82,8 +82,9 @@ def moments(values: np.ndarray) -> Chunk:
 def merged(a: Chunk, b: Chunk) -> Chunk:
     """Moments (see `moments`) of the samples of a and b together.
 
-    Equation: `mean = mean_a + d n_b / n`, `S = S_a + S_b + d d^T n_a n_b / n`, with
-    `d = mean_b - mean_a`. Not associative in floating point: merge in a fixed order.
+    Equation: `mean = mean_a + d n_b / n`, `S = S_a + S_b + d d^T n_a n_b / n`, with n the numbers
+    `used`, S the `products`, `d = mean_b - mean_a`. Not associative in floating point: merge in a
+    fixed order.
 
     Source: Chan, Golub and LeVeque, Am. Statistician 37 (1983) 242.
 

@@ -89,16 +89,16 @@ def work_precision(result: WorkPrecision, title: str = "") -> Figure:
     styles, ends = _styles(result.points), []
     for axes, (quantity, against, label) in zip(panels, _PANELS):
         for name, row in result.points.items():
-            at = _draw(axes, row, quantity, against, styles[name])
+            at = _draw_errors(axes, row, quantity, against, styles[name])
             if at is not None and styles[name]["ls"] != "none":
                 ends.append(LineEnd(axes, at, name, styles[name]["color"]))
-        _finish(axes, result.reference.uncertainty[quantity], label, _ERRORS[quantity])
+        _finish_errors(axes, result.reference.uncertainty[quantity], label, _ERRORS[quantity])
     if not gradients:
-        legend_below(figure, 2, note=_note(result))
+        legend_below(figure, 2, note=_reading_note(result))
     else:  # next to the three panels
         lines = {x.get_label(): x for axes in panels for x in axes.get_legend_handles_labels()[0]}
         panels[3].axis("off")
-        panels[3].legend(handles=list(lines.values()), title=_note(result), loc="center")
+        panels[3].legend(handles=list(lines.values()), title=_reading_note(result), loc="center")
     label_ends(figure, ends)
     return figure
 
@@ -126,7 +126,7 @@ _PANELS = (  # error, and what it is drawn against
 )
 
 
-def _draw(
+def _draw_errors(
     axes: Axes, row: tuple[Point, ...], quantity: str, against: str, style: dict[str, Any]
 ) -> tuple[float, float] | None:
     """Draw the error of a `quantity` over times [µs] or counts, one point for each setting.
@@ -161,7 +161,7 @@ def _draw(
     return float(x[known][-1]), float(y[known][-1])
 
 
-def _finish(axes: Axes, uncertainty: float, x: str, y: str) -> None:
+def _finish_errors(axes: Axes, uncertainty: float, x: str, y: str) -> None:
     """Logarithmic axes with labels, and the grey band up to the uncertainty of the reference."""
     axes.set(xlabel=x, ylabel=y, yscale="log")
     low, high = axes.get_ylim()
@@ -173,7 +173,7 @@ def _finish(axes: Axes, uncertainty: float, x: str, y: str) -> None:
     logarithmic(axes, "y")
 
 
-def _note(result: WorkPrecision) -> str:
+def _reading_note(result: WorkPrecision) -> str:
     """Note below the chart: how errors and times were measured, and what grey and hollow mean."""
     return (
         f"errors: largest of {result.sample} impacts, stiffness\nspread over a factor "
@@ -209,7 +209,7 @@ def stability_map(result: StabilityMap, title: str = "") -> Figure:
         _ticks(axes, "x", name, result.axes[name])
         axes.set_yticks(range(len(result.methods)), result.methods, fontsize=SMALL)
         axes.tick_params(labelleft=i % COLUMNS == 0)
-        axes.plot(_place(result, name), -0.62, "v", color="black", ms=5, clip_on=False)
+        axes.plot(_base_position(result, name), -0.62, "v", color="black", ms=5, clip_on=False)
         axes.set_ylim(len(result.methods) - 0.5, -0.5)
     _legend_of_classes(figure, result)
     return figure
@@ -245,21 +245,21 @@ def stability_pairs(result: StabilityMap, method: str, title: str = "") -> Figur
     figure, grid = new_figure(1.6 + 1.5 * size, title or method, size, size, squeeze=False)
     for each in pairs:
         column, row = (names.index(name) for name in each.axes)
-        _pair(grid[row - 1, column], result, each)
+        _draw_pair(grid[row - 1, column], result, each)
     for above in grid[np.triu_indices(size, 1)]:
         above.remove()
     _legend_of_classes(figure, result)
     return figure
 
 
-def _pair(axes: Axes, result: StabilityMap, each: Slice) -> None:
+def _draw_pair(axes: Axes, result: StabilityMap, each: Slice) -> None:
     """Draw the classes of a slice over two axes; a ring marks the base point."""
     _draw_classes(axes, each.codes.T)
     axes.invert_yaxis()
     for which, name in zip("xy", each.axes):
         _ticks(axes, which, name, result.axes[name], 3)
     axes.label_outer()
-    x, y = (_place(result, name) for name in each.axes)
+    x, y = (_base_position(result, name) for name in each.axes)
     axes.plot(x, y, "o", ms=7, mfc="none", mec="white", mew=2.5)
     axes.plot(x, y, "o", ms=7, mfc="none", mec="black", mew=1.2)
 
@@ -284,7 +284,7 @@ def _ticks(axes: Axes, which: str, name: str, values: np.ndarray, most: int = _T
     axis.set_label_text(_LABELS.get(name, name.replace("_", " ")), fontsize=SMALL)
 
 
-def _place(result: StabilityMap, name: str) -> float:
+def _base_position(result: StabilityMap, name: str) -> float:
     """Position of the base point on a panel's axis: its index among the values, interpolated."""
     values = result.axes[name]
     return float(np.interp(result.base[name], values, np.arange(len(values))))

@@ -23,7 +23,6 @@ from jimpact.plot.motions import (
     one_motion,
     plane_of,
     set_limits,
-    stretch_of,
 )
 from jimpact.plot.style import GREY
 from jimpact.tools.checks import check_values
@@ -154,10 +153,10 @@ def _frames(
     digits = max(2, int(np.ceil(-np.log10(speed / rate))))  # in which frames differ
     slow = "" if speed == 1 else f" (speed {speed:g})"
     captions = [f"{title}\n{t:.{digits}f} s{slow}".lstrip() for t in time]
-    return count, _drawn(body, curves, colours_of(body, q[0], point), ground, captions)
+    return count, _film(body, curves, colours_of(body, q[0], point), ground, captions)
 
 
-def _drawn(
+def _film(
     body: Body, curves: Any, colours: list[str], ground: np.ndarray, captions: list[str]
 ) -> FuncAnimation:
     """Film of curves in their `colours`, the planes that a body stands on, and captions.
@@ -183,6 +182,17 @@ def _drawn(
         return [*lines, *planes]
 
     return FuncAnimation(figure, draw, frames=len(captions))
+
+
+def stretch_of(n: np.ndarray, offset: float, view: np.ndarray, ground: np.ndarray) -> np.ndarray:
+    """Ends (2, 2), a column each, of the part of a plane `n^T (x - ground) = offset` in view.
+
+    `view` (2, 2) are the limits of x and of y, `ground` (2,) is the displacement of the plane. The
+    middle is the foot of the perpendicular from the centre of the view.
+    """
+    middle, reach = view.mean(axis=1), np.ptp(view[0])
+    foot = middle - (n @ (middle - ground) - offset) * n
+    return foot[:, None] + reach * np.array([-1, 1]) * np.array([n[1], -n[0]])[:, None]
 
 
 def positions(at: np.ndarray, q: np.ndarray, slopes: np.ndarray, time: np.ndarray) -> np.ndarray:

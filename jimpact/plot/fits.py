@@ -76,8 +76,8 @@ def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> F
         top.set_ylabel(f"{what} [{unit}]" if unit else what)
         bottom.set_ylabel(f"measured − fitted [{unit}]" if unit else "measured − fitted")
         bottom.axhline(0, color=GREY, lw=0.8)
-        _shot_axis(bottom, fit, dodge)
-    _legend(figure, fit, others or {}, error is not None)
+        _label_shots(bottom, fit, dodge)
+    _draw_legend(figure, fit, others or {}, error is not None)
     for axes in figure.axes:
         axes.grid(False, axis="x")
     return figure
@@ -135,7 +135,7 @@ def _error_bars(fit: Fit) -> np.ndarray | None:
     return _in_rows(np.full(shape, fit.noise)) if np.isfinite(fit.noise) else None
 
 
-def _shot_axis(axes: Axes, fit: Fit, dodge: np.ndarray) -> None:
+def _label_shots(axes: Axes, fit: Fit, dodge: np.ndarray) -> None:
     """Label the x axis: bodies, at the offsets `dodge`, for a single shot; else shots or values.
 
     At most `_LABELLED` of them have a label.
@@ -153,7 +153,7 @@ def _shot_axis(axes: Axes, fit: Fit, dodge: np.ndarray) -> None:
     axes.set_xlim(-0.6, len(labels) - 0.4)
 
 
-def _legend(figure: Figure, fit: Fit, others: Mapping[str, Fit], has_bars: bool) -> None:
+def _draw_legend(figure: Figure, fit: Fit, others: Mapping[str, Fit], has_bars: bool) -> None:
     """Draw a legend: markers of measured and fitted values and of other fits, colours of bodies."""
     bars = ""
     if has_bars:

@@ -140,7 +140,7 @@ def residuals(fit: Fit) -> Figure:
     first.axline((float(measured[here].mean()),) * 2, slope=1.0, color=GREY, lw=0.8)
     first.plot(fit.predicted[here], measured[here], color=COLOURS[0], **style)
     first.set(xlabel=f"fitted{values}", ylabel=f"measured{values}")
-    over, label = _over(fit)
+    over, label = _residual_axis(fit)
     second.axhline(0, color=GREY, lw=0.8)
     second.plot(np.broadcast_to(over, here.shape)[here], scaled, color=COLOURS[0], **style)
     second.set(xlabel=label, ylabel=f"residual [{unit}]")
@@ -155,7 +155,7 @@ def residuals(fit: Fit) -> Figure:
     return figure
 
 
-def _over(fit: Fit) -> tuple[np.ndarray, str]:
+def _residual_axis(fit: Fit) -> tuple[np.ndarray, str]:
     """Values and label of the x axis of residuals.
 
     The fastest approach (K, 1) [m/s] of K shots; of other data the fitted values.
@@ -199,16 +199,16 @@ def corner(fit: Fit, draws: Any = None, names: Sequence[str] | None = None) -> F
     shown = [i for i in usable if names is None or fit.names[i] in names][:MOST]
     if not shown:
         raise ValueError("Argument `fit` must have a standard error to show, but has none.")
-    values = None if draws is None else _drawn(fit, draws)
+    values = None if draws is None else _draws_of(fit, draws)
     count = len(shown)
     height = float(np.clip(1.6 * count + 0.8, 3.0, 7.2))
     figure, grid = new_figure(height, "", count, count, squeeze=False, sharex="col")
     for above in grid[np.triu_indices(count, 1)]:
         above.remove()
     for k, i in enumerate(shown):
-        _one(grid[k, k], fit, i, values)
+        _draw_density(grid[k, k], fit, i, values)
         for axes, j in zip(grid[k, :k], shown):
-            _pair(axes, fit, j, i, values)
+            _draw_ellipses(axes, fit, j, i, values)
     for axes, i in zip(grid[-1], shown):
         axes.set_xlabel(fit.names[i])
     for axes, name in zip(grid[:, 0], ["density", *(fit.names[i] for i in shown[1:])]):
@@ -216,7 +216,7 @@ def corner(fit: Fit, draws: Any = None, names: Sequence[str] | None = None) -> F
     return figure
 
 
-def _drawn(fit: Fit, draws: Any) -> np.ndarray:
+def _draws_of(fit: Fit, draws: Any) -> np.ndarray:
     """Draws (N, P) of a fit's P parameters, from an array, a bootstrap or ArviZ's posterior."""
     if hasattr(draws, "posterior"):
         columns = [np.ravel(draws.posterior[name]) for name in fit.names]
@@ -230,7 +230,7 @@ def _drawn(fit: Fit, draws: Any) -> np.ndarray:
     return values
 
 
-def _one(axes: Axes, fit: Fit, i: int, values: np.ndarray | None) -> None:
+def _draw_density(axes: Axes, fit: Fit, i: int, values: np.ndarray | None) -> None:
     """Draw the normal density of parameter i from value and standard error; draws: a histogram."""
     z, error = np.linspace(-_WIDE, _WIDE, 121), fit.standard_error[i]
     density = np.exp(-0.5 * z**2) / (error * np.sqrt(2 * np.pi))
@@ -240,7 +240,7 @@ def _one(axes: Axes, fit: Fit, i: int, values: np.ndarray | None) -> None:
     axes.set_yticks([])
 
 
-def _pair(axes: Axes, fit: Fit, i: int, j: int, values: np.ndarray | None) -> None:
+def _draw_ellipses(axes: Axes, fit: Fit, i: int, j: int, values: np.ndarray | None) -> None:
     """Draw the ellipses in which parameters i and j lie with 68 and 95 %; draws: points.
 
     Equation: `(x - x_fit)^T C^-1 (x - x_fit) = chi^2`, C their covariance and chi^2 the quantile

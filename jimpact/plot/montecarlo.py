@@ -56,14 +56,14 @@ def monte_carlo(result: MonteCarlo, title: str = "") -> Figure:
     panels = figure.subplot_mosaic(mosaic)
     for body in bodies:
         axes = panels[str(body)]
-        _histogram(axes, result, body)
+        _draw_histogram(axes, result, body)
     axes.set_xlabel(f"{axes.get_xlabel()}\n(dot: mean, bar: 5 % to 95 %)")
     if mapped:
-        _map(panels["map"], result, int(scattered[0]))
+        _draw_map(panels["map"], result, int(scattered[0]))
     return figure
 
 
-def _histogram(axes: Axes, result: MonteCarlo, body: int) -> None:
+def _draw_histogram(axes: Axes, result: MonteCarlo, body: int) -> None:
     """Draw the share of the samples [%] by v+ of a body, its mean, and 5 % to 95 % as a bar."""
     # without the counts below the first edge and above the last one
     counts, edges = result.counts[body, 1:-1], result.edges[body]
@@ -101,7 +101,7 @@ def _most_correlated_gaps(result: MonteCarlo, body: int) -> list[int]:
     return sorted(np.lexsort((-std, -np.where(varies, correlation, -1.0)))[:2].tolist())
 
 
-def _map(axes: Axes, result: MonteCarlo, body: int) -> None:
+def _draw_map(axes: Axes, result: MonteCarlo, body: int) -> None:
     """Draw the first samples over their two most correlated gaps, coloured by v+ of a body.
 
     Of a single random gap: v+ over this gap.

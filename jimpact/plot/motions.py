@@ -92,26 +92,26 @@ def motion(
             at, words = zip(*which, strict=True)
             axes.plot(course.time, values[:, at], label=words)
             if j == 0 and unit == "m" and system is not None:
-                _moving_base(axes, system, motion)
+                _draw_base(axes, system, motion)
             what = words[0] if len(which) == 1 else ("coordinates", "velocities")[j]
             axes.set_ylabel(f"{what} [{unit}]" if unit else what)
-            _finish(axes, scales.get(unit, 1.0), f"{_FEW} of {count}" if count > _FEW else "")
+            _finish_panel(axes, scales.get(unit, 1.0), f"{_FEW} of {count}" if count > _FEW else "")
         for axes in panels[len(units) : -1, j]:
             axes.remove()
-    left_out = _gaps(panels[-1, 0], motion, _shown_contacts(motion, system, bodies, contacts))
-    _finish(panels[-1, 0], scales["m"], left_out)
-    _ledger(panels[-1, 1], motion, course, system)
-    _finish(panels[-1, 1], float(np.nanmax(np.abs(motion.energy), initial=0.0)) or 1.0)
+    left_out = _draw_gaps(panels[-1, 0], motion, _shown_contacts(motion, system, bodies, contacts))
+    _finish_panel(panels[-1, 0], scales["m"], left_out)
+    _draw_energies(panels[-1, 1], motion, course, system)
+    _finish_panel(panels[-1, 1], float(np.nanmax(np.abs(motion.energy), initial=0.0)) or 1.0)
     for axes in figure.axes:
         if axes is not panels[-1, 1]:
-            _event_lines(axes, motion)
+            _draw_events(axes, motion)
     for axes in panels[-1]:
         axes.set_xlabel("time [s]")
     legend_below(figure, 4, [Line2D([], [], label=x, **y) for x, y in _event_styles(motion)])
     return figure
 
 
-def _finish(axes: Axes, scale: float, note: str = "") -> None:
+def _finish_panel(axes: Axes, scale: float, note: str = "") -> None:
     """Draw a panel's legend with a note, and set limits that do not enlarge rounding of `scale`."""
     axes.grid(False, axis="x")
     low, high = axes.dataLim.intervaly
@@ -168,7 +168,7 @@ def _labels(
 ) -> tuple[list[str], list[str]]:
     """Names, with units as in "x [m]", of the coordinates and of the velocities of a motion.
 
-    In this order: given names, those of the system's body, q1, q2, ... and v1, v2, ...
+    The given names, else those of the system's body, else q1, q2, ... and v1, v2, ...
     """
     n, rates = motion.q.shape[-1], motion.velocity.shape[-1]
     known = () if system is None else system.body.names
@@ -213,11 +213,12 @@ class _Course(NamedTuple):
 def course_of(motion: Motion) -> _Course:
     """States of a motion in the order of time: samples, and before and after each event."""
     events, rows = motion.events, np.asarray(motion.events.kind) > 0
+    # rows of the record that hold an event: its velocities before and after (E, 2, n)
     jumps = np.stack([events.velocity_before, events.velocity_after], axis=1)[rows]
     time = np.concatenate([motion.time, np.repeat(np.asarray(events.time)[rows], 2)])
     q = np.concatenate([motion.q, np.repeat(np.asarray(events.q)[rows], 2, axis=0)])
     v = np.concatenate([motion.velocity, jumps.reshape(-1, jumps.shape[-1])])
-    # states are samples, then before, after, before, after, ...: after an event at even numbers > 0
+    # samples up to 0, then before an event at 1, 3, ..., after it at 2, 4, ...
     after = np.arange(len(time)) - len(motion.time) + 1
     # stable: of events at one time before and after of the first, then of the second
     order = np.argsort(time, kind="stable")
@@ -239,7 +240,7 @@ def base_path(system: System, time: np.ndarray) -> np.ndarray:
     return np.linalg.lstsq(np.asarray(directions), moved.T, rcond=None)[0].T
 
 
-def _moving_base(axes: Axes, system: System, motion: Motion) -> None:
+def _draw_base(axes: Axes, system: System, motion: Motion) -> None:
     """Draw the displacement of the base over time, a line for each direction in which it moves."""
     if system.base is None:
         return
@@ -254,7 +255,7 @@ def _moving_base(axes: Axes, system: System, motion: Motion) -> None:
             axes.plot(time, values, style, color="black", lw=0.8, label=f"base{word}")
 
 
-def _gaps(axes: Axes, motion: Motion, shown: list[int] | None) -> str:
+def _draw_gaps(axes: Axes, motion: Motion, shown: list[int] | None) -> str:
     """Draw the gaps over time, 0 at events of their contacts; a note says how many are shown.
 
     `shown` None: the `_FEW` contacts with the most events, then the least gaps, without those that
@@ -293,14 +294,14 @@ def _event_styles(motion: Motion) -> list[tuple[str, dict[str, Any]]]:
     return [(kind, style) for kind, style in styles.items() if len(motion.event_times(kind))]
 
 
-def _event_lines(axes: Axes, motion: Motion) -> None:
+def _draw_events(axes: Axes, motion: Motion) -> None:
     """Draw a vertical line at each event of the marked kinds."""
     for kind, style in _event_styles(motion):
         for t in motion.event_times(kind)[:_MANY]:
             axes.axvline(t, zorder=0, **style)
 
 
-def _ledger(axes: Axes, motion: Motion, course: _Course, system: System | None) -> None:
+def _draw_energies(axes: Axes, motion: Motion, course: _Course, system: System | None) -> None:
     """Draw energies [J] over time: T, T + V, and the work of contacts, base and forces.
 
     V counts from its least value, so that losses can be seen. T and T + V of a known system jump at
@@ -414,17 +415,6 @@ def colours_of(body: Body, q: np.ndarray, point: float) -> list[str]:
     """The colour of each outline: one for each body."""
     each = enumerate(body.outlines_by_body(q, point))
     return [colour_of(i) for i, curves in each for _ in curves]
-
-
-def stretch_of(n: np.ndarray, offset: float, view: np.ndarray, ground: np.ndarray) -> np.ndarray:
-    """Ends (2, 2), a column each, of the part of a plane `n^T (x - ground) = offset` in view.
-
-    `view` (2, 2) are the limits of x and of y, `ground` (2,) is the displacement of the plane. The
-    middle is the foot of the perpendicular from the centre of the view.
-    """
-    middle, reach = view.mean(axis=1), np.ptp(view[0])
-    foot = middle - (n @ (middle - ground) - offset) * n
-    return foot[:, None] + reach * np.array([-1, 1]) * np.array([n[1], -n[0]])[:, None]
 
 
 def plane_of(angle: Any, offset: Any) -> tuple[np.ndarray, float]:

@@ -49,7 +49,7 @@ def system(drawn: Scene | Body | System, state: Any, title: str = "") -> Figure:
         if drawn.walls is None:
             raise TypeError("Argument `drawn` must be a chain, a body or a system; draw the body.")
         figure, axes = new_figure(2.4, title)
-        _row(axes, drawn, np.asarray(as_velocity(drawn, state)))
+        _draw_chain(axes, drawn, np.asarray(as_velocity(drawn, state)))
     else:
         body = drawn.body if isinstance(drawn, System) else drawn
         if body.names:
@@ -98,7 +98,9 @@ def force_chains(pile: Bodies, q: Any, scene: Scene, impulse: Any, title: str = 
     d = pile.dimension
     centres = np.asarray(q, float).reshape(pile.count, -1)[:, :d]
     first, second = scene.pairs.neighbours.bodies.T  # bodies of each contact; second < 0: a wall
-    ends = np.where((second < 0)[:, None], _on_walls(pile, scene.pairs, centres), centres[second])
+    ends = np.where(
+        (second < 0)[:, None], _points_on_walls(pile, scene.pairs, centres), centres[second]
+    )
     size = np.abs(p) / (np.abs(p).max() or 1.0)
     drawn = np.flatnonzero(size > _FAINT)
     drawn = drawn[np.argsort(size[drawn])]
@@ -115,7 +117,7 @@ def force_chains(pile: Bodies, q: Any, scene: Scene, impulse: Any, title: str = 
     return figure
 
 
-def _on_walls(pile: Bodies, pairs: PairNormals, centres: np.ndarray) -> np.ndarray:
+def _points_on_walls(pile: Bodies, pairs: PairNormals, centres: np.ndarray) -> np.ndarray:
     """Points (m, d) [m] at which bodies at `centres` touch walls, if their contact is with a wall.
 
     Equation: `x = c - (n^T c - offset) n`, the foot of the centre c on the wall that its normal n
@@ -135,7 +137,7 @@ def _on_walls(pile: Bodies, pairs: PairNormals, centres: np.ndarray) -> np.ndarr
     return on_wall
 
 
-def _row(axes: Axes, scene: Scene, velocity: np.ndarray) -> None:
+def _draw_chain(axes: Axes, scene: Scene, velocity: np.ndarray) -> None:
     """Draw a chain as a row of circles with their masses [kg], and arrows for velocities [m/s].
 
     Lengths are in radii of the largest body, `radius = sqrt(m / max m)`.

@@ -80,19 +80,19 @@ def admissible_set(
     closed = np.flatnonzero(np.asarray(result.scene.closed))
     plane = result.dimension == 2 and len(closed) == 2
     closed = closed if len(closed) else np.arange(result.scene.contacts)
-    draw = _plane if plane else _projections
+    draw = _draw_plane if plane else _draw_projections
     default = "Admissible: unilateral contact, pushing impulses, no energy gained"
     return draw(result, marked, closed, title or default)
 
 
-def _plane(
+def _draw_plane(
     result: AdmissibleSet, marked: Mapping[str, np.ndarray], closed: np.ndarray, title: str
 ) -> Figure:
     """Draw the set of two contacts in the plane of kinetic coordinates, with marked outcomes.
 
     Sides are `gamma_k+ = 0` and `p_k = 0`, the arc is T+ = T-; `closed` are both contacts.
     """
-    frame = _Plane(result, closed)
+    frame = _TurnedCoordinates(result, closed)
     figure, axes = new_figure(7.6, title)
     circle = np.linspace(0, 2 * np.pi, 400)
     r = frame.radius
@@ -100,9 +100,11 @@ def _plane(
     axes.fill(*frame(result.boundary(400)).T, color=_FILL, lw=0)
     for k in (0, 1):
         number = closed[k] + 1
-        _line(axes, frame, np.zeros(2), frame.walls[k], f"contact {number} remains closed", "-")
+        _draw_side(
+            axes, frame, np.zeros(2), frame.walls[k], f"contact {number} remains closed", "-"
+        )
         away = frame.push[1 - k]
-        _line(axes, frame, frame.before, away, f"no impulse at contact {number}", ":")
+        _draw_side(axes, frame, frame.before, away, f"no impulse at contact {number}", ":")
     arc = frame(result.conserving_arc(200))
     axes.plot(*arc.T, color="black", lw=2.4, solid_capstyle="round")
     write(axes, arc[len(arc) // 2] * 1.13, "$T^+ = T^-$", fontsize="medium")
@@ -120,7 +122,7 @@ def _plane(
     return figure
 
 
-class _Plane:
+class _TurnedCoordinates:
     """Kinetic coordinates u (2,) [sqrt(J)] turned so that outcomes with gamma+ >= 0 open upwards.
 
     `push` and `walls` (2, 2): a unit vector for each contact, along the change of u by its impulse,
@@ -150,9 +152,9 @@ class _Plane:
         return (velocity - self._set.centre) @ self._metric.T @ self._turn.T
 
 
-def _line(
+def _draw_side(
     axes: Axes,
-    frame: _Plane,
+    frame: _TurnedCoordinates,
     start: np.ndarray,
     direction: np.ndarray,
     text: str,
@@ -175,7 +177,7 @@ def _line(
     write(axes, start + share * length * direction, text, color=GREY, **turned)
 
 
-def _projections(
+def _draw_projections(
     result: AdmissibleSet, marked: Mapping[str, np.ndarray], closed: np.ndarray, title: str
 ) -> Figure:
     """Draw samples of the set over pairs of normalized gap velocities qn+ [sqrt(J)].

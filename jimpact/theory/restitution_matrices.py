@@ -63,7 +63,7 @@ def margin(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
     >>> round(float(value), 6), x.round(3).tolist()
     (-1.0, [0.707..., 0.707...])
     """
-    m = _size(matrix)
+    m = _checked_size(matrix)
     q = 0.5 * (matrix + matrix.T)
     fixed = jax.lax.stop_gradient(q)
     largest = jnp.abs(fixed).max()
@@ -105,7 +105,7 @@ def copositivity(
     'boundary'
     """
     q = as_numbers("matrix", matrix)
-    _size(q)
+    _checked_size(q)
     check_values("tolerance", tolerance, low=0.0)
     check_values("scale", scale, low=0.0)
     value, witness = (np.asarray(part) for part in _compiled_margin(q))
@@ -118,7 +118,7 @@ def copositivity(
     return Copositivity("yes" if value > 0 else "no", float(value), witness)
 
 
-def _size(matrix: jax.Array) -> int:
+def _checked_size(matrix: jax.Array) -> int:
     """Number m of rows of a square matrix, checked: 1 to `LARGEST`."""
     shape = np.shape(matrix)
     if len(shape) != 2 or shape[0] != shape[1] or shape[0] == 0:
@@ -195,9 +195,8 @@ class MatrixAudit(NamedTuple):
             "boundary": "boundary, energy never grows but is conserved",
         }[energetic.answer]
         if energetic.answer != "yes":
-            text += (
-                f" for qn- = {_row(self.worst_normal_velocity)}, v- = {_row(self.worst_velocity)}"
-            )
+            qn, v = _as_text(self.worst_normal_velocity), _as_text(self.worst_velocity)
+            text += f" for qn- = {qn}, v- = {v}"
         lines.append(f"energetic  (6.3)    G^-1 - E^T G^-1 E copositive: {text}")
         if self.spectral is None:
             text = "not applicable, E is not self-adjoint (G^-1 E not symmetric)"
@@ -285,8 +284,8 @@ def audit_matrix(scene: Scene, matrix: Any, tolerance: float | None = None) -> M
     self_adjoint = np.abs(skew).max() <= tolerance * max(np.abs(inverse @ e).max(), 1e-300)
     radius = float(np.abs(np.linalg.eigvals(e)).max()) if self_adjoint else None
     return MatrixAudit(
-        kinematic=_sign(e, tolerance * max(1.0, np.abs(e).max()), closed),
-        kinetic=_sign(inverse + inverse @ e, tolerance * scale, closed),
+        kinematic=_nonnegativity(e, tolerance * max(1.0, np.abs(e).max()), closed),
+        kinetic=_nonnegativity(inverse + inverse @ e, tolerance * scale, closed),
         energetic=energetic,
         worst_normal_velocity=worst_normal,
         worst_velocity=np.asarray(worst),
@@ -346,7 +345,7 @@ def _check_independent(scene: Scene, g: np.ndarray) -> None:
         )
 
 
-def _sign(a: np.ndarray, tolerance: float, closed: np.ndarray) -> Sign:
+def _nonnegativity(a: np.ndarray, tolerance: float, closed: np.ndarray) -> Sign:
     """Verdict on `a >= 0`, entry by entry, of a matrix between the closed contacts.
 
     Column j of `a` is the result (qn+ or pbar) of an approach of contact j alone, qn-_j = -1.
@@ -360,7 +359,7 @@ def _sign(a: np.ndarray, tolerance: float, closed: np.ndarray) -> Sign:
     return Sign(worst >= -tolerance, worst, (int(contact[at[0]]), int(contact[at[1]])), velocity)
 
 
-def _row(vector: np.ndarray) -> str:
+def _as_text(vector: np.ndarray) -> str:
     """A vector with four digits."""
     return "(" + ", ".join(f"{x:.4g}" for x in vector) + ")"
 
