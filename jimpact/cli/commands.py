@@ -1,4 +1,4 @@
-"""What the commands of the command line do: each takes its options and returns a result.
+"""Commands of the command line: each takes its options and returns a result.
 
 Public names are taken from `jimpact` itself, so that a command imports no more than it needs.
 """

@@ -1,4 +1,4 @@
-"""What the command line does without computing: begin a user's own study, print laws."""
+"""Commands that compute nothing: begin a user's own study, print laws."""
 
 import json
 import shutil

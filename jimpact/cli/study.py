@@ -158,21 +158,21 @@ def read_study(path: str | Path, law: str | None = None) -> Study | MotionStudy:
     ('Three equal hard balls, one shot', "Newton's cradle, three balls")
     """
 
-    def build(tables: dict[str, Any], place: Path) -> Study | MotionStudy:
+    def build(tables: dict[str, Any], path: Path) -> Study | MotionStudy:
         """The study of a motion if there is a table [motion], else of an impact."""
-        return (motion_study_of if "motion" in tables else _impact_study)(tables, place, law)
+        return (motion_study_of if "motion" in tables else _impact_study)(tables, path, law)
 
     return _read(path, "[law]", build)
 
 
 def impact_study(path: str | Path, law: str | None = None) -> Study:
     """The study of one impact, see `read_study`; one of a motion is refused."""
-    return _read(path, "[scene]", lambda tables, place: _impact_study(tables, place, law))
+    return _read(path, "[scene]", lambda tables, path: _impact_study(tables, path, law))
 
 
 def motion_study(path: str | Path) -> MotionStudy:
     """The study of a motion, see `read_study`; one of an impact is refused."""
-    return _read(path, "[system]", lambda tables, place: motion_study_of(tables, place, None))
+    return _read(path, "[system]", lambda tables, path: motion_study_of(tables, path, None))
 
 
 def _read(
@@ -183,26 +183,26 @@ def _read(
     `table` is the head of a table that all bundled studies of this kind have: a missing file's
     error lists these.
     """
-    place = located(Path(path), table)
+    file = located(Path(path), table)
     try:
-        return build(read_tables(place), place)
+        return build(read_tables(file), file)
     except (ValueError, TypeError) as error:
-        raise ValueError(f"{place}: {error}") from None
+        raise ValueError(f"{file}: {error}") from None
 
 
-def _impact_study(tables: Mapping[str, Any], place: Path, law_name: str | None) -> Study:
-    """Study of one impact from the tables of the file `place`, checked.
+def _impact_study(tables: Mapping[str, Any], path: Path, law_name: str | None) -> Study:
+    """Study of one impact from the tables of the file `path`, checked.
 
     `law_name`: a law in the place of the study's, None: its own.
     """
     check_tables(tables, ("scene", "law"), ("fit", *SHOTS, "monte_carlo"))
     scene, body = _scene(tables["scene"])
-    law, values, fitted = law_of(tables, law_name, place.parent, scene)
+    law, values, fitted = law_of(tables, law_name, path.parent, scene)
     fittable = free_parameters_of(law)
     bounce = [name for name in ("restitution", *OF_SPEED) if name in fittable]
-    track, experiments = _shots(tables, place, body or scene)
+    track, experiments = _shots(tables, path, body or scene)
     return Study(
-        str(tables.get("title", place.stem)),
+        str(tables.get("title", path.stem)),
         scene,
         law,
         free=fitted.free or dict.fromkeys(bounce or default_free(law), True),
@@ -228,11 +228,11 @@ def _scene(table: Mapping[str, Any]) -> tuple[Scene, Body | None]:
 
 
 def _shots(
-    tables: Mapping[str, Any], study: Path, place: Scene | Body
+    tables: Mapping[str, Any], path: Path, owner: Scene | Body
 ) -> tuple["Track | None", Experiments | None]:
     """Track and shots of a study from the table [track], [bounces] or [data]; None without.
 
-    `study` is the path of its file, `place` the scene or the body of the shots.
+    `path` is that of its file, `owner` the scene or the body of the shots.
     """
     given = [name for name in SHOTS if name in tables]
     if len(given) > 1:
@@ -240,34 +240,34 @@ def _shots(
             f"the study must have one table of shots, but has {', '.join(f'[{x}]' for x in given)}."
         )
     if "track" in tables:
-        track = track_of(tables["track"], study)
-        return track, shots_of_track(track, tables["track"], place)
+        track = track_of(tables["track"], path)
+        return track, shots_of_track(track, tables["track"], owner)
     if "bounces" in tables:
         return None, shots_of_bounces(tables["bounces"])
-    return None, _experiments(tables["data"], study, place) if "data" in tables else None
+    return None, _experiments(tables["data"], path, owner) if "data" in tables else None
 
 
-def _experiments(table: Mapping[str, Any], study: Path, place: Scene | Body) -> Experiments:
+def _experiments(table: Mapping[str, Any], path: Path, owner: Scene | Body) -> Experiments:
     """Shots in the file of the table [data], selected and corrected as the table says.
 
-    `study` is the path of the study, `place` its scene, or its body, which gives each its scene.
+    `path` is that of the study, `owner` its scene, or its body, which gives each its scene.
     """
     check_keys("[data]", table, DATA, ("file",))
     check_kind("[data]", "file", table["file"], str, "a path")
     corrected = table.get("momentum_corrected", False)
     check_kind("[data]", "momentum_corrected", corrected, bool, "true or false")
     near = table.get("near_m", CLOSED_BELOW)
-    experiments = read_experiments(study.parent / table["file"], place, near)
+    experiments = read_experiments(path.parent / table["file"], owner, near)
     if experiments.scenes is None:
         for key in ("contacts", "near_m"):
             if key in table:
                 raise ValueError(f"`{key}` in [data] is for shots with scenes of their own.")
-        if isinstance(place, Scene):
-            experiments.scene_of(place, 0)  # raises where their sizes differ
+        if isinstance(owner, Scene):
+            experiments.scene_of(owner, 0)  # raises where their sizes differ
     if "contacts" in table:
         experiments = experiments.with_contacts(table["contacts"])
     if corrected:
-        return experiments.momentum_corrected(place if isinstance(place, Scene) else None)
+        return experiments.momentum_corrected(owner if isinstance(owner, Scene) else None)
     return experiments
 
 

@@ -1,4 +1,4 @@
-"""What studies of impacts and of motions share: their file, keys of its tables, law and body."""
+"""Common parts of studies of impacts and of motions: file, keys of its tables, law and body."""
 
 import dataclasses
 import importlib.util

@@ -99,24 +99,24 @@ class MotionStudy:
         return simulate(self.system, self.law, **(self.arguments | without_none(changes)))
 
 
-def motion_study_of(tables: Mapping[str, Any], place: Path, law_name: str | None) -> MotionStudy:
-    """Study of a motion from the tables of the file `place`, checked.
+def motion_study_of(tables: Mapping[str, Any], path: Path, law_name: str | None) -> MotionStudy:
+    """Study of a motion from the tables of the file `path`, checked.
 
     `law_name`: a law in the place of the study's, None: its own.
     """
     check_tables(tables, ("system", "law", "motion"), ("base", "fit", "data"))
-    law, _, fitted = law_of(tables, law_name, place.parent)
+    law, _, fitted = law_of(tables, law_name, path.parent)
     check_keys("[motion]", tables["motion"], (*MOTION, *METHOD, *OTHERS), ("q0", "v0", "t_end_s"))
     motion = tables["motion"]
     arguments = arguments_of(motion, MOTION)
     arguments["t_end"] = float(motion.get("t_start_s", 0.0)), motion["t_end_s"]
     arguments["method"] = _method(motion)
     return MotionStudy(
-        str(tables.get("title", place.stem)),
+        str(tables.get("title", path.stem)),
         _system(tables["system"], tables.get("base"), motion.get("friction")),
         law,
         arguments=arguments,
-        measured=_measured(tables["data"], place) if "data" in tables else None,
+        measured=_measured(tables["data"], path) if "data" in tables else None,
         free=fitted.free or dict.fromkeys(default_free(law)[:1], True),
         bounds=fitted.bounds,
         priors=fitted.priors,

@@ -51,19 +51,19 @@ def track_of(table: Mapping[str, Any], study: Path) -> "Track":
         raise ValueError(f"[track]: {error}") from None
 
 
-def shots_of_track(track: "Track", table: Mapping[str, Any], place: Scene | Body) -> Experiments:
-    """Shots of a track's impacts in the study's scene `place`, or in those of the body's poses."""
-    if isinstance(place, Scene):
+def shots_of_track(track: "Track", table: Mapping[str, Any], owner: Scene | Body) -> Experiments:
+    """Shots of a track's impacts in the study's scene `owner`, or in those of the body's poses."""
+    if isinstance(owner, Scene):
         if "near_m" in table:
             raise ValueError("`near_m` in [track] is for bodies, which have poses.")
-        if len(track.units) != place.size:
+        if len(track.units) != owner.size:
             raise ValueError(
-                f"`columns` in [track] must be those of {place.size} coordinates, one of "
+                f"`columns` in [track] must be those of {owner.size} coordinates, one of "
                 f"each body of the scene, but are {len(track.units)}."
             )
     near = {"near": table["near_m"]} if "near_m" in table else {}
     try:
-        return track.experiments(place, **near)
+        return track.experiments(owner, **near)
     except ValueError as error:
         raise ValueError(f"[track]: {error}") from None
 

@@ -560,17 +560,17 @@ def _with_simplest_laws(
     `M^-1 (N dp + H_t dp_t)`, at most `tolerance` in the energy norm over that of v-.
     """
     m, blocks = situation.scene.contacts, []
-    moved = jax.vmap(partial(velocity_change, situation.scene))
+    changes = jax.vmap(partial(velocity_change, situation.scene))
     for block in situation.blocks:
         names = candidates if block.approaches else ()
         inside = np.isin(np.arange(m), block.contacts)
         for name in names:
-            out, side = outcomes[name], None
+            out, dp_t = outcomes[name], None
             if t := reference.tangential.shape[1]:
                 of_block = np.repeat(inside, t // m)  # mask (t,) of tangents
-                side = (out.tangential[:1] - reference.tangential) * of_block
-            wrong = moved((out.impulse[:1] - reference.impulse) * inside, side)
-            within = np.nanmax(situation.distance(np.asarray(wrong))) <= tolerance
+                dp_t = (out.tangential[:1] - reference.tangential) * of_block
+            dv = changes((out.impulse[:1] - reference.impulse) * inside, dp_t)
+            within = np.nanmax(situation.distance(np.asarray(dv))) <= tolerance
             if within and candidates[name].status != "order_dependent":
                 block = block._replace(law=name)
                 break

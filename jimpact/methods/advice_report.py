@@ -1,4 +1,4 @@
-"""What `advise` reports: half a page, with the numbers of the scene."""
+"""Report of `advise`: half a page, with the numbers of the scene."""
 
 import math
 import textwrap

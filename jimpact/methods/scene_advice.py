@@ -170,11 +170,11 @@ def simplest_scene(
     check_shape("names", np.empty(len(labels)), (scene.contacts,), "one per contact")
     norm = EnergyNorm.of(scene, np.asarray(v), watched)
     trial = _Trial(law, scene, v, norm)
-    whole = trial.run([()])
-    whole.check_first("The law fails on the whole scene")
-    friction, trial = _simplest_friction(trial, whole, tolerance)
+    reference = trial.run([()])
+    reference.check_first("The law fails on the whole scene")
+    friction, trial = _simplest_friction(trial, reference, tolerance)
     working, errors, changes = _effect_of_each_contact(trial, runs)
-    kept, error = _sufficient_contacts(trial, whole, working, errors, tolerance, runs)
+    kept, error = _sufficient_contacts(trial, reference, working, errors, tolerance, runs)
     taking = scene.closed
     if law.uses_gaps and scene.gaps is not None:
         taking = jnp.isfinite(scene.gaps)
@@ -188,7 +188,7 @@ def simplest_scene(
         tolerance=float(tolerance),
         friction=friction,
         names=labels,
-        impulses=whole.impulse[0],
+        impulses=reference.impulse[0],
         errors=errors,
         changes=changes,
         blocks=blocks_of(trial.scene, gamma, np.flatnonzero(np.asarray(taking)), couples),
@@ -224,13 +224,13 @@ class _Trial(NamedTuple):
         run = partial(varied_impacts, self.law, self.scene, self.velocity)
         return in_batches(run, {"gaps": self.gaps(left_out)}, lanes)
 
-    def changes(self, left_out: Sequence[Any], whole: Outcomes) -> np.ndarray:
+    def changes(self, left_out: Sequence[Any], reference: Outcomes) -> np.ndarray:
         """Changes (r, n) of v+ from that of the whole scene; NaN where the law fails."""
-        return self.run(left_out).where_usable().velocity - whole.velocity[0]
+        return self.run(left_out).where_usable().velocity - reference.velocity[0]
 
 
 def _simplest_friction(
-    trial: _Trial, whole: Outcomes, tolerance: float
+    trial: _Trial, reference: Outcomes, tolerance: float
 ) -> tuple[dict[str, float], _Trial]:
     """Errors of v+ by way to treat friction, and the simplest way that is within tolerance.
 
@@ -242,11 +242,11 @@ def _simplest_friction(
     simpler: Any = replace(law, friction=None)  # type: ignore[call-arg]
     ways = {"none": trial._replace(law=simpler, scene=_with_tangents(scene, None))}
     if scene.tangents.shape[1] == 2 * scene.contacts:
-        along = _with_tangents(scene, _tangents_along_impulses(scene, whole))
+        along = _with_tangents(scene, _tangents_along_impulses(scene, reference))
         ways["one direction"] = trial._replace(scene=along)
     errors, chosen = {}, None
     for name, way in ways.items():
-        errors[name] = float(trial.norm(way.changes([()], whole))[0])
+        errors[name] = float(trial.norm(way.changes([()], reference))[0])
         if chosen is None and errors[name] <= tolerance:
             chosen = way
     return errors, chosen or trial
@@ -257,14 +257,14 @@ def _with_tangents(scene: Scene, tangents: jax.Array | None) -> Scene:
     return eqx.tree_at(lambda tree: tree.tangents, scene, tangents)
 
 
-def _tangents_along_impulses(scene: Scene, whole: Outcomes) -> jax.Array:
+def _tangents_along_impulses(scene: Scene, reference: Outcomes) -> jax.Array:
     """One tangent (n, m) for each contact in space, along its tangential impulse.
 
     Equation: `T_j d_j`, T_j (n, 2) the tangents of contact j, `d_j = p_t,j / |p_t,j|` (2,), the
     first tangent where p_t,j = 0.
     """
     m = scene.contacts
-    impulse = whole.tangential[0].reshape(m, 2)
+    impulse = reference.tangential[0].reshape(m, 2)
     size = np.linalg.norm(impulse, axis=1, keepdims=True)
     direction = np.where(size > 0, impulse / np.where(size > 0, size, 1.0), [[1.0, 0.0]])
     tangents = np.asarray(scene.tangents).reshape(-1, m, 2)
@@ -279,15 +279,15 @@ def _effect_of_each_contact(trial: _Trial, runs: int) -> tuple[np.ndarray, np.nd
     contact without impulse, and NaN beyond the first `runs` contacts with the largest
     `p_j sqrt(W_jj)`.
     """
-    whole, norm = trial.run([()]), trial.norm
-    p = np.abs(whole.impulse[0])
+    reference, norm = trial.run([()]), trial.norm
+    p = np.abs(reference.impulse[0])
     working = np.flatnonzero(p)
     weight = p * np.sqrt(np.asarray(diagonal(delassus_matrix(trial.scene))))
     largest = working[np.argsort(-weight[working], kind="stable")][:runs]
     errors, changes = np.zeros(len(p)), np.zeros(len(p))
     errors[working] = changes[working] = np.nan
     if len(largest):
-        change = trial.changes([(j,) for j in largest], whole)
+        change = trial.changes([(j,) for j in largest], reference)
         errors[largest] = norm(change)
         changes[largest] = np.abs(change[:, norm.watched]).max(axis=1)
     return working, errors, changes
@@ -295,7 +295,7 @@ def _effect_of_each_contact(trial: _Trial, runs: int) -> tuple[np.ndarray, np.nd
 
 def _sufficient_contacts(
     trial: _Trial,
-    whole: Outcomes,
+    reference: Outcomes,
     working: np.ndarray,
     errors: np.ndarray,
     tolerance: float,
@@ -316,7 +316,7 @@ def _sufficient_contacts(
         # numbers of waiting contacts to leave out, all from 0 to `last` if `runs` allows it
         counts = np.unique(np.linspace(0, last, min(runs, last) + 1, dtype=int))
         sets = [left_out + waiting[:count] for count in counts]
-        error = trial.norm(trial.changes(sets, whole))
+        error = trial.norm(trial.changes(sets, reference))
         suffice = np.flatnonzero(error <= tolerance)
         best = int(suffice[-1]) if len(suffice) else 0
         left_out, left = sets[best], waiting[counts[best] :]

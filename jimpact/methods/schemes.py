@@ -23,7 +23,7 @@ is touched for the first time has a closed form. It has no time, so the duration
 import dataclasses
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -69,8 +69,8 @@ class Scaled(NamedTuple):
     dynamics: Dynamics
     happens: jax.Array
 
-    def solution(self, p: Any, t: Any, evaluations: Any, code: Any, side: Any) -> Solution:
-        """Solution in SI units of dimensionless p (m,), duration t (), `side` p_t (t,).
+    def solution(self, p: Any, t: Any, evaluations: Any, code: Any, p_t: Any) -> Solution:
+        """Solution in SI units of dimensionless p (m,), duration t (), p_t (t,).
 
         Impulses are 0 if nothing happens; the status is `not_finite` if an impulse is not finite.
         """
@@ -78,7 +78,7 @@ class Scaled(NamedTuple):
         impulse = jnp.where(self.happens, p * units.momentum, 0.0)
         finite = jnp.all(jnp.isfinite(impulse))
         if self.dynamics.problem.tangential is not None:
-            tangential = jnp.where(self.happens, side * per_tangent(units.momentum, side), 0.0)
+            tangential = jnp.where(self.happens, p_t * per_tangent(units.momentum, p_t), 0.0)
             finite = finite & jnp.all(jnp.isfinite(tangential))
         code = jnp.where(self.happens, code, CODE["ok"])
         return Solution(
@@ -121,7 +121,7 @@ def time_scale(law: LZB, scene: Scene, velocity: Any) -> jax.Array:
 class Field(NamedTuple):
     """Right-hand sides of the dimensionless flow in time (module docstring); JAX or NumPy arrays.
 
-    In its methods x (m,) are indentations, p (m,) and `side` p_t (t,) impulses.
+    In its methods x (m,) are indentations, p (m,) and p_t (t,) impulses.
     """
 
     x: Any  # indentations (m,) before the impact
@@ -140,9 +140,9 @@ class Field(NamedTuple):
         """Indentations x (m,) and impulses p (m,) and p_t (t,), the impulses 0."""
         return self.x, 0.0 * self.gamma, 0.0 * self.slip
 
-    def gap_velocity(self, p: Any, side: Any) -> Any:
+    def gap_velocity(self, p: Any, p_t: Any) -> Any:
         """`gamma = gamma- + G p + K_nt p_t` (m,)."""
-        return self.gamma + self.coupling @ p + self.cross @ side
+        return self.gamma + self.coupling @ p + self.cross @ p_t
 
     def closing(self, now: Any) -> Any:
         """`x' = -omega c gamma` (m,) at gap velocities `now`; c = 1, or 1/e^2 where they open."""
@@ -155,26 +155,26 @@ class Field(NamedTuple):
             return (eta + 1) / 2 * self.omega * np.maximum(x, 0.0) ** eta
         return (jnp.asarray(self.exponent, x.dtype) + 1) / 2 * self.omega * power(x, self.exponent)
 
-    def drag(self, force: Any, p: Any, side: Any, slow: Any) -> Any:
+    def drag(self, force: Any, p: Any, p_t: Any, slow: Any) -> Any:
         """`p_t' = -mu F u / sqrt(|u|^2 + slow^2)` (t,) of normal forces F (m,).
 
         `u = u- + K_tn p + K_tt p_t`; `slow` (m,) or () is the slip that regularizes it.
         """
-        u = (self.slip + self.cross.T @ p + self.tangent @ side).reshape(len(force), -1)
+        u = (self.slip + self.cross.T @ p + self.tangent @ p_t).reshape(len(force), -1)
         square = (u**2).sum(axis=1) + slow**2
         moves = square > 0
         drag = self.friction * force / _where(moves, square, 1.0) ** 0.5
         return -(_where(moves, drag, 0.0)[:, None] * u).ravel()
 
-    def rates(self, x: Any, p: Any, side: Any, slow: Any) -> tuple[Any, Any, Any]:
+    def rates(self, x: Any, p: Any, p_t: Any, slow: Any) -> tuple[Any, Any, Any]:
         """(x', p', p_t'); an open contact stays at its x <= 0, as solvers cannot clamp."""
-        closing, force = self.closing(self.gap_velocity(p, side)), self.force(x)
+        closing, force = self.closing(self.gap_velocity(p, p_t)), self.force(x)
         opened = (x <= 0) & (closing < 0)
-        return _where(opened, 0.0, closing), force, self.drag(force, p, side, slow)
+        return _where(opened, 0.0, closing), force, self.drag(force, p, p_t, slow)
 
-    def at_work(self, x: Any, p: Any, side: Any) -> Any:
+    def at_work(self, x: Any, p: Any, p_t: Any) -> Any:
         """`max(x_j, -gamma_j)` (): positive while a contact is loaded or approaches."""
-        return (-self.gap_velocity(p, side)).max().clip(x.max())
+        return (-self.gap_velocity(p, p_t)).max().clip(x.max())
 
 
 def _where(condition: Any, yes: Any, no: Any) -> Any:
@@ -218,19 +218,19 @@ def aligned(law: LZB, scene: Scene, velocity: Any, setting: Any) -> Solution:
     problem = scaled(law, scene, velocity, setting)
     dynamics = problem.dynamics._replace(method="time")
     program, leaves = dynamics.program(), dynamics.columns()[0]
-    p, side, _, code, passes = evaluate(program, leaves)
+    p, p_t, _, code, passes = evaluate(program, leaves)
     _, _, t, _, _ = evaluate(dataclasses.replace(program, with_end_time=True), leaves)
     evaluations = (STAGES + 1) * passes[0, 0]  # of all passes, rejected ones included
-    return problem.solution(p[:, 0], t[0, 0], evaluations, code[0, 0], side[:, 0])
+    return problem.solution(p[:, 0], t[0, 0], evaluations, code[0, 0], p_t[:, 0])
 
 
 def implicit(law: LZB, scene: Scene, velocity: Any, setting: Any) -> Solution:
     """The law's method 'implicit', without events; `setting` is the rtol."""
     problem = scaled(law, scene, velocity, setting)
     dynamics = problem.dynamics._replace(method="implicit")
-    p, side, t, code, passes = evaluate(dynamics.program(), dynamics.columns()[0])
+    p, p_t, t, code, passes = evaluate(dynamics.program(), dynamics.columns()[0])
     forces = _FORCES_A_STEP * passes[0, 0]
-    return problem.solution(p[:, 0], t[0, 0], forces, code[0, 0], side[:, 0])
+    return problem.solution(p[:, 0], t[0, 0], forces, code[0, 0], p_t[:, 0])
 
 
 # ---------------------------------------------------------------------------- fixed steps
@@ -241,7 +241,7 @@ class Walk(NamedTuple):
 
     x: jax.Array  # indentations (m,)
     p: jax.Array  # normal impulses (m,)
-    side: jax.Array  # tangential impulses p_t (t,)
+    p_t: jax.Array  # tangential impulses (t,)
     gamma: jax.Array  # gap velocities (m,)
     force: jax.Array  # contact forces (m,)
     steps: jax.Array  # steps taken ()
@@ -257,14 +257,19 @@ class StepEnd(NamedTuple):
 
     x: jax.Array
     p: jax.Array
-    side: jax.Array
+    p_t: jax.Array
     force: jax.Array
 
 
 Step = Callable[[Field, jax.Array, Walk], StepEnd]  # of the field, the step size h, the state
 
 
-def until_over(advance: Callable[[Any], Any], walk: Any, most: int) -> tuple[Any, jax.Array]:
+State = TypeVar("State", Walk, "ImpulseWalk")
+
+
+def until_over(
+    advance: Callable[[State], State], walk: State, most: int
+) -> tuple[State, jax.Array]:
     """Last state of an integration that advances while it is `at_work`, and its status.
 
     `walk` is the first state, a `Walk` or `ImpulseWalk`; after `most` steps the status is
@@ -285,14 +290,14 @@ def in_time(step: Step, stages: int) -> Solve:
 
         def advance(walk: Walk) -> Walk:
             """State after one step, indentations clamped at 0."""
-            x, p, side, force = step(field, h, walk)
-            gamma = field.gap_velocity(p, side)
-            return Walk(jnp.maximum(x, 0.0), p, side, gamma, force, walk.steps + 1)
+            x, p, p_t, force = step(field, h, walk)
+            gamma = field.gap_velocity(p, p_t)
+            return Walk(jnp.maximum(x, 0.0), p, p_t, gamma, force, walk.steps + 1)
 
         first = Walk(*field.start, field.gamma, field.force(field.x), jnp.zeros((), jnp.int32))
         end, code = until_over(advance, first, problem.dynamics.max_steps)
         time = h * end.steps.astype(h.dtype)
-        return problem.solution(end.p, time, stages * end.steps, code, end.side)
+        return problem.solution(end.p, time, stages * end.steps, code, end.p_t)
 
     return solve
 
@@ -303,10 +308,10 @@ def rk4(field: Field, h: jax.Array, walk: Walk) -> StepEnd:
     rates = total = jax.tree.map(jnp.zeros_like, start)
     for node, weight in ((0.0, 1 / 6), (0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6)):
         x, p = (a + node * h * rate for a, rate in zip(start, rates))
-        rates = field.closing(field.gap_velocity(p, walk.side)), field.force(x)
+        rates = field.closing(field.gap_velocity(p, walk.p_t)), field.force(x)
         total = total[0] + weight * h * rates[0], total[1] + weight * h * rates[1]
     # p_t and the force at the end are not needed by further steps
-    return StepEnd(walk.x + total[0], walk.p + total[1], walk.side, walk.force)
+    return StepEnd(walk.x + total[0], walk.p + total[1], walk.p_t, walk.force)
 
 
 def verlet(field: Field, h: jax.Array, walk: Walk) -> StepEnd:
@@ -318,17 +323,17 @@ def verlet(field: Field, h: jax.Array, walk: Walk) -> StepEnd:
     """
     stiffest = jnp.max(jnp.sum(jnp.abs(field.tangent), axis=1), initial=0.0)
 
-    def dragged(force: jax.Array, p: jax.Array, side: jax.Array) -> jax.Array:
+    def dragged(force: jax.Array, p: jax.Array, p_t: jax.Array) -> jax.Array:
         """Tangential impulses (t,) after friction has acted for half a step."""
         slow = field.friction * force * 0.5 * h * stiffest
-        return side + 0.5 * h * field.drag(force, p, side, slow)
+        return p_t + 0.5 * h * field.drag(force, p, p_t, slow)
 
     p = walk.p + 0.5 * h * walk.force
-    side = dragged(walk.force, p, walk.side)
-    x = jnp.maximum(walk.x + h * field.closing(field.gap_velocity(p, side)), 0.0)
+    p_t = dragged(walk.force, p, walk.p_t)
+    x = jnp.maximum(walk.x + h * field.closing(field.gap_velocity(p, p_t)), 0.0)
     force = field.force(x)
     p = p + 0.5 * h * force
-    return StepEnd(x, p, dragged(force, p, side), force)
+    return StepEnd(x, p, dragged(force, p, p_t), force)
 
 
 # ------------------------------------------------------------- steps in impulse (published)
@@ -484,13 +489,13 @@ def by_scipy(name: str) -> Solve:
             count, reached = count + 1, (t, y)
             if count > most:
                 raise _GaveUpError
-            x, p, side = np.split(y, parts)
-            return np.concatenate(field.rates(x, p, side, rtol))
+            x, p, p_t = np.split(y, parts)
+            return np.concatenate(field.rates(x, p, p_t, rtol))
 
         def at_work(_: float, y: np.ndarray) -> float:
             """Event function `max(x, -gamma) - rtol`: positive while the impact lasts."""
-            x, p, side = np.split(y, parts)
-            return field.at_work(x, p, side) - rtol
+            x, p, p_t = np.split(y, parts)
+            return field.at_work(x, p, p_t) - rtol
 
         at_work.terminal, at_work.direction = True, -1.0  # type: ignore[attr-defined]
         options = {"method": name, "rtol": rtol, "atol": rtol, "events": at_work}
@@ -501,9 +506,9 @@ def by_scipy(name: str) -> Solve:
         else:
             ended, reached = result.status == 1, (float(result.t[-1]), result.y[:, -1])
         time, y = reached
-        _, p, side = (jnp.asarray(x, traced.gamma.dtype) for x in np.split(y, parts))
+        _, p, p_t = (jnp.asarray(x, traced.gamma.dtype) for x in np.split(y, parts))
         code = CODE["ok" if ended else "max_steps"]
-        return problem.solution(p, jnp.asarray(time), count, code, side)
+        return problem.solution(p, jnp.asarray(time), count, code, p_t)
 
     return solve
 

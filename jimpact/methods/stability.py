@@ -243,22 +243,22 @@ def stability_map(
     samples, max_steps = as_whole("samples", samples, 0), as_whole("max_steps", max_steps, 1)
     if not jnp.zeros(()).dtype == jnp.float64:
         raise ValueError("A stability map needs double precision: enable jax_enable_x64.")
-    place = _place(scene, velocity)
-    chosen = _methods(methods, place)
-    values = _axis_values(axes, as_whole("resolution", resolution, 2), place.axes)
+    setup = _checked_setup(scene, velocity)
+    chosen = _methods(methods, setup)
+    values = _axis_values(axes, as_whole("resolution", resolution, 2), setup.axes)
     start = {name: axis.base for name, axis in _AXES.items()}
-    start |= {name: float(x) for name, x in _checked("base", base or {}, place.axes).items()}
+    start |= {name: float(x) for name, x in _checked("base", base or {}, setup.axes).items()}
     axis_sets: list[tuple[str, ...]] = [(name,) for name in values]
     if slices == "pairs":
         axis_sets += list(combinations(values, 2))
     parts = [_slice_points(start, values, names) for names in axis_sets]
     sampled = _sample_points(start, values, samples, seed)
     points = np.concatenate([*(part.reshape(-1, len(AXES)) for part in parts), sampled])
-    runners = cache(partial(runner, max_steps, place))
+    runners = cache(partial(runner, max_steps, setup))
     total = len(points) * (len(chosen) + 1)
     with counting_bar(total, "impacts", progress) as advance:
-        exact, confirmation = references(points, place, runners, advance)
-        classes = {m.name: partial(classes_of, m, place, exact, runners, advance) for m in chosen}
+        exact, confirmation = references(points, setup, runners, advance)
+        classes = {m.name: partial(classes_of, m, setup, exact, runners, advance) for m in chosen}
         classified, left_out = at_points(classes, points)
     ends = np.cumsum([part[..., 0].size for part in parts])  # of slices among all points
     by_slice, by_sample = {}, {}
@@ -272,7 +272,7 @@ def stability_map(
     return StabilityMap(
         methods=tuple(by_slice),
         axes=values,
-        base={name: start[name] for name in place.axes},
+        base={name: start[name] for name in setup.axes},
         slices=by_slice,
         samples=sampled,
         sampled=by_sample,
@@ -282,7 +282,7 @@ def stability_map(
     )
 
 
-class Place(NamedTuple):
+class Setup(NamedTuple):
     """Scene of all points at v- (n,), the largest |v-| 1; None: chains whose first ball strikes.
 
     A point is a row (7,) of numbers in the order of `AXES`.
@@ -331,28 +331,28 @@ class Place(NamedTuple):
             yield np.flatnonzero(balls == n), int(n)
 
 
-def _place(scene: Scene | None, velocity: Any) -> Place:
+def _checked_setup(scene: Scene | None, velocity: Any) -> Setup:
     """The scene with its v-, scaled to 1 as the largest and checked; without a scene, chains."""
     if scene is None:
         if velocity is not None:
             raise ValueError("Argument `velocity` must be None without a `scene`.")
-        return Place()
+        return Setup()
     if velocity is None:
         raise ValueError("Argument `velocity` must be given with a `scene`, but is None.")
     v = as_velocity(scene, velocity, finite=True)
     if not bool(LZB(1.0).contact(scene, v).happens):
         raise ValueError("Argument `velocity` must let a closed contact approach.")
-    return Place(scene, v / jnp.max(jnp.abs(v)))
+    return Setup(scene, v / jnp.max(jnp.abs(v)))
 
 
-def _methods(methods: Sequence[str | Contender] | None, place: Place) -> list[Contender]:
+def _methods(methods: Sequence[str | Contender] | None, setup: Setup) -> list[Contender]:
     """Contenders to map, by name or a user's own; None: the default ones, with friction if needed.
 
     Only those that JAX can batch are known.
     """
-    able = [m for m in CONTENDERS.values() if m.jax and (m.friction or not place.friction)]
+    able = [m for m in CONTENDERS.values() if m.jax and (m.friction or not setup.friction)]
     known = {m.name: m for m in able}
-    defaults = FRICTION_NAMES if place.friction else NAMES
+    defaults = FRICTION_NAMES if setup.friction else NAMES
     return contenders_of("methods", defaults if methods is None else methods, known)
 
 
@@ -368,7 +368,7 @@ def _checked(argument: str, values: Mapping[str, Any], names: tuple[str, ...]) -
     return values
 
 
-def default_axes(r: int, names: tuple[str, ...] = Place().axes) -> dict[str, np.ndarray]:
+def default_axes(r: int, names: tuple[str, ...] = Setup().axes) -> dict[str, np.ndarray]:
     """`r` values of each axis by name (numbers of balls: six, or three below `_FEW`)."""
     balls = np.array(BALLS if r >= _FEW else _FEW_BALLS, float)
     return {name: balls if name == "balls" else _AXES[name].values(r) for name in names}
@@ -406,13 +406,13 @@ def _sample_points(
     points = np.tile([base[name] for name in AXES], (samples, 1))
     unit = qmc.LatinHypercube(len(axes), rng=np.random.default_rng(seed)).random(samples)
     for column, (name, values) in zip(unit.T, axes.items()):
-        place = column * (len(values) - 1)
+        index = column * (len(values) - 1)
         if name == "balls":
-            points[:, AXES.index(name)] = values[np.round(place).astype(int)]
+            points[:, AXES.index(name)] = values[np.round(index).astype(int)]
             continue
         powers = bool((values > 0).all()) and name != "exponent"
         scaled = np.log(values) if powers else values
-        between = np.interp(place, np.arange(len(values)), scaled)
+        between = np.interp(index, np.arange(len(values)), scaled)
         points[:, AXES.index(name)] = np.exp(between) if powers else between
     return points
 
@@ -463,7 +463,7 @@ Runner = Callable[[np.ndarray, Any], tuple[Outcomes, np.ndarray]]
 Runners = Callable[[Contender, int], Runner]
 
 
-def runner(max_steps: int, place: Place, method: Contender, balls: int) -> Runner:
+def runner(max_steps: int, setup: Setup, method: Contender, balls: int) -> Runner:
     """Function of points (L, 7) and settings that runs one method on chains of N balls or a scene.
 
     It returns outcomes (L,) and gains of energy over T- (L,).
@@ -471,7 +471,7 @@ def runner(max_steps: int, place: Place, method: Contender, balls: int) -> Runne
 
     def one(point: jax.Array, setting: jax.Array) -> tuple[Outcomes, jax.Array]:
         """Outcome at one point (7,), and the energy gained over T-."""
-        law, scene, v = place.impact_at(point, balls, max_steps)
+        law, scene, v = setup.impact_at(point, balls, max_steps)
         out, compared = solved(method, law, scene, v, setting)
         return compared, audit(scene, v, out).energy_gain
 
@@ -489,14 +489,14 @@ def runner(max_steps: int, place: Place, method: Contender, balls: int) -> Runne
 
 
 def references(
-    points: np.ndarray, place: Place, runners: Runners, advance: Callable[[int], None]
+    points: np.ndarray, setup: Setup, runners: Runners, advance: Callable[[int], None]
 ) -> tuple[np.ndarray, Confirmation]:
     """Reference v+ of the points (P, largest n), NaN if no run ends, and its check by scipy.
 
     Runs of 'time' at `REFERENCE_RTOL`.
     """
-    groups = list(place.groups(points))
-    exact = np.full((len(points), max((place.size(n) for _, n in groups), default=0)), np.nan)
+    groups = list(setup.groups(points))
+    exact = np.full((len(points), max((setup.size(n) for _, n in groups), default=0)), np.nan)
     for at, n in groups:
         # points that differ in their setting alone (column 0) share a run
         unique, back = np.unique(points[at, 1:], axis=0, return_inverse=True)
@@ -504,28 +504,28 @@ def references(
         out, _ = runners(CONTENDERS["time"], n)(rows, REFERENCE_RTOL)
         ended = (out.code == CODE["ok"]) | (out.code == CODE["plastic_limit"])
         velocity = np.where(ended[:, None], out.velocity, np.nan)[np.ravel(back)]
-        exact[at, : place.size(n)] = velocity
+        exact[at, : setup.size(n)] = velocity
         advance(len(at))
-    return exact, _confirm(points, place, exact)
+    return exact, _confirm(points, setup, exact)
 
 
-def _confirm(points: np.ndarray, place: Place, exact: np.ndarray) -> Confirmation:
+def _confirm(points: np.ndarray, setup: Setup, exact: np.ndarray) -> Confirmation:
     """Differences of the reference v+ `exact` from scipy's, at a few points that it solves soon.
 
     Up to `CHECKED` of them, spread over the points (P, 7).
     """
-    quick = np.array([_is_quick(point, place) for point in points])
+    quick = np.array([_is_quick(point, setup) for point in points])
     candidates = np.flatnonzero(np.isfinite(exact[:, 0]) & quick)
     _, first = np.unique(points[candidates, 1:], axis=0, return_index=True)
     candidates = candidates[np.sort(first)]
     stride = max(1, -(-len(candidates) // CHECKED))
     name, rtol, within = "scipy_dop853", CHECK_RTOL, CONFIRMED
-    if place.friction:
+    if setup.friction:
         name, rtol, within = "scipy_radau", FRICTION_RTOL, FRICTION_CONFIRMED
     differences = []
     for i in candidates[::stride]:
         balls = int(points[i, AXES.index("balls")])
-        law, scene, v = place.impact_at(list(map(float, points[i])), balls, CHECK_STEPS)
+        law, scene, v = setup.impact_at(list(map(float, points[i])), balls, CHECK_STEPS)
         _, out = solved(CONTENDERS[name], law, scene, v, rtol)
         differences.append(float(relative_error(out.velocity, exact[i, : len(v)])))
     agree = sum(x <= within for x in differences)
@@ -533,7 +533,7 @@ def _confirm(points: np.ndarray, place: Place, exact: np.ndarray) -> Confirmatio
     return Confirmation(len(points), len(differences), agree, largest, within)
 
 
-def _is_quick(point: np.ndarray, place: Place) -> bool:
+def _is_quick(point: np.ndarray, setup: Setup) -> bool:
     """True for a point (7,) that scipy solves soon, and does not end too early (small e).
 
     Equation: `sqrt(2) eta / e spread < QUICK_RATIO`: the largest frequency of the linearized flow
@@ -541,7 +541,7 @@ def _is_quick(point: np.ndarray, place: Place) -> bool:
     """
     _, kappa, eta, e, mass_ratio, balls, _ = map(float, point)
     spread = max(kappa, 1 / kappa) ** (1 / (eta + 1)) * max(mass_ratio, 1 / mass_ratio) ** 0.5
-    few = (balls if place.scene is None else place.scene.contacts) <= QUICK_BALLS
+    few = (balls if setup.scene is None else setup.scene.contacts) <= QUICK_BALLS
     return few and e >= RECLOSING and np.sqrt(2) * eta / e * spread < QUICK_RATIO
 
 
@@ -550,7 +550,7 @@ def _is_quick(point: np.ndarray, place: Place) -> bool:
 
 def classes_of(
     method: Contender,
-    place: Place,
+    setup: Setup,
     exact: np.ndarray,
     runners: Runners,
     advance: Callable[[int], None],
@@ -567,8 +567,8 @@ def classes_of(
     fixed = np.full(len(points), FIXED_STEP_RIGHT)
     allowed = HONEST * setting if method.setting == "rtol" else fixed
     e = points[:, AXES.index("restitution")]
-    for group, n in place.groups(points):
-        run, size = runners(method, n), place.size(n)
+    for group, n in setup.groups(points):
+        run, size = runners(method, n), setup.size(n)
         at = group[e[group] > 0] if method.divides else group
         if len(at):
             out, gain = run(points[at], setting[at])

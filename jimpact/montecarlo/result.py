@@ -1,4 +1,4 @@
-"""What `monte_carlo` returns, and its report in words."""
+"""Result of `monte_carlo`, and its report in words."""
 
 from dataclasses import dataclass, field
 from typing import Any

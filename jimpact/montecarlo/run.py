@@ -234,8 +234,8 @@ def _mapping_of(executor: Any, run: Run) -> Iterator[tuple[Callable[..., Any], W
             yield pool.map, lambda task: run(task, devices[task.number % len(devices)])
     elif isinstance(executor, str):
         distributed = needed("distributed", "pip install 'jimpact[distributed]'")
-        here = {"threads_per_worker": 1, "dashboard_address": None}  # processes on this machine
-        options = here if executor == "dask" else {"address": executor}
+        local = {"threads_per_worker": 1, "dashboard_address": None}  # processes on this machine
+        options = local if executor == "dask" else {"address": executor}
         with distributed.Client(**options) as client:
             yield client.map, _picklable(run)
     else:

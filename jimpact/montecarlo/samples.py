@@ -1,4 +1,4 @@
-"""What determines the samples of a run: checked, in one precision, named by a hash.
+"""Inputs that determine the samples of a run: checked, in one precision, named by a hash.
 
 A chunk is always computed at its full size, on one device, by the same program; the statistics are
 numpy's, in float64. So they depend neither on the executor nor on the number of devices. (A program
@@ -100,13 +100,13 @@ def impacts(
         """v+ (n,) and status () of one sample with v- `velocity` (n,) and gaps (m,)."""
         code = jnp.where(within_domains(law), 0, BAD_LAW)
         code = jnp.where(jnp.all(jnp.isfinite(velocity)), code, BAD_VELOCITY)
-        place = scene
+        one_scene = scene
         if gaps is not None:
             fine = jnp.isfinite(gaps) & (rounded_gaps(gaps) >= 0)
             code = jnp.where(jnp.all(fine), code, BAD_GAP)
-            place = with_gaps(scene, jnp.where(fine, gaps, 0))
+            one_scene = with_gaps(scene, jnp.where(fine, gaps, 0))
         velocity = jnp.where(code == 0, velocity, 0)  # at rest: over at once
-        out = impact(law, place, velocity, rtol=rtol)
+        out = impact(law, one_scene, velocity, rtol=rtol)
         return out.velocity, jnp.where(code == 0, out.status, code.astype(jnp.int32))
 
     axes = tuple(eqx.if_array(0) if random[name] else None for name in vars(drawn))

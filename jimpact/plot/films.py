@@ -112,7 +112,7 @@ def animation(
 
 
 def readable_speed(duration: float) -> float:
-    """Speed of a film: 1, or the largest of .5, .2, .1, .. at which it lasts `_SHORTEST`.
+    """Speed of a film: 1, or the largest of .5, .2, .1, .. at which it lasts 2 s (`_SHORTEST`).
 
     `duration` [s] is that of the motion, `duration / speed` that of the film.
 

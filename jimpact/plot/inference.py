@@ -127,22 +127,24 @@ def residuals(fit: Fit) -> Figure:
     """
     problem = fit.problem
     measured = np.asarray(problem.measured, float)
-    here = ~np.isnan(measured)
+    is_measured = ~np.isnan(measured)
     sigma = fit.noise if problem.sigma is None else np.asarray(problem.sigma, float)
-    noise = np.broadcast_to(sigma, measured.shape)[here]
+    noise = np.broadcast_to(sigma, measured.shape)[is_measured]
     known = np.isfinite(noise).all() and (noise > 0).all()
-    scaled = fit.residual[here] / (noise if known else 1.0)
+    scaled = fit.residual[is_measured] / (noise if known else 1.0)
     unit = "standard errors" if known else "as measured"
     figure, (first, second, third) = new_panels(3, 3.0)
     units = [] if fit.experiments is None else dict.fromkeys(fit.experiments.units)
     values = f" [{', '.join(units)}]" if units else ""
     style: dict[str, Any] = {"ls": "none", "marker": "o", "mfc": "none", "ms": 4}
-    first.axline((float(measured[here].mean()),) * 2, slope=1.0, color=GREY, lw=0.8)
-    first.plot(fit.predicted[here], measured[here], color=COLOURS[0], **style)
+    first.axline((float(measured[is_measured].mean()),) * 2, slope=1.0, color=GREY, lw=0.8)
+    first.plot(fit.predicted[is_measured], measured[is_measured], color=COLOURS[0], **style)
     first.set(xlabel=f"fitted{values}", ylabel=f"measured{values}")
     over, label = _residual_axis(fit)
     second.axhline(0, color=GREY, lw=0.8)
-    second.plot(np.broadcast_to(over, here.shape)[here], scaled, color=COLOURS[0], **style)
+    second.plot(
+        np.broadcast_to(over, is_measured.shape)[is_measured], scaled, color=COLOURS[0], **style
+    )
     second.set(xlabel=label, ylabel=f"residual [{unit}]")
     ordered = np.sort(scaled)
     normal = ndtri((np.arange(len(ordered)) + 0.5) / len(ordered))
@@ -231,7 +233,10 @@ def _draws_of(fit: Fit, draws: Any) -> np.ndarray:
 
 
 def _draw_density(axes: Axes, fit: Fit, i: int, values: np.ndarray | None) -> None:
-    """Draw the normal density of parameter i from value and standard error; draws: a histogram."""
+    """Draw the normal density of parameter i from value and standard error; draws: a histogram.
+
+    `values` are draws (N, P) of all parameters, if any.
+    """
     z, error = np.linspace(-_WIDE, _WIDE, 121), fit.standard_error[i]
     density = np.exp(-0.5 * z**2) / (error * np.sqrt(2 * np.pi))
     if values is not None:

@@ -401,13 +401,13 @@ def _range(values: np.ndarray) -> float:
 
 def draw_body(axes: Axes, body: Body, q: np.ndarray) -> None:
     """Draw a body at its configuration q, and the planes that it stands on."""
-    point = POINT * (np.ptp(q) or 1.0)
+    point = POINT * (np.ptp(q) or 1.0)  # radius of a point mass [m]
     curves, floors = body.outlines(q, point), [plane_of(*floor) for floor in body.floors]
     set_limits(axes, [curves], np.zeros((1, 2)), floors)
     for points, colour in zip(curves, colours_of(body, q, point), strict=True):
         axes.plot(*points.T, color=colour)
     for angle, offset in body.floors:
-        foot = (-offset * np.sin(angle), offset * np.cos(angle))
+        foot = (-offset * np.sin(angle), offset * np.cos(angle))  # nearest to the origin
         axes.axline(foot, slope=np.tan(angle), color=GREY, lw=2)
 
 

@@ -1,4 +1,4 @@
-"""What the pictures share: the style sheet, figures of panels, legends, logarithmic axes."""
+"""Parts of all pictures: the style sheet, figures of panels, legends, logarithmic axes."""
 
 import functools
 import inspect

@@ -1,4 +1,4 @@
-"""How kinetic energy is kept and how evenly it is spread after an impact."""
+"""Kinetic energy after an impact: the part that is kept, and its spread over the coordinates."""
 
 from typing import Any
 

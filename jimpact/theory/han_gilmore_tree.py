@@ -252,7 +252,7 @@ def _impact(problem: _Problem, node: _Node, at: np.ndarray, slides: np.ndarray) 
             block[count + k], target[count + k] = 0.0, 0.0
             block[count + k, [k, count + k]] = mu[at[k]] * slides[k], 1.0
     solved = np.linalg.lstsq(block, target, rcond=SINGULAR)[0]
-    pushes, sides = solved[:count], solved[count:]
+    pushes, p_t = solved[:count], solved[count:]
     if np.abs(block @ solved - target).max() > ZERO or np.any(pushes <= ZERO):
         return None
     p = np.zeros_like(node.p)
@@ -260,7 +260,7 @@ def _impact(problem: _Problem, node: _Node, at: np.ndarray, slides: np.ndarray) 
     state = node.state + problem.matrix @ p
     state[at] = -problem.restitution[at] * node.state[at]
     if mu is not None:
-        if np.any((slides == 0) & (np.abs(sides) > mu[at] * pushes + ZERO)):
+        if np.any((slides == 0) & (np.abs(p_t) > mu[at] * pushes + ZERO)):
             return None
         if np.any(slides * state[m + at] < -ZERO):
             return None

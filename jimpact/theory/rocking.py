@@ -168,7 +168,7 @@ class RockingDispersion(eqx.Module):
         back about A; free: both; unresolved: the law failed.
         """
         leaves = np.asarray(self.gap_velocity) > separation_threshold  # last axis: B, A
-        codes = leaves[..., 1] + 2 * leaves[..., 0]
+        codes = leaves[..., 1] + 2 * leaves[..., 0]  # 0 none, 1 A only, 2 B only, 3 both
         unresolved = OUTCOMES.index("unresolved")
         return np.where(np.isnan(np.asarray(self.gap_velocity[..., 0])), unresolved, codes)
 
@@ -444,6 +444,6 @@ def rocking_domain(aspect: Any, sliding: bool = True) -> RockingDomain:
     """
     a = float(as_numbers("aspect", aspect, (), "one block", low=0.0, open_low=True))
     g = (a**2 - 2) / (a**2 + 4) if sliding else float(housner_restitution(a))
-    wide = [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]
+    wide = [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]  # a, b >= 0, a + b <= 1, cut by b = g (1 + a)
     slender = [[0.0, g], [(1 - g) / (1 + g), 2 * g / (1 + g)], [0.0, 1.0]]
     return RockingDomain(a, sliding, g, np.array(wide if g <= 0 else slender))
