@@ -114,7 +114,7 @@ def _impact_of(command: options.ShotCommand) -> tuple[Study, np.ndarray, np.ndar
     the scene of this shot where shots have their own.
     """
     study, shot = impact_study(command.study), command.shot - 1
-    if command.velocity:
+    if command.velocity:  # given: it need not be one of the study's shots
         before = np.asarray(command.velocity, float)
         separates = np.asarray(ji.gap_velocity(study.scene, before)) >= 0
         if separates.all() and "initial_energy" not in study.parameters:
@@ -504,7 +504,7 @@ def simulate(command: options.SimulateCommand, steps: Steps) -> CommandResult:
     steps("motion computed")
     more: dict[Path, Any] = {}
     if command.portrait is not None:
-        which = None if command.coordinate is None else command.coordinate - 1
+        which = None if command.coordinate is None else command.coordinate - 1  # from 0
         more[command.portrait] = ji.plot.phase_portrait(motion, which, title, system=system)
     if command.gif is not None:
         more[command.gif] = partial(

@@ -29,14 +29,14 @@ def begin(kind: str, folder: Path, like: str | None = None) -> list[Path]:
     study = path.read_text(encoding="utf-8")
     texts = {folder / STUDY: templates["head"].format(kind=kind) + "\n" + study}
     tables = tomllib.loads(study)
-    for table, name in FILES.items():
+    for table, name in FILES.items():  # data files are copied under new names
         data = tables.get(table, {}).get("file")
         if data is not None:
             texts[folder / STUDY] = texts[folder / STUDY].replace(data, name)
             texts[folder / name] = (path.parent / data).read_text(encoding="utf-8")
     cells = [templates["setup"], *template["cells"]]
     texts[folder / "study.ipynb"] = _notebook(template["title"], cells)
-    existing = [str(path) for path in texts if path.exists()]
+    existing = [str(path) for path in texts if path.exists()]  # is never replaced
     if existing:
         other = folder.with_name(f"{folder.name}_2")
         raise ValueError(

@@ -199,7 +199,7 @@ def _impact_study(tables: Mapping[str, Any], path: Path, law_name: str | None) -
     scene, body = _scene(tables["scene"])
     law, values, fitted = law_of(tables, law_name, path.parent, scene)
     fittable = free_parameters_of(law)
-    bounce = [name for name in ("restitution", *OF_SPEED) if name in fittable]
+    bounce = [name for name in ("restitution", *OF_SPEED) if name in fittable]  # free by default
     track, experiments = _shots(tables, path, body or scene)
     return Study(
         str(tables.get("title", path.stem)),

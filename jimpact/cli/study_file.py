@@ -265,6 +265,7 @@ def body_of(where: str, table: Any, others: tuple[str, ...] = ()) -> Body:
     name = names.get(str(table["kind"]).lower(), table["kind"])
     check_word(f"`kind` in {where}", name, names.values())
     parameters = inspect.signature(BODIES[name]).parameters
+    # key of the table, with its unit -> argument of the class
     keys = {f"{key}_{_UNITS[key]}" if key in _UNITS else key: key for key in parameters}
     required = tuple(
         x for x, key in keys.items() if parameters[key].default is inspect.Parameter.empty

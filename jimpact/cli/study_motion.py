@@ -163,5 +163,5 @@ def _system(
             f"but is {direction!r}."
         )
     motion = HarmonicBase(**arguments_of(base, BASE))
-    moved = directions[:, names.index(direction), None]
-    return System(body, potential=weight, base=motion, base_directions=moved, friction=friction)
+    column = directions[:, names.index(direction), None]
+    return System(body, potential=weight, base=motion, base_directions=column, friction=friction)

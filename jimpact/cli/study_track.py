@@ -42,7 +42,7 @@ def track_of(table: Mapping[str, Any], study: Path) -> "Track":
     try:
         t, q = ji.tracks.read(study.parent / choice["file"], **_entries(choice, READ))
         unit = choice["unit"]
-        stated = [unit] * q.shape[1] if isinstance(unit, str) else unit
+        stated = [unit] * q.shape[1] if isinstance(unit, str) else unit  # of each column
         units = ["rad" if each in ("rad", "deg") else "m" for each in stated]
         of_poses = "quaternion" in choice
         options = _entries(choice, FOUND)

@@ -197,6 +197,7 @@ def advise(
     check_law(law, scene, v.dtype)
     situation = situation_of(scene, np.asarray(v), law, stiffness is not None)
     mixed = len(np.unique(np.asarray(exponent, float))) > 1
+    # gaps, and contacts with unequal exponents, have no outcome in ratios of stiffness alone
     absolute = bool(situation.gapped.any()) or (mixed and bool(situation.coupled))
     if absolute and stiffness is None:
         raise ValueError(_missing_stiffness(situation))

@@ -440,6 +440,7 @@ def _method_programs(
         return _compiled(compile_time, name, each, k[:rows], case)
 
     batched = batch("batched", timed, len(k))
+    # errors need the duration, times do not: two programs if it takes a run of its own
     complete = batch("errors", solve, case.sample) if durations and apart else batched
     return Programs(
         single=_compiled(compile_time, "single", timed, k[0], case),
@@ -522,7 +523,7 @@ def _errors(case: Case, tried: Outcomes, truth: Outcomes) -> dict[str, float]:
     """
     fastest = float(jnp.max(jnp.abs(case.velocity))) or np.abs(truth.velocity).max()
     before = float(kinetic_energy(case.scene, case.velocity)) or np.abs(truth.energy_change).max()
-    compared = {
+    compared = {  # value, exact value, scale
         "velocity": (tried.velocity, truth.velocity, fastest),
         "impulse": (tried.impulse, truth.impulse, np.abs(truth.impulse).max()),
         "energy": (tried.energy_change, truth.energy_change, before),

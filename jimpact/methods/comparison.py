@@ -175,6 +175,7 @@ def compare(
             "came with it."
         )
     check_kind("laws", laws, Mapping)
+    # the first calls, with compiling, sort out the laws that raise; then all are timed in turns
     first, raised = at_points({n: partial(_first_call, law, scene) for n, law in laws.items()}, v)
     runs = {name: partial(impact, laws[name], scene, v) for name in first}
     each = dict(zip(runs, in_turns(list(runs.values()), _REPEATS)))

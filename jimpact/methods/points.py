@@ -146,6 +146,7 @@ def in_batches(
     for _, part in in_parts(run, [rows], size):
         advance(min(size, count - size * len(parts)))
         parts.append(part)
+    # without the rows that filled up the last batch
     return jax.tree.map(lambda *x: np.concatenate(x)[:count], *parts)
 
 

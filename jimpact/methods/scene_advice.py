@@ -175,10 +175,10 @@ def simplest_scene(
     friction, trial = _simplest_friction(trial, reference, tolerance)
     working, errors, changes = _effect_of_each_contact(trial, runs)
     kept, error = _sufficient_contacts(trial, reference, working, errors, tolerance, runs)
-    taking = scene.closed
+    taking_part = scene.closed
     if law.uses_gaps and scene.gaps is not None:
-        taking = jnp.isfinite(scene.gaps)
-    couples = getattr(trial.law, "friction", None) is not None
+        taking_part = jnp.isfinite(scene.gaps)
+    has_friction = getattr(trial.law, "friction", None) is not None
     gamma = np.asarray(gap_velocity(scene, v))
     return SceneAdvice(
         law=trial.law,
@@ -191,7 +191,7 @@ def simplest_scene(
         impulses=reference.impulse[0],
         errors=errors,
         changes=changes,
-        blocks=blocks_of(trial.scene, gamma, np.flatnonzero(np.asarray(taking)), couples),
+        blocks=blocks_of(trial.scene, gamma, np.flatnonzero(np.asarray(taking_part)), has_friction),
     )
 
 

@@ -96,6 +96,7 @@ def scaled(law: LZB, scene: Scene, velocity: Any, rtol: Any = 1.0) -> Scaled:
     law, scene, v = in_common_dtype(law, scene, v)
     contact = law.contact(scene, v)
     gamma, happens = contact.gap_velocity, contact.happens
+    # any approach will do for the placeholder, if its numbers are finite
     harmless = jnp.where(happens, gamma, -jnp.ones_like(gamma))
     contact = eqx.tree_at(lambda c: c.gap_velocity, contact, harmless)
     return Scaled(law.dynamics(contact, jnp.asarray(rtol, v.dtype)), happens)

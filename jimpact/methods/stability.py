@@ -516,6 +516,7 @@ def _confirm(points: np.ndarray, setup: Setup, exact: np.ndarray) -> Confirmatio
     """
     quick = np.array([_is_quick(point, setup) for point in points])
     candidates = np.flatnonzero(np.isfinite(exact[:, 0]) & quick)
+    # of points that differ in their setting alone (column 0) the first
     _, first = np.unique(points[candidates, 1:], axis=0, return_index=True)
     candidates = candidates[np.sort(first)]
     stride = max(1, -(-len(candidates) // CHECKED))
@@ -569,7 +570,7 @@ def classes_of(
     e = points[:, AXES.index("restitution")]
     for group, n in setup.groups(points):
         run, size = runners(method, n), setup.size(n)
-        at = group[e[group] > 0] if method.divides else group
+        at = group[e[group] > 0] if method.divides else group  # refused at e = 0: flagged
         if len(at):
             out, gain = run(points[at], setting[at])
             errors[at] = relative_error(out.velocity, exact[at, :size])

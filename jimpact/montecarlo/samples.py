@@ -300,6 +300,7 @@ def _checked_sources(sources: Sources, scene: Scene) -> Sources:
             "Argument `gaps` must be given where neither the velocity nor the law is random: all "
             "samples would be the same."
         )
+    # a function of a key is called once, to look at its law
     drawn = law if isinstance(law, Law) else law(jax.random.key(0, impl="threefry2x32"))
     if not isinstance(drawn, Law):
         raise TypeError(f"Argument `law` must give a Law for a key, but gives {drawn!r}.")

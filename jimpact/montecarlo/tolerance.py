@@ -39,6 +39,7 @@ def first_chunk(run: Run, recorded: Tolerance | None) -> Chunk:
     default = open_tolerance(run)
     task = run.task(0, AS_THE_LAW if default is None else Tolerance(default))
     fine = run.outcomes(task)
+    # laws with a tolerance of their own, short runs and raw samples keep that of the law
     if default is None or run.chunks < WORTH_LOOKING or run.keep_samples:
         return run.reduced(task, fine)
     for times in COARSER:
@@ -54,7 +55,7 @@ def first_chunk(run: Run, recorded: Tolerance | None) -> Chunk:
 def open_tolerance(run: Run) -> float | None:
     """The default tolerance of a law that would take another one; None: it has its own, or none."""
     law, scene, velocity = run.sample(0)
-    found: list[Any] = []
+    found: list[Any] = []  # filled while JAX traces `look`: nothing is computed
 
     def look(velocity: jax.Array) -> jax.Array:
         """Enter in `found` the law's accuracy, and if it is the contact's rtol where one is set."""

@@ -323,7 +323,7 @@ def validity_map(result: ValidityMap, tolerance: float = 1e-2, title: str = "") 
     """
     default = "Where the stiffness ratio may be left out"
     figure, (top, bottom) = new_figure(6.8, title or default, 2, 1, sharex=True)
-    for i, eta in enumerate(result.exponents):
+    for i, eta in enumerate(result.exponents):  # a colour an exponent, a line style a law
         top.plot(result.ratios, result.dispersion[i], label=f"LZB, exponent {eta:g}")
         for name, style in _STYLES.items():
             error = np.maximum(result.error(name)[i], _LEAST)

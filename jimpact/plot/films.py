@@ -170,7 +170,7 @@ def _film(
     set_limits(axes, curves, ground, floors)
     lines = [axes.plot([], [], color=colour)[0] for colour in colours]
     planes = [axes.plot([], [], color=GREY, lw=2)[0] for _ in floors]
-    view = np.array([axes.get_xlim(), axes.get_ylim()])
+    view = np.array([axes.get_xlim(), axes.get_ylim()])  # limits of x, of y
 
     def draw(k: int) -> list[Any]:
         """Set lines, planes and title to frame k; returns what has changed."""

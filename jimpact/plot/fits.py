@@ -52,7 +52,7 @@ def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> F
     measured, predicted = _in_rows(fit.problem.measured), _in_rows(fit.predicted)
     shots, bodies = predicted.shape
     dodge = side_by_side(bodies)
-    x = np.arange(shots)[:, None] + dodge[None, :]
+    x = np.arange(shots)[:, None] + dodge[None, :]  # (shots, bodies)
     size = float(np.clip(220 / (shots * bodies), 3, 8))
     speed = "" if data is None else " m/s"
     heading = title or f"{type(fit.law).__name__}, rms {fit.rms:.3g}{speed}"
@@ -61,7 +61,7 @@ def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> F
     units, error = list(dict.fromkeys(each)), _error_bars(fit)
     grid: Any = {"sharex": True, "squeeze": False, "height_ratios": (3, 1.4)}
     figure, panels = new_figure(6.0, heading, 2, len(units), **grid)
-    for (top, bottom), unit in zip(panels.T, units):
+    for (top, bottom), unit in zip(panels.T, units):  # a column of panels for each unit
         members = [i for i, own in enumerate(each) if own == unit]
         for i in members:
             bars = None if error is None else error[:, i]

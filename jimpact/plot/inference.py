@@ -95,7 +95,7 @@ def correlation(fit: Fit) -> Figure:
     image = axes.imshow(finite, vmin=-1, vmax=1, cmap="RdBu_r")
     axes.set_xticks(range(count), fit.names, rotation=90)
     axes.set_yticks(range(count), fit.names)
-    if count <= 8:
+    if count <= 8:  # numbers fit into the cells, white on dark ones
         for i, j in np.argwhere(np.isfinite(fit.correlation)):
             colour = "white" if abs(fit.correlation[i, j]) > 0.6 else "black"
             write(axes, (j, i), f"{fit.correlation[i, j]:.2f}", color=colour)
@@ -142,12 +142,11 @@ def residuals(fit: Fit) -> Figure:
     first.set(xlabel=f"fitted{values}", ylabel=f"measured{values}")
     over, label = _residual_axis(fit)
     second.axhline(0, color=GREY, lw=0.8)
-    second.plot(
-        np.broadcast_to(over, is_measured.shape)[is_measured], scaled, color=COLOURS[0], **style
-    )
+    abscissa = np.broadcast_to(over, is_measured.shape)[is_measured]
+    second.plot(abscissa, scaled, color=COLOURS[0], **style)
     second.set(xlabel=label, ylabel=f"residual [{unit}]")
     ordered = np.sort(scaled)
-    normal = ndtri((np.arange(len(ordered)) + 0.5) / len(ordered))
+    normal = ndtri((np.arange(len(ordered)) + 0.5) / len(ordered))  # expected of normal noise
     third.plot(normal, ordered, color=COLOURS[0], **style)
     third.axline((0.0, 0.0), slope=1.0 if known else float(np.std(scaled)) or 1.0, color=GREY)
     third.set(xlabel="normal quantile [standard errors]", ylabel=f"residual [{unit}]")
@@ -207,7 +206,7 @@ def corner(fit: Fit, draws: Any = None, names: Sequence[str] | None = None) -> F
     figure, grid = new_figure(height, "", count, count, squeeze=False, sharex="col")
     for above in grid[np.triu_indices(count, 1)]:
         above.remove()
-    for k, i in enumerate(shown):
+    for k, i in enumerate(shown):  # densities on the diagonal, pairs below it
         _draw_density(grid[k, k], fit, i, values)
         for axes, j in zip(grid[k, :k], shown):
             _draw_ellipses(axes, fit, j, i, values)

@@ -82,6 +82,7 @@ def motion(
     course = course_of(motion)
     columns = [_by_unit(labels, bodies), _by_unit(rates, bodies)]
     rows = max(map(len, columns)) + 1
+    # left coordinates, right velocities, a row for each unit; in the last row gaps and energy
     figure, panels = new_figure(2.7 * rows + 0.4, title, rows, 2, sharex=True, squeeze=False)
     scales = _scales(labels, motion)
     for j, (units, values) in enumerate(zip(columns, (course.q, course.v), strict=True)):
@@ -98,8 +99,8 @@ def motion(
             _finish_panel(axes, scales.get(unit, 1.0), f"{_FEW} of {count}" if count > _FEW else "")
         for axes in panels[len(units) : -1, j]:
             axes.remove()
-    left_out = _draw_gaps(panels[-1, 0], motion, _shown_contacts(motion, system, bodies, contacts))
-    _finish_panel(panels[-1, 0], scales["m"], left_out)
+    note = _draw_gaps(panels[-1, 0], motion, _shown_contacts(motion, system, bodies, contacts))
+    _finish_panel(panels[-1, 0], scales["m"], note)
     _draw_energies(panels[-1, 1], motion, course, system)
     _finish_panel(panels[-1, 1], float(np.nanmax(np.abs(motion.energy), initial=0.0)) or 1.0)
     for axes in figure.axes:

@@ -98,7 +98,7 @@ def _draw_plane(
     r = frame.radius
     axes.plot(r * np.cos(circle), r * np.sin(circle), color=GREY, lw=0.8, ls=(0, (4, 3)))
     axes.fill(*frame(result.boundary(400)).T, color=_FILL, lw=0)
-    for k in (0, 1):
+    for k in (0, 1):  # gamma_k+ = 0 from u = 0; p_k = 0 from v- along the other contact's push
         number = closed[k] + 1
         _draw_side(
             axes, frame, np.zeros(2), frame.walls[k], f"contact {number} remains closed", "-"
@@ -187,7 +187,7 @@ def _draw_projections(
     contacts = closed[:_MOST_CONTACTS]
     samples = result.sample(0, _SAMPLES)
     norm = np.asarray(kinetic_norm(result.scene), float)
-    unit = (np.asarray(result.scene.normals, float) / norm)[:, contacts]
+    unit = (np.asarray(result.scene.normals, float) / norm)[:, contacts]  # qn = unit^T v
     cloud, energies = samples @ unit, _energy_ratio(result, samples)
     pairs = list(combinations(range(len(contacts)), 2)) or [(0, 0)]
     figure, grid = new_panels(len(pairs), 3.1, 0.8, title)

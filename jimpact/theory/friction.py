@@ -65,6 +65,8 @@ def restitution_inclusion(
 ) -> InclusionOutcome:
     """Solve `v+ - v- in -Gbar N_V(Gamma (v+ + Lambda v-))` with `Gamma = Gbar^T P`, V a box.
 
+    N_V is the normal cone of V, the box of all y with `low <= y <= high`.
+
     Equation: `v+ = -Lambda v- + R^-1 proj[{x: Gbar^T R x in V}; R (Lambda + I) v-]`, `R^2 = P`.
     With the multipliers of the projection, y = Gamma (v+ + Lambda v-), it reads `v+ = v- + Gbar p`,
     `p_i >= 0` where y_i is at its lower bound, `<= 0` at its upper one, else 0: one linear
@@ -97,15 +99,15 @@ def restitution_inclusion(
         raise ValueError(f"Argument `coupling` must be a matrix, but has shape {gbar.shape}.")
     n, c = gbar.shape
     v = as_numbers("velocity", velocity, (n,), "one per row of `coupling`")
-    p = as_numbers("metric", metric, (n, n), "square, one row per row of `coupling`")
+    metric_p = as_numbers("metric", metric, (n, n), "square, one row per row of `coupling`")
     lam = lam * jnp.eye(n, dtype=lam.dtype) if lam.ndim == 0 else lam
     check_shape("restitution", lam, (n, n), "or a scalar")
     low, high = (
         jnp.broadcast_to(as_float_array(name, x), (c,))
         for name, x in (("low", low), ("high", high))
     )
-    gamma = gbar.T @ p
-    y = gamma @ (v + lam @ v)
+    gamma = gbar.T @ metric_p
+    y = gamma @ (v + lam @ v)  # Gamma (v+ + Lambda v-) without percussion, v+ = v-
     percussion, code = _box_multipliers(gamma @ gbar, y, low, high)
     return InclusionOutcome(v + gbar @ percussion, percussion, code.astype(jnp.int32))
 

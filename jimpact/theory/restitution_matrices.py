@@ -280,7 +280,7 @@ def audit_matrix(scene: Scene, matrix: Any, tolerance: float | None = None) -> M
     worst = velocity_change(scene, jnp.asarray(impulse, scene.mass.dtype)) + 0.0
     worst_normal = np.array(normalized_gap_velocity(scene, worst), float)
     worst_normal[closed] = 0.0 - energetic.witness
-    skew = inverse @ e - (inverse @ e).T
+    skew = inverse @ e - (inverse @ e).T  # 0: E is self-adjoint
     self_adjoint = np.abs(skew).max() <= tolerance * max(np.abs(inverse @ e).max(), 1e-300)
     radius = float(np.abs(np.linalg.eigvals(e)).max()) if self_adjoint else None
     return MatrixAudit(
