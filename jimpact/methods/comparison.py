@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
+import jax
 import numpy as np
 
 from jimpact.core.audits import Audit, audit, nothing_approaches
@@ -195,6 +196,6 @@ def compare(
     return Comparison(scene, np.asarray(v), entries, left_out | raised)
 
 
-def _first_call(law: Law, scene: Scene, velocity: Any) -> float:
+def _first_call(law: Law, scene: Scene, velocity: jax.Array) -> float:
     """Time [s] of a law's first impact, with compiling."""
     return seconds(partial(impact, law, scene, velocity))

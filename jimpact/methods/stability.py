@@ -322,9 +322,9 @@ class Setup(NamedTuple):
         return law, self.scene, self.velocity
 
     def groups(self, points: np.ndarray) -> Iterator[tuple[np.ndarray, int]]:
-        """Indices of the points (P, 7) with the same number of balls, and that number; 0: a scene.
+        """Groups of points (P, 7) with equal numbers of balls: indices (L,), and N (0: a scene).
 
-        One function is compiled for each.
+        One function is compiled for each group.
         """
         balls = points[:, AXES.index("balls")] if self.scene is None else np.zeros(len(points))
         for n in np.unique(balls):

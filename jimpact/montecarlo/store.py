@@ -15,6 +15,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
+from types import FunctionType
 from typing import Any
 
 import jax
@@ -79,7 +80,7 @@ def _described(value: Any, inside: tuple[int, ...]) -> Any:
         return name
 
 
-def _source(function: Any) -> Any:
+def _source(function: FunctionType) -> Any:
     """Source text of a function; if there is none, its byte code with names and constants."""
     try:
         return inspect.getsource(function)

@@ -1,5 +1,6 @@
 """Motions as films in real time: GIF, MP4, or a page that plays them."""
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -157,7 +158,11 @@ def _frames(
 
 
 def _film(
-    body: Body, curves: Any, colours: list[str], ground: np.ndarray, captions: list[str]
+    body: Body,
+    curves: Sequence[Sequence[np.ndarray]],
+    colours: list[str],
+    ground: np.ndarray,
+    captions: list[str],
 ) -> FuncAnimation:
     """Film of curves in their `colours`, the planes that a body stands on, and captions.
 

@@ -418,12 +418,17 @@ def colours_of(body: Body, q: np.ndarray, point: float) -> list[str]:
     return [colour_of(i) for i, curves in each for _ in curves]
 
 
-def plane_of(angle: Any, offset: Any) -> tuple[np.ndarray, float]:
+def plane_of(angle: float, offset: float) -> tuple[np.ndarray, float]:
     """Normal n (2,) and offset of the plane `n^T x = offset` inclined by `angle` [rad]."""
     return np.array([-np.sin(angle), np.cos(angle)]), float(offset)
 
 
-def set_limits(axes: Axes, curves: list[Any], ground: np.ndarray, floors: list[Any]) -> None:
+def set_limits(
+    axes: Axes,
+    curves: Sequence[Sequence[np.ndarray]],
+    ground: np.ndarray,
+    floors: Sequence[tuple[np.ndarray, float]],
+) -> None:
     """Set equal limits that hold the curves of all frames, and a point of each plane.
 
     That is the foot, on `n^T (x - ground[0]) = offset`, of the middle of the curves.
