@@ -9,7 +9,7 @@ from jimpact.motion.record import Motion, read_motion
 
 
 def load(path: str | Path) -> Fit[Any] | Motion:
-    """What `Fit.save` or `Motion.save` wrote, to the last digit, with all that one can do with it.
+    """Read the fit or the motion that `Fit.save` or `Motion.save` wrote, to the last digit.
 
     The classes of laws and scenes of a fit are imported by name, so read only files that you trust.
     The file of a motion, or of a batch, does not hold its system and law.

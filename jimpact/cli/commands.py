@@ -1,4 +1,4 @@
-"""What the commands of the command line do: each takes its options and returns a result.
+"""Commands of the command line: each takes its options and returns a result.
 
 Public names are taken from `jimpact` itself, so that a command imports no more than it needs.
 """
@@ -73,7 +73,7 @@ def run(command: options.DrawingCommand, steps: Steps) -> str:
 
 
 def _show(command: options.DrawingCommand, result: CommandResult, steps: Steps) -> None:
-    """Write the pictures of a result and print it."""
+    """Write the pictures of a result, and print it as text, CSV or JSON, as the options say."""
     pictures: dict[Path, Any] = {command.picture(): result.picture, **result.more}
     replaced = [path for path in pictures if path.exists()]
     for path, picture in pictures.items():
@@ -108,9 +108,13 @@ def _write_picture(path: Path, picture: "Figure | Callable[[Path], Any]") -> Non
 
 
 def _impact_of(command: options.ShotCommand) -> tuple[Study, np.ndarray, np.ndarray | None]:
-    """The study, in the scene of the shot where shots have their own, v-, and v+ if measured."""
+    """Study, v- (n,) [m/s, rad/s] and measured v+ (n,), None without one, of a command's impact.
+
+    v- is --velocity; without it v- and v+ are those of the study's shot --shot, and the study gets
+    the scene of this shot where shots have their own.
+    """
     study, shot = impact_study(command.study), command.shot - 1
-    if command.velocity:
+    if command.velocity:  # given: it need not be one of the study's shots
         before = np.asarray(command.velocity, float)
         separates = np.asarray(ji.gap_velocity(study.scene, before)) >= 0
         if separates.all() and "initial_energy" not in study.parameters:
@@ -141,7 +145,10 @@ RAW, CORRECTED, ALL_FREE = "as measured", "momentum corrected", "all free"
 
 
 def fit(command: options.FitCommand, steps: Steps) -> CommandResult:
-    """The study's fit, and what else was asked for; or every law, side by side."""
+    """`jimpact fit`: fit the study's law to its data; with --law all every law.
+
+    Shots are fitted up to three times, see `_fits_of`, until the time limit --limit [s].
+    """
     if command.law == options.EVERY_LAW:
         return _fit_every_law(command, steps)
     chosen: dict[str, Any] = {
@@ -159,7 +166,7 @@ def fit(command: options.FitCommand, steps: Steps) -> CommandResult:
         return _fits_result(study.title, fits)
 
     def result() -> CommandResult:
-        """Of the fits that are done."""
+        """The result with the fits that are done so far."""
         return _with_track(_fits_result(study.title, fits), study, command)
 
     end = np.inf if command.limit is None else time.monotonic() + command.limit
@@ -181,7 +188,12 @@ def fit(command: options.FitCommand, steps: Steps) -> CommandResult:
 def _fits_of(
     study: Study, all_free: bool, fits: Mapping[str, "Fit"]
 ) -> Iterator[tuple[str, Study]]:
-    """The studies to fit, by name: as it is; its momentum corrected where it must be; all free."""
+    """Studies to fit one after the other, by name: variants of one study of shots.
+
+    `RAW` as it is; `CORRECTED` with velocities changed to conserve momentum, if the report of the
+    first of the `fits` finds that they do not; `ALL_FREE` with every e and stiffness ratio free, if
+    asked for.
+    """
     with_all_free = None
     if all_free:  # fits of one law share one compiled program
         study, with_all_free = _per_contact(study)
@@ -195,7 +207,7 @@ def _fits_of(
 
 
 def _fits_result(title: str, fits: dict[str, "Fit"]) -> CommandResult:
-    """All fits as text, table and picture."""
+    """Fits by name as a result: the first one's report and picture, a table of all."""
     text = "\n".join([str(fits[RAW]), "", *_fits_table(fits), ""])
     heads = ("fit", "law", "parameter", "value", "standard_error", "rms_m_per_s", "rank")
     rows = [
@@ -204,11 +216,11 @@ def _fits_result(title: str, fits: dict[str, "Fit"]) -> CommandResult:
         for i, parameter in enumerate(x.names)
     ]
     picture = ji.plot.fit(fits[RAW], None, title)
-    return CommandResult(title, {"fits": dict(fits)}, picture, _plain(heads, rows), text)
+    return CommandResult(title, {"fits": dict(fits)}, picture, _plain_table(heads, rows), text)
 
 
 def _with_track(result: CommandResult, study: Study, command: options.FitCommand) -> CommandResult:
-    """The result with the track that the shots are of: its impacts and warnings, its picture."""
+    """The result, and the impacts, warnings and picture of the track that the shots are from."""
     if study.track is None:
         return result
     text = str(result.data) if result.text is None else result.text
@@ -219,13 +231,13 @@ def _with_track(result: CommandResult, study: Study, command: options.FitCommand
     return result._replace(data=data, text=f"{study.track}\n\n{text}", more=picture)
 
 
-def _plain(heads: Iterable[str], rows: Sequence[Sequence[Any]]) -> Table:
-    """A table for CSV only."""
+def _plain_table(heads: Iterable[str], rows: Sequence[Sequence[Any]]) -> Table:
+    """A table of plain columns, without formats and notes."""
     return Table([Column(name) for name in heads], rows)
 
 
 def _fit_every_law(command: options.FitCommand, steps: Steps) -> CommandResult:
-    """All laws on the study's data; the picture is that of the first one."""
+    """`jimpact fit --law all`: fits of every law to the study's shots; the picture has the best."""
     study = impact_study(command.study)
     if study.experiments is None:
         raise ValueError(NO_DATA)
@@ -237,9 +249,9 @@ def _fit_every_law(command: options.FitCommand, steps: Steps) -> CommandResult:
 
 
 def _laws_fitted(study: Study, steps: Steps, **chosen: int | None) -> "LawFits":
-    """Every law on the study's data, and whether e depends on the speed.
+    """Fits of every law to the study's shots, also with e as a function of the speed.
 
-    `chosen`: starts and seed in the place of the study's.
+    `chosen`: starts and seed in the place of the study's; None: the study's.
     """
     assert study.experiments is not None  # the callers have seen to it
     values = {key: x for key, x in study.parameters.items() if key != "restitution"}
@@ -247,7 +259,7 @@ def _laws_fitted(study: Study, steps: Steps, **chosen: int | None) -> "LawFits":
     friction = [name for name in study.free if name in FRICTION_PARAMETERS]
 
     def done(name: str, fit: "Fit") -> None:
-        """Count a law as a step."""
+        """Report a law that is fitted as a step of the command."""
         steps(_fit_in_words(name, fit))
 
     return ji.fit_laws(
@@ -261,17 +273,18 @@ def _laws_fitted(study: Study, steps: Steps, **chosen: int | None) -> "LawFits":
 
 
 def _per_contact(study: Study) -> tuple[Study, Study | None]:
-    """The study of an LZB law with an entry for each contact; those of one value share it.
+    """The study with e and k of LZB as arrays (m,), and the same with every entry free.
 
-    And the study with every e and stiffness ratio free; None where the law is another one, or
-    where they are free already.
+    In the first one, entries that were one number have one label and stay equal. The second one is
+    None if the law is not LZB, has other free parameters, or is all free already.
     """
     law, contacts = study.law, study.scene.contacts
     fields = ("restitution", "stiffness")
     if not isinstance(law, ji.LZB) or contacts < 2 or not set(study.free) <= set(fields):
         return study, None
-    groups = {}
+    groups = {}  # labels (m,): 0 fixed, entries of one label are one free value
     for name in fields:
+        # the study's choice: True or False, a mask (m,), or labels (m,)
         value, choice = getattr(law, name), np.asarray(study.free.get(name, False))
         one_each = np.arange(1, contacts + 1) if np.ndim(value) else 1
         labels = np.where(choice, one_each, 0) if choice.dtype == bool else choice
@@ -284,18 +297,18 @@ def _per_contact(study: Study) -> tuple[Study, Study | None]:
 
 
 def _fits_table(fits: dict[str, "Fit"]) -> list[str]:
-    """A line for each parameter of each fit, and what the data determine with all of them free."""
+    """Lines of a table with a row for each parameter of each fit, and the rank with all free."""
     rows = []
     for name, fit in fits.items():
         data = "corrected" if name == CORRECTED else RAW
         rms = f"{fit.rms:.4f}" if fit.experiments is not None else f"{fit.rms:.4g}"
-        ends = [type(fit.law).__name__, data, rms, f"{fit.rank} of {len(fit.names)}"]
+        of_fit = [type(fit.law).__name__, data, rms, f"{fit.rank} of {len(fit.names)}"]
         for i, parameter in enumerate(fit.names):
-            rows.append([*ends[:2], parameter, _value(fit, i), *ends[2:]])
-            ends = [""] * 4  # said once
+            rows.append([*of_fit[:2], parameter, _value_with_error(fit, i), *of_fit[2:]])
+            of_fit = [""] * 4  # in the first row only
     speeds = all(fit.experiments is not None for fit in fits.values())
     heads = ["law", "data", "parameter", "value", "rms [m/s]" if speeds else "rms", "rank"]
-    lines = str(_plain(heads, rows)).splitlines()
+    lines = str(_plain_table(heads, rows)).splitlines()
     if ALL_FREE in fits:
         fit = fits[ALL_FREE]
         names = ", ".join(fit.names)
@@ -305,14 +318,14 @@ def _fits_table(fits: dict[str, "Fit"]) -> list[str]:
 
 
 def _fit_in_words(name: str, fit: "Fit") -> str:
-    """The values of a fit in one line."""
-    values = ", ".join(f"{x} {_value(fit, i)}" for i, x in enumerate(fit.names))
+    """Fitted values with standard errors, and the rms of the residuals, in one line."""
+    values = ", ".join(f"{x} {_value_with_error(fit, i)}" for i, x in enumerate(fit.names))
     unit = "" if fit.experiments is None else " m/s"
     return f"{name}: {values}, rms {fit.rms:.4g}{unit}"
 
 
-def _value(fit: "Fit", i: int) -> str:
-    """A fitted value with its standard error."""
+def _value_with_error(fit: "Fit", i: int) -> str:
+    """Fitted value i with its standard error, or a word why it has none."""
     error = fit.standard_error[i]
     if not fit.determined[i]:
         spread = "(not determined)"
@@ -329,7 +342,7 @@ def _value(fit: "Fit", i: int) -> str:
 
 
 def compare(command: options.CompareCommand, steps: Steps) -> CommandResult:
-    """Every law on one scene."""
+    """`jimpact compare`: outcomes of every law on one impact; with --fit fitted laws, too."""
     study, before, measured = _impact_of(command)
     laws, left_out = registered_laws(study.parameters)
     with waiting("comparing laws", steps.patience):
@@ -353,7 +366,7 @@ def compare(command: options.CompareCommand, steps: Steps) -> CommandResult:
 
 
 def montecarlo(command: options.MonteCarloCommand, steps: Steps) -> CommandResult:
-    """Random gaps, velocities, parameters."""
+    """`jimpact montecarlo`: impacts with random gaps, velocities and parameters of the law."""
     study = impact_study(command.study)
     if not study.monte_carlo:
         raise ValueError(f"the study '{command.study}' must have a [monte_carlo] table.")
@@ -377,7 +390,7 @@ QUICK_LAWS = ("moreau", "binary")
 
 
 def chart(command: options.ChartCommand, steps: Steps) -> CommandResult:
-    """Speed against accuracy on one scene."""
+    """`jimpact chart`: speed against accuracy of methods and laws on one impact."""
     from jimpact.methods.chart import shared_parameters
     from jimpact.methods.contenders import CONTENDERS
 
@@ -418,7 +431,7 @@ TITLE = "LZB, three equal Hertz balls, e = 0.9 (triangles), one axis changed at 
 
 
 def stability(command: options.StabilityCommand, steps: Steps) -> CommandResult:
-    """Maps of methods: a picture of single axes, with --full one of pairs for each method."""
+    """`jimpact stability`: map of methods over single axes; --full: over pairs of axes, too."""
     if not command.full:  # three balls: one program for each method
         from jimpact.methods.stability import default_axes
 
@@ -445,7 +458,7 @@ _ADVISE_REFUSED = ("tangential_restitution", "initial_energy")  # these would ch
 
 
 def advise(command: options.AdviseCommand, steps: Steps) -> CommandResult:
-    """The simplest law that a scene needs."""
+    """`jimpact advise`: the simplest law that suffices for an impact."""
     study, before, _ = _impact_of(command)
     result = ji.advise(
         study.scene,
@@ -462,7 +475,7 @@ def advise(command: options.AdviseCommand, steps: Steps) -> CommandResult:
 
 
 def _advise_parameters(study: Study) -> dict[str, Any]:
-    """The study's parameters that `ji.advise` takes; others that matter are refused."""
+    """The study's parameters that `ji.advise` takes; a ValueError for others that matter."""
     rheology = study.parameters.get("rheology", "bistiffness")
     if rheology != "bistiffness":
         raise ValueError(
@@ -482,7 +495,7 @@ def _advise_parameters(study: Study) -> dict[str, Any]:
 
 
 def simulate(command: options.SimulateCommand, steps: Steps) -> CommandResult:
-    """A whole motion; one that does not reach its end is drawn and printed as far as it goes."""
+    """`jimpact simulate`: a whole motion; drawn and printed as far as it goes if it fails."""
     study = motion_study(command.study)
     system, title = study.system, study.title
     motion = jax.block_until_ready(
@@ -491,7 +504,7 @@ def simulate(command: options.SimulateCommand, steps: Steps) -> CommandResult:
     steps("motion computed")
     more: dict[Path, Any] = {}
     if command.portrait is not None:
-        which = None if command.coordinate is None else command.coordinate - 1
+        which = None if command.coordinate is None else command.coordinate - 1  # from 0
         more[command.portrait] = ji.plot.phase_portrait(motion, which, title, system=system)
     if command.gif is not None:
         more[command.gif] = partial(
@@ -503,13 +516,13 @@ def simulate(command: options.SimulateCommand, steps: Steps) -> CommandResult:
             speed=command.speed,
         )
     heads = ("time [s]", *system.body.names, *system.body.velocity_names)
-    table = _plain(heads, np.column_stack([motion.time, motion.q, motion.velocity]).tolist())
+    table = _plain_table(heads, np.column_stack([motion.time, motion.q, motion.velocity]).tolist())
     picture = ji.plot.motion(motion, title, system=system)
-    return CommandResult(title, motion, picture, table, more=more, failure=_failure(motion))
+    return CommandResult(title, motion, picture, table, more=more, failure=_failure_of(motion))
 
 
-def _failure(motion: "Motion") -> str:
-    """Why a motion failed, '' if it did not."""
+def _failure_of(motion: "Motion") -> str:
+    """Message of the failure of a motion, '' if its status is none."""
     try:
         ji.raise_on_failure(motion)
     except RuntimeError as error:

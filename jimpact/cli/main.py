@@ -59,9 +59,9 @@ class Call:
         return "jimpact" if self.command is None else f"jimpact {self.command.name()}"
 
     def interrupt_message(self) -> str:
-        """What ctrl-C leaves behind: steps that are done, and what is kept in files.
+        """Message after ctrl-C: the steps that are done, and the results that are in files.
 
-        What is finished is printed and drawn at once, where a command can do so.
+        Commands that can do so print and draw what is finished first.
         """
         done = f" after: {'; '.join(self.steps.done)}" if self.steps and self.steps.done else ""
         if self.steps is not None and self.steps.show_finished is not None:
@@ -73,13 +73,13 @@ class Call:
         return f"{self.name}: stopped{done}. {remains}".rstrip()
 
     def warn(self, message: Any, *_: Any) -> None:
-        """Print a warning, once: a file may be read twice. In the place of `showwarning`."""
+        """Print a warning, once: a file may be read twice. It replaces `warnings.showwarning`."""
         if str(message) not in self.warnings:
             self.warnings.add(str(message))
             print(f"{self.name}: {message}", file=sys.stderr)
 
     def fail(self, reason: Any, code: int) -> int:
-        """Print the reason; the exit code."""
+        """Print the reason of a failure, and return the exit code."""
         print(f"{self.name}: {reason}", file=sys.stderr)
         return code
 
@@ -105,7 +105,10 @@ def program() -> int:
 
 
 def main(arguments: list[str] | None = None, call: Call | None = None) -> int:
-    """The exit code: 0; wrong input 2, a method or law that fails 1, ctrl-C 130."""
+    """Run the program with `arguments` (None: those of the shell), and return the exit code.
+
+    0; wrong input 2, a method or law that fails 1, ctrl-C 130.
+    """
     arguments = sys.argv[1:] if arguments is None else arguments
     call = call or Call()
     if arguments == ["--version"]:
@@ -130,7 +133,7 @@ def main(arguments: list[str] | None = None, call: Call | None = None) -> int:
 
 
 def run_command(call: Call, arguments: list[str]) -> int:
-    """Parse, check and run; the exit code."""
+    """Parse the arguments, check the options, run the command, and return the exit code."""
     command = call.command = parse(arguments)
     command.check()
     if command.light:
@@ -145,7 +148,7 @@ def run_command(call: Call, arguments: list[str]) -> int:
 
 
 def parse(arguments: list[str]) -> Any:
-    """The command of these arguments, with its options."""
+    """Options of the command that the arguments name, an object of its class in `options`."""
     import functools
     import operator
     from typing import Annotated
@@ -171,9 +174,10 @@ def parse(arguments: list[str]) -> Any:
 
 
 def keep_programs(no_cache: bool) -> None:
-    """Tell JAX, before it is imported, where to keep what it compiles, unless the user has done so.
+    """Tell JAX, before it is imported, in which folder to keep compiled programs.
 
-    The place is in the folder `JIMPACT_CACHE` (empty: nowhere), else in the user's cache folder.
+    A folder that the user has set for JAX stays. Ours is in the folder `JIMPACT_CACHE` (empty:
+    nowhere), else in the user's cache folder.
     """
     root = os.environ.get("JIMPACT_CACHE")
     if no_cache:
@@ -222,7 +226,7 @@ def end_on_interrupt(message: Callable[[], str]) -> None:
             os._exit(INTERRUPTED)
 
     def wait() -> None:
-        """Until the pipe delivers an interrupt."""
+        """Wait until the pipe delivers the number of an interrupt, then end the process."""
         while os.read(reading_end, 1)[0] != signal.SIGINT:
             pass
         end()

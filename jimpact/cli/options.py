@@ -20,7 +20,7 @@ PICTURES = (".png", ".pdf", ".svg")
 
 
 def _option(metavar: str, constructor: Any = None) -> Any:
-    """How --help names a value whose default the text explains, and what makes it of a string."""
+    """Option of tyro: its value's name in --help, without a default, and its type if not plain."""
     return tyro.conf.arg(metavar=metavar, constructor=constructor, help_behavior_hint="")
 
 
@@ -38,7 +38,7 @@ Names = Annotated[tuple[str, ...], _option("NAME ...")]
 class Command:
     """Options of every command."""
 
-    light: ClassVar[bool] = False  # whether it computes nothing and has a method `run`
+    light: ClassVar[bool] = False  # True: it computes nothing, and has a method `run`
 
     json: Flag = False
     """Print JSON instead of text."""
@@ -59,7 +59,7 @@ class Command:
             raise ValueError("--json and --csv must not both be given.")
 
     def remains(self) -> str:
-        """What remains of an interrupted command."""
+        """Sentence: the files that remain of an interrupted command."""
         cached = os.environ.get("JAX_COMPILATION_CACHE_DIR") and not self.no_cache
         return "Only compiled programs are stored." if cached else "No result is stored."
 
@@ -73,7 +73,7 @@ class DrawingCommand(Command):
     out: Annotated[Path, _option("FILE", Path)] = Path()
 
     def check(self) -> None:
-        """Also the picture."""
+        """Check the options of every command, and the path of the picture."""
         super().check()
         self.picture()
 
@@ -85,13 +85,16 @@ class DrawingCommand(Command):
         return checked_file("--out", self.out / f"{named}.png", PICTURES)
 
     def subject(self) -> str:
-        """What is drawn, for the name of the file: the study; '' for the command's own."""
+        """Name of the study, to name the file of its picture; '' for the default study."""
         study, default = (getattr(x, "study", None) for x in (self, type(self)))
         return "" if study is None or study == default else study.absolute().stem
 
 
 def checked_file(option: str, path: Path, endings: tuple[str, ...], or_else: str = "") -> Path:
-    """The path; other endings, and places where no file can be written, are refused."""
+    """The path of an option, checked: one of the endings, a place where a file can be written.
+
+    `or_else` adds to the error of the ending another thing that the option may be.
+    """
     if path.suffix not in endings:
         *others, last = endings
         listed = f"{', '.join(others)} or {last}" if others else last
@@ -105,7 +108,7 @@ def checked_file(option: str, path: Path, endings: tuple[str, ...], or_else: str
 
 
 def check_writable(option: str, folder: Path) -> None:
-    """Refuse a folder in which no file can be made; one that is missing will be made."""
+    """Raise a ValueError if no file can be made in a folder, or above it if it is missing."""
     above = next(x for x in (folder, *folder.absolute().parents) if x.exists())
     try:
         with tempfile.TemporaryFile(dir=above):
@@ -148,7 +151,7 @@ class FitCommand(DrawingCommand):
     """Seconds after which no further step is begun; default: no limit."""
 
     def check(self) -> None:
-        """Also the limit."""
+        """Check the picture, and that the limit is positive."""
         super().check()
         if self.limit is not None and not self.limit > 0:
             raise ValueError(f"--limit must be > 0 seconds, but is {self.limit:g}.")
@@ -180,14 +183,14 @@ class MonteCarloCommand(DrawingCommand):
     """Keep the raw samples in the folder, too."""
 
     def check(self) -> None:
-        """Also the executor and the folder."""
+        """Check the picture, the executor, and that the folder is writable."""
         super().check()
         check_executor(self.executor)
         if self.folder is not None:
             check_writable("--folder", self.folder)
 
     def remains(self) -> str:
-        """Finished chunks, if there is a folder."""
+        """Sentence: the folder of finished chunks, or that none is stored."""
         if self.folder is None:
             return "No result is stored, because --folder is not set."
         return f"Finished chunks are in '{self.folder}': the same command continues from there."
@@ -209,7 +212,7 @@ class ChartCommand(ShotCommand):
 
 @dataclasses.dataclass(frozen=True)
 class StabilityCommand(DrawingCommand):
-    """Where methods of integration are right, wrong, gain energy or do not end."""
+    """Map where methods of integration are right, wrong, gain energy or do not end."""
 
     methods: Names = ()
     """Methods by name; default: time, rk4, verlet and impulse_euler."""
@@ -252,7 +255,7 @@ class SimulateCommand(DrawingCommand):
     """Coordinate of the phase portrait, counted from 1; default: one that moves."""
 
     def check(self) -> None:
-        """Also the other pictures."""
+        """Check the picture, the other pictures and the speed."""
         super().check()
         if self.portrait is not None:
             checked_file("--portrait", self.portrait, PICTURES)
@@ -278,7 +281,7 @@ class LawsCommand(Command):
     light: ClassVar[bool] = True
 
     def run(self) -> int:
-        """Print them."""
+        """Print the table of laws as text, JSON, CSV or BibTeX."""
         from jimpact.cli.starting import laws_as_text
         from jimpact.cli.study_file import import_laws
         from jimpact.laws import REGISTRY
@@ -328,7 +331,7 @@ class NewCommand:
         return ""
 
     def run(self) -> int:
-        """Write the files, and print the next command."""
+        """Write the files of a new study, and print their names and the next command."""
         from jimpact.cli.starting import begin
 
         folder = self.folder or Path(f"my_{self.kind}")

@@ -1,4 +1,4 @@
-"""What the command line does without computing: begin a user's own study, print laws."""
+"""Commands that compute nothing: begin a user's own study, print laws."""
 
 import json
 import shutil
@@ -16,7 +16,9 @@ FILES = {"data": "shots.csv", "track": "track.csv"}  # of the tables of a study 
 
 
 def begin(kind: str, folder: Path, like: str | None = None) -> list[Path]:
-    """Write study, data and notebook, as in the study `like`; returns the files.
+    """Write a study, its data and a notebook into a folder; returns the paths of the files.
+
+    `kind` is the command that they are for, `like` the bundled study to copy (None: its default).
 
     Raises:
         FileNotFoundError: there is no such study. ValueError: a file exists already.
@@ -27,14 +29,14 @@ def begin(kind: str, folder: Path, like: str | None = None) -> list[Path]:
     study = path.read_text(encoding="utf-8")
     texts = {folder / STUDY: templates["head"].format(kind=kind) + "\n" + study}
     tables = tomllib.loads(study)
-    for table, name in FILES.items():
+    for table, name in FILES.items():  # data files are copied under new names
         data = tables.get(table, {}).get("file")
         if data is not None:
             texts[folder / STUDY] = texts[folder / STUDY].replace(data, name)
             texts[folder / name] = (path.parent / data).read_text(encoding="utf-8")
     cells = [templates["setup"], *template["cells"]]
     texts[folder / "study.ipynb"] = _notebook(template["title"], cells)
-    existing = [str(path) for path in texts if path.exists()]
+    existing = [str(path) for path in texts if path.exists()]  # is never replaced
     if existing:
         other = folder.with_name(f"{folder.name}_2")
         raise ValueError(
@@ -62,7 +64,7 @@ def _notebook(title: str, sources: list[str]) -> str:
 
 
 def laws_as_text(rows: Mapping[str, Mapping[str, Any]]) -> str:
-    """Laws one below the other, in lines that fit the terminal."""
+    """Text on laws one below the other, in lines that fit the terminal, from rows by name."""
     width = min(shutil.get_terminal_size((80, 24)).columns, WIDEST)
     lines = []
     for name, row in rows.items():

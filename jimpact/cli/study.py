@@ -96,7 +96,7 @@ class Study:
         return self._problem(FitProblem.from_shots)
 
     def _problem(self, of_shots: Callable[..., FitProblem]) -> FitProblem:
-        """The same, that of shots made by this function."""
+        """The problem of the study's shots, made by `of_shots` (law, scene, shots, choice)."""
         choice = self.free, self.bounds, self.priors
         if self.experiments is None:
             raise ValueError(NO_DATA)
@@ -158,47 +158,51 @@ def read_study(path: str | Path, law: str | None = None) -> Study | MotionStudy:
     ('Three equal hard balls, one shot', "Newton's cradle, three balls")
     """
 
-    def build(tables: dict[str, Any], place: Path) -> Study | MotionStudy:
-        """The study, of whatever kind it is."""
-        return (motion_study_of if "motion" in tables else _impact_study)(tables, place, law)
+    def build(tables: dict[str, Any], path: Path) -> Study | MotionStudy:
+        """The study of a motion if there is a table [motion], else of an impact."""
+        return (motion_study_of if "motion" in tables else _impact_study)(tables, path, law)
 
-    return _built(path, "[law]", build)
+    return _read(path, "[law]", build)
 
 
 def impact_study(path: str | Path, law: str | None = None) -> Study:
     """The study of one impact, see `read_study`; one of a motion is refused."""
-    return _built(path, "[scene]", lambda tables, place: _impact_study(tables, place, law))
+    return _read(path, "[scene]", lambda tables, path: _impact_study(tables, path, law))
 
 
 def motion_study(path: str | Path) -> MotionStudy:
     """The study of a motion, see `read_study`; one of an impact is refused."""
-    return _built(path, "[system]", lambda tables, place: motion_study_of(tables, place, None))
+    return _read(path, "[system]", lambda tables, path: motion_study_of(tables, path, None))
 
 
-def _built(
+def _read(
     path: str | Path, table: str, build: Callable[[dict[str, Any], Path], AnyStudy]
 ) -> AnyStudy:
-    """What is built of the tables of a file; an error names the file.
+    """Study that `build(tables, path)` makes of a TOML file; its errors name the file.
 
-    `table` is the head of a table that all bundled studies of this kind have.
+    `table` is the head of a table that all bundled studies of this kind have: a missing file's
+    error lists these.
     """
-    place = located(Path(path), table)
+    file = located(Path(path), table)
     try:
-        return build(read_tables(place), place)
+        return build(read_tables(file), file)
     except (ValueError, TypeError) as error:
-        raise ValueError(f"{place}: {error}") from None
+        raise ValueError(f"{file}: {error}") from None
 
 
-def _impact_study(tables: Mapping[str, Any], place: Path, law_name: str | None) -> Study:
-    """The study of these tables."""
+def _impact_study(tables: Mapping[str, Any], path: Path, law_name: str | None) -> Study:
+    """Study of one impact from the tables of the file `path`, checked.
+
+    `law_name`: a law in the place of the study's, None: its own.
+    """
     check_tables(tables, ("scene", "law"), ("fit", *SHOTS, "monte_carlo"))
     scene, body = _scene(tables["scene"])
-    law, values, fitted = law_of(tables, law_name, place.parent, scene)
+    law, values, fitted = law_of(tables, law_name, path.parent, scene)
     fittable = free_parameters_of(law)
-    bounce = [name for name in ("restitution", *OF_SPEED) if name in fittable]
-    track, experiments = _shots(tables, place, body or scene)
+    bounce = [name for name in ("restitution", *OF_SPEED) if name in fittable]  # free by default
+    track, experiments = _shots(tables, path, body or scene)
     return Study(
-        str(tables.get("title", place.stem)),
+        str(tables.get("title", path.stem)),
         scene,
         law,
         free=fitted.free or dict.fromkeys(bounce or default_free(law), True),
@@ -214,7 +218,7 @@ def _impact_study(tables: Mapping[str, Any], place: Path, law_name: str | None) 
 
 
 def _scene(table: Mapping[str, Any]) -> tuple[Scene, Body | None]:
-    """The scene of a study, and the body whose scene it is."""
+    """Scene of the table [scene], and the body whose scene it is; None: a chain."""
     if "kind" not in table:
         check_keys("[scene]", table, CHAIN, ("masses_kg",))
         return chain(**arguments_of(table, CHAIN)), None
@@ -224,40 +228,46 @@ def _scene(table: Mapping[str, Any]) -> tuple[Scene, Body | None]:
 
 
 def _shots(
-    tables: Mapping[str, Any], study: Path, place: Scene | Body
+    tables: Mapping[str, Any], path: Path, owner: Scene | Body
 ) -> tuple["Track | None", Experiments | None]:
-    """The shots of a study, if it has any, and the track of which they are."""
+    """Track and shots of a study from the table [track], [bounces] or [data]; None without.
+
+    `path` is that of its file, `owner` the scene or the body of the shots.
+    """
     given = [name for name in SHOTS if name in tables]
     if len(given) > 1:
         raise ValueError(
             f"the study must have one table of shots, but has {', '.join(f'[{x}]' for x in given)}."
         )
     if "track" in tables:
-        track = track_of(tables["track"], study)
-        return track, shots_of_track(track, tables["track"], place)
+        track = track_of(tables["track"], path)
+        return track, shots_of_track(track, tables["track"], owner)
     if "bounces" in tables:
         return None, shots_of_bounces(tables["bounces"])
-    return None, _experiments(tables["data"], study, place) if "data" in tables else None
+    return None, _experiments(tables["data"], path, owner) if "data" in tables else None
 
 
-def _experiments(table: Mapping[str, Any], study: Path, place: Scene | Body) -> Experiments:
-    """The shots of the table [data], with the scenes that they have of their own."""
+def _experiments(table: Mapping[str, Any], path: Path, owner: Scene | Body) -> Experiments:
+    """Shots in the file of the table [data], selected and corrected as the table says.
+
+    `path` is that of the study, `owner` its scene, or its body, which gives each its scene.
+    """
     check_keys("[data]", table, DATA, ("file",))
     check_kind("[data]", "file", table["file"], str, "a path")
     corrected = table.get("momentum_corrected", False)
     check_kind("[data]", "momentum_corrected", corrected, bool, "true or false")
     near = table.get("near_m", CLOSED_BELOW)
-    experiments = read_experiments(study.parent / table["file"], place, near)
+    experiments = read_experiments(path.parent / table["file"], owner, near)
     if experiments.scenes is None:
         for key in ("contacts", "near_m"):
             if key in table:
                 raise ValueError(f"`{key}` in [data] is for shots with scenes of their own.")
-        if isinstance(place, Scene):
-            experiments.scene_of(place, 0)  # raises where their sizes differ
+        if isinstance(owner, Scene):
+            experiments.scene_of(owner, 0)  # raises where their sizes differ
     if "contacts" in table:
         experiments = experiments.with_contacts(table["contacts"])
     if corrected:
-        return experiments.momentum_corrected(place if isinstance(place, Scene) else None)
+        return experiments.momentum_corrected(owner if isinstance(owner, Scene) else None)
     return experiments
 
 

@@ -1,4 +1,4 @@
-"""What studies of impacts and of motions share: their file, keys of its tables, law and body."""
+"""Common parts of studies of impacts and of motions: file, keys of its tables, law and body."""
 
 import dataclasses
 import importlib.util
@@ -47,9 +47,10 @@ _UNITS = {
 
 
 def located(path: Path, table: str) -> Path:
-    """The file, that of a folder (`jimpact new`), or the bundled study of this name.
+    """Path of a study: the file, `study.toml` in the folder, or the bundled study of this name.
 
-    `table` is the head of a table of the studies that an error lists.
+    `table` is the head of a table: if there is no such study, the error lists the bundled studies
+    that have it.
     """
     if path.is_file():
         return path
@@ -84,7 +85,7 @@ def read_tables(path: Path) -> dict[str, Any]:
 
 
 def _position(error: Exception) -> str:
-    """Where a file is not TOML, and why.
+    """Phrase: place and reason of an error of the TOML parser.
 
     >>> from jimpact.cli.study_file import _position
     >>> _position(ValueError("Expected ']' (at line 9, column 7)"))
@@ -116,20 +117,23 @@ def check_keys(where: str, table: Any, allowed: Any, required: tuple[str, ...] =
 
 
 def check_kind(where: str, key: str, value: Any, kind: Any, words: str) -> None:
-    """Raise a ValueError for a value of another kind, which `words` name."""
+    """Raise a ValueError unless the value of a key is of a Python type, which `words` name."""
     if not isinstance(value, kind):
         raise ValueError(f"`{key}` in {where} must be {words}, but is {value!r}.")
 
 
 def arguments_of(table: Mapping[str, Any], keys: Mapping[str, str]) -> dict[str, Any]:
-    """The values of a table by the arguments that these keys of it stand for."""
+    """Values of a table by name of the argument, `keys` mapping its keys to arguments."""
     return {name: table[key] for key, name in keys.items() if key in table}
 
 
 def check_tables(
     study: Mapping[str, Any], required: tuple[str, ...], others: tuple[str, ...]
 ) -> None:
-    """Raise a ValueError for tables that are unknown, missing or none; a title is allowed, too."""
+    """Raise a ValueError unless a study has the `required` tables, and besides only `others`.
+
+    A title is allowed, too.
+    """
     for scene, system, kind in (("scene", "system", "a motion"), ("system", "scene", "one impact")):
         if system in required and system not in study and scene in study:
             raise ValueError(
@@ -149,18 +153,20 @@ FIT = ("free", "method", "loss", "starts", "seed", "max_steps", "profiles")
 
 
 class Fitted(NamedTuple):
-    """What a study says of its fit: what is free (names -> masks), limits, options of `fit`."""
+    """Statements of a study on its fit, by name of the parameter."""
 
-    free: dict[str, Any]
-    bounds: dict[str, Any]
-    priors: dict[str, Any]
-    options: dict[str, Any]
+    free: dict[str, Any]  # True, or a mask over contacts
+    bounds: dict[str, Any]  # (low, high)
+    priors: dict[str, Any]  # (mean, standard deviation)
+    options: dict[str, Any]  # of `fit`, by name of the argument
 
 
 def law_of(
     tables: Mapping[str, Any], other_law: str | None, folder: Path, scene: Scene | None = None
 ) -> tuple[Law, dict[str, Any], Fitted]:
-    """The law of a study, its values, and what [fit], [law.bounds] and [law.priors] say of it.
+    """Law of a study, values of its parameters, and statements on its fit, from checked tables.
+
+    The tables are [law], [law.bounds], [law.priors] and [fit].
 
     Args:
         tables: of the study.
@@ -195,7 +201,7 @@ def law_of(
     values = _with_exponent(values, free)
 
     def kept(pairs: Mapping[str, Any]) -> dict[str, Any]:
-        """What belongs to this law, where it stands in the place of the study's."""
+        """The pairs whose parameter the law has; all if it is the study's own."""
         fields = (*row.parameters, *not_of_law)
         return {x: y for x, y in pairs.items() if other_law is None or entry_of(x)[0] in fields}
 
@@ -208,7 +214,7 @@ def law_of(
 
 
 def _masks(free: Any) -> dict[str, Any]:
-    """What is free, by name: True, or a mask over contacts."""
+    """Free parameters by name: True, or a mask over contacts; `free` is a list or such a table."""
     if isinstance(free, dict):
         return free
     if isinstance(free, list) and all(isinstance(name, str) for name in free):
@@ -217,7 +223,7 @@ def _masks(free: Any) -> dict[str, Any]:
 
 
 def _with_exponent(values: dict[str, Any], free: Mapping[str, Any]) -> dict[str, Any]:
-    """A law's values: fixed exponents are fast as numbers, free ones must be arrays."""
+    """A law's values with the exponent as an array if it is free, else as numbers: faster."""
     if "exponent" not in values:
         return values
     exponent = values["exponent"]
@@ -227,12 +233,15 @@ def _with_exponent(values: dict[str, Any], free: Mapping[str, Any]) -> dict[str,
 
 
 def without_none(options: Mapping[str, Any]) -> dict[str, Any]:
-    """The options that are not None, which means: as the study says."""
+    """The options that are not None; None means: as the study says."""
     return {key: value for key, value in options.items() if value is not None}
 
 
 def fit_arguments(options: Mapping[str, Any], search: Search) -> dict[str, Any]:
-    """Arguments of `fit` from the options of a study, of which all but two belong to its search."""
+    """Arguments of `fit` from the options of a study: `starts`, `profiles`, and `search`.
+
+    All other options replace entries of `search`.
+    """
     own = {name: options[name] for name in ("starts", "profiles") if name in options}
     check_kind("[fit]", "profiles", own.get("profiles", False), bool, "true or false")
     others = {name: value for name, value in options.items() if name not in own}
@@ -240,7 +249,7 @@ def fit_arguments(options: Mapping[str, Any], search: Search) -> dict[str, Any]:
 
 
 def body_of(where: str, table: Any, others: tuple[str, ...] = ()) -> Body:
-    """The body that a table of a study describes.
+    """Body that a table of a study describes; `where` is the head of the table, for errors.
 
     `kind` is the name of a body's class (`Block`, `Box`, `Bodies`, ..., in any case); the other
     keys are the arguments of that class, with their units behind them: `width_m`, `mass_kg`,
@@ -256,6 +265,7 @@ def body_of(where: str, table: Any, others: tuple[str, ...] = ()) -> Body:
     name = names.get(str(table["kind"]).lower(), table["kind"])
     check_word(f"`kind` in {where}", name, names.values())
     parameters = inspect.signature(BODIES[name]).parameters
+    # key of the table, with its unit -> argument of the class
     keys = {f"{key}_{_UNITS[key]}" if key in _UNITS else key: key for key in parameters}
     required = tuple(
         x for x, key in keys.items() if parameters[key].default is inspect.Parameter.empty

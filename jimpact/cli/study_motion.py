@@ -99,21 +99,24 @@ class MotionStudy:
         return simulate(self.system, self.law, **(self.arguments | without_none(changes)))
 
 
-def motion_study_of(tables: Mapping[str, Any], place: Path, law_name: str | None) -> MotionStudy:
-    """The study of these tables of a file."""
+def motion_study_of(tables: Mapping[str, Any], path: Path, law_name: str | None) -> MotionStudy:
+    """Study of a motion from the tables of the file `path`, checked.
+
+    `law_name`: a law in the place of the study's, None: its own.
+    """
     check_tables(tables, ("system", "law", "motion"), ("base", "fit", "data"))
-    law, _, fitted = law_of(tables, law_name, place.parent)
+    law, _, fitted = law_of(tables, law_name, path.parent)
     check_keys("[motion]", tables["motion"], (*MOTION, *METHOD, *OTHERS), ("q0", "v0", "t_end_s"))
     motion = tables["motion"]
     arguments = arguments_of(motion, MOTION)
     arguments["t_end"] = float(motion.get("t_start_s", 0.0)), motion["t_end_s"]
     arguments["method"] = _method(motion)
     return MotionStudy(
-        str(tables.get("title", place.stem)),
+        str(tables.get("title", path.stem)),
         _system(tables["system"], tables.get("base"), motion.get("friction")),
         law,
         arguments=arguments,
-        measured=_measured(tables["data"], place) if "data" in tables else None,
+        measured=_measured(tables["data"], path) if "data" in tables else None,
         free=fitted.free or dict.fromkeys(default_free(law)[:1], True),
         bounds=fitted.bounds,
         priors=fitted.priors,
@@ -122,14 +125,14 @@ def motion_study_of(tables: Mapping[str, Any], place: Path, law_name: str | None
 
 
 def _measured(table: Mapping[str, Any], study: Path) -> Positions:
-    """The positions in the file of the table [data]."""
+    """Times, positions and their errors in the file of the table [data]; `study`: path of it."""
     check_keys("[data]", table, ("file",), ("file",))
     check_kind("[data]", "file", table["file"], str, "a path")
     return read_positions(study.parent / table["file"])
 
 
 def _method(motion: Mapping[str, Any]) -> Method:
-    """The method of [motion] with its options."""
+    """Method of a motion with its options, from the table [motion]; default: 'events'."""
     word = motion.get("method", "events")
     check_choice("method", word, METHODS)
     known = {field.name for field in fields(METHODS[word])}
@@ -142,7 +145,7 @@ def _method(motion: Mapping[str, Any]) -> Method:
 def _system(
     table: Mapping[str, Any], base: Mapping[str, Any] | None, friction: float | None
 ) -> System:
-    """The body under its weight, on a base that shakes if there is one."""
+    """System of a body under its weight, from the table [system], on the base of [base] if any."""
     body = body_of("[system]", table, (GRAVITY,))
     acceleration = table.get(GRAVITY, STANDARD_GRAVITY)
     weight = gravity(body, acceleration) if acceleration else None
@@ -160,5 +163,5 @@ def _system(
             f"but is {direction!r}."
         )
     motion = HarmonicBase(**arguments_of(base, BASE))
-    moved = directions[:, names.index(direction), None]
-    return System(body, potential=weight, base=motion, base_directions=moved, friction=friction)
+    column = directions[:, names.index(direction), None]
+    return System(body, potential=weight, base=motion, base_directions=column, friction=friction)

@@ -31,42 +31,45 @@ _KINDS = {
 
 
 def track_of(table: Mapping[str, Any], study: Path) -> "Track":
-    """The track that the table [track] describes, with its impacts."""
+    """Track in the file of the table [track], with its impacts; `study` is the path of the study.
+
+    Angles are in rad, whatever their unit in the file.
+    """
     check_keys("[track]", table, TRACK, ("file", "columns", "unit"))
     choice = dict(table)
     choice |= {key: None for key in ("acceleration", "drag") if choice.get(key) == UNKNOWN}
     _check_kinds("[track]", {key: x for key, x in choice.items() if x is not None})
     try:
-        t, q = ji.tracks.read(study.parent / choice["file"], **_only(choice, READ))
+        t, q = ji.tracks.read(study.parent / choice["file"], **_entries(choice, READ))
         unit = choice["unit"]
-        stated = [unit] * q.shape[1] if isinstance(unit, str) else unit
+        stated = [unit] * q.shape[1] if isinstance(unit, str) else unit  # of each column
         units = ["rad" if each in ("rad", "deg") else "m" for each in stated]
         of_poses = "quaternion" in choice
-        options = _only(choice, FOUND)
+        options = _entries(choice, FOUND)
         return ji.tracks.find_impacts(t, q, units=None if of_poses else units, **options)
     except (ValueError, TypeError) as error:
         raise ValueError(f"[track]: {error}") from None
 
 
-def shots_of_track(track: "Track", table: Mapping[str, Any], place: Scene | Body) -> Experiments:
-    """The shots of a track, in the scene of the study or in those of the poses of its body."""
-    if isinstance(place, Scene):
+def shots_of_track(track: "Track", table: Mapping[str, Any], owner: Scene | Body) -> Experiments:
+    """Shots of a track's impacts in the study's scene `owner`, or in those of the body's poses."""
+    if isinstance(owner, Scene):
         if "near_m" in table:
             raise ValueError("`near_m` in [track] is for bodies, which have poses.")
-        if len(track.units) != place.size:
+        if len(track.units) != owner.size:
             raise ValueError(
-                f"`columns` in [track] must be those of {place.size} coordinates, one of "
+                f"`columns` in [track] must be those of {owner.size} coordinates, one of "
                 f"each body of the scene, but are {len(track.units)}."
             )
     near = {"near": table["near_m"]} if "near_m" in table else {}
     try:
-        return track.experiments(place, **near)
+        return track.experiments(owner, **near)
     except ValueError as error:
         raise ValueError(f"[track]: {error}") from None
 
 
 def shots_of_bounces(table: Mapping[str, Any]) -> Experiments:
-    """The shots of bounces that were heard, of the table [bounces]."""
+    """Shots of a ball that bounces at the times that the table [bounces] lists."""
     check_keys("[bounces]", table, BOUNCES, ("times", "sigma"))
     _check_kinds("[bounces]", table)
     try:
@@ -76,12 +79,12 @@ def shots_of_bounces(table: Mapping[str, Any]) -> Experiments:
 
 
 def _check_kinds(where: str, table: Mapping[str, Any]) -> None:
-    """Raise a ValueError for a value that is no text, number or list, where its key asks for it."""
+    """Raise a ValueError for a value whose type is not that of its key in `_KINDS`."""
     for key, value in table.items():
         kind, words = _KINDS[key]
         check_kind(where, key, None if isinstance(value, bool) else value, kind, words)
 
 
-def _only(table: Mapping[str, Any], keys: tuple[str, ...]) -> dict[str, Any]:
-    """The values of these keys, as far as they are there."""
+def _entries(table: Mapping[str, Any], keys: tuple[str, ...]) -> dict[str, Any]:
+    """The entries of a table with these keys; missing keys are left out."""
     return {key: table[key] for key in keys if key in table}

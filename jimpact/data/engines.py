@@ -28,7 +28,7 @@ ENGINE_SCENES = {
 
 
 class EngineImpact(NamedTuple):
-    """What one engine made of one scene.
+    """Outcome of one scene by one engine.
 
     `velocity` (n,): v+ over v1-. `momentum` and `energy_ratio`: after over before (None with a
     wall). `nearest_law` with `nearest_e`, among Moreau, Binary and LZB with Hertz contacts or
@@ -58,7 +58,7 @@ class EngineImpacts(Tabular):
 
     @property
     def table(self) -> Table:
-        """A row a measurement."""
+        """Table: a row for each measurement; velocities v+ of up to five balls over v1-."""
         columns = [Column(name) for name in ("engine", "version", "scene", "setting")]
         columns += [Column(f"v{i}", "+.3f") for i in range(1, 6)]
         columns += [Column("momentum", ".3f"), Column("energy_ratio", ".3f", "energy")]
@@ -74,7 +74,7 @@ class EngineImpacts(Tabular):
 
 
 def engine_impacts(engine: str | None = None, scene: str | None = None) -> EngineImpacts:
-    """What some thirty physics engines make of balls that touch, and the law nearest to each.
+    """Outcomes of impacts of touching balls by some thirty physics engines, and the nearest laws.
 
     Each engine was asked for e in its own documented way. Scenes `ji.data.ENGINE_SCENES`: S1 three
     balls, e = 1; S2 five; S3 three, e = .5; S4 two and a wall; S8 a light ball between two heavy
@@ -109,7 +109,7 @@ def engine_impacts(engine: str | None = None, scene: str | None = None) -> Engin
 
 
 def _row(line: dict[str, str]) -> EngineImpact:
-    """A line of the file."""
+    """The measurement of a line of the bundled file, values by column."""
     count = len(ENGINE_SCENES[line["scene"]].masses)
     return EngineImpact(
         engine=line["engine"],

@@ -44,8 +44,8 @@ def ellipse_impacts() -> Experiments:
     values, units, labels = read_shots(str(_DATA / "ellipse_impacts.csv"))
     a, b = ELLIPSE_AXES
     sine, cosine = np.sin(values["q"][:, 2]), np.cos(values["q"][:, 2])
-    height = np.hypot(a * sine, b * cosine)
-    arm = (b**2 - a**2) * sine * cosine / height
+    height = np.hypot(a * sine, b * cosine)  # h
+    arm = (b**2 - a**2) * sine * cosine / height  # c
     mass = ELLIPSE_MASS * np.array([1.0, 1.0, (a**2 + b**2) / 4])
     scenes = [
         Scene(mass, [[0.0], [1.0], [x]], tangents=[[1.0], [0.0], [h]]) for x, h in zip(arm, height)

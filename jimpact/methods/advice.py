@@ -104,16 +104,19 @@ class Trial(NamedTuple):
     scene: Scene
 
     def varied(self, velocity: np.ndarray, stiffness: np.ndarray) -> tuple[dict[str, Any], int]:
-        """Rows to run, of stiffness or one of a law without it, and how many of them together."""
+        """Arguments to vary, by name with a row for each impact, and the rows of a batch.
+
+        Stiffness (r, m) [N/m^eta] of a law that has one, else v- (1, n) [m/s]: one impact.
+        """
         rows, contacts = stiffness.shape
         if "stiffness" not in free_parameters_of(self.law):
             return {"velocity": velocity[None, :]}, max(1, LANES // contacts**2)
         return {"stiffness": stiffness}, CHUNK if contacts <= FEW_CONTACTS else min(rows, CHUNK)
 
     def run(self, velocity: np.ndarray, varied: dict[str, Any]) -> Outcomes:
-        """Outcomes over rows; scenes with and without gaps share one compiled program."""
+        """Outcomes of impacts at v- (n,), one for each row of the arguments `varied`."""
         scene = self.scene
-        if scene.gaps is None:
+        if scene.gaps is None:  # scenes with and without gaps share one compiled program
             scene = with_gaps(scene, jnp.zeros(scene.contacts, scene.mass.dtype))
         return varied_impacts(self.law, scene, jnp.asarray(velocity), varied)
 
@@ -194,17 +197,18 @@ def advise(
     check_law(law, scene, v.dtype)
     situation = situation_of(scene, np.asarray(v), law, stiffness is not None)
     mixed = len(np.unique(np.asarray(exponent, float))) > 1
+    # gaps, and contacts with unequal exponents, have no outcome in ratios of stiffness alone
     absolute = bool(situation.gapped.any()) or (mixed and bool(situation.coupled))
     if absolute and stiffness is None:
         raise ValueError(_missing_stiffness(situation))
     nominal = np.broadcast_to(np.asarray(k, v.dtype), (scene.contacts,))
     unknown = _unknown_stiffnesses(situation, nominal, factors, absolute)
-    tried = _samples(nominal, unknown, samples, seed)
+    tried = _stiffnesses_to_try(nominal, unknown, samples, seed)
     laws, options = trials(situation, law), (float(tolerance), timing, progress)
-    return _advice(situation, laws, unknown, tried, slice(-samples, None), *options)
+    return _simplest_law(situation, laws, unknown, tried, slice(-samples, None), *options)
 
 
-def _advice(
+def _simplest_law(
     situation: Situation,
     laws: dict[str, Trial],
     unknown: tuple[Unknown, ...],
@@ -214,7 +218,12 @@ def _advice(
     timing: bool,
     progress: float | None,
 ) -> Advice:
-    """Runs every law over stiffnesses k (r, m), chooses the reference and the simplest near it."""
+    """Compare all laws with the reference, and advise the simplest one within `tolerance`.
+
+    Each runs over stiffnesses k (r, m), row 0 the nominal ones, in which the `unknown` ones vary;
+    `random` are the rows drawn at random. The reference is Compliant where gaps count or contacts
+    re-close, else LZB.
+    """
     v = situation.velocity
     each = {name: partial(_outcomes, law, v, progress=progress) for name, law in laws.items()}
     outcomes, left_out = at_points(each, k)
@@ -222,7 +231,7 @@ def _advice(
         if name in left_out:
             raise RuntimeError(f"The reference law {name} {left_out[name]}")
     laws = {name: laws[name] for name in outcomes}
-    apart = _reclosing(situation, outcomes)
+    apart = _reclosing_distance(situation, outcomes)  # of LZB and Compliant
     follows_gaps = situation.gapped.any() or apart > tolerance / SMALL_PART
     name = "compliant" if follows_gaps else "lzb"
     outcomes[name].check_first(f"The reference law {name} fails on this scene")
@@ -235,7 +244,9 @@ def _advice(
     suffice = [key for key, c in candidates.items() if c.usable and c.worst <= tolerance]
     chosen = suffice[0] if suffice else name
     if "rtol" in options_of(type(laws[chosen].law)):
-        candidates[chosen] = _loosened(candidates[chosen], situation, reference, tolerance)
+        candidates[chosen] = _with_coarsest_rtol(
+            candidates[chosen], situation, reference, tolerance
+        )
     gap_ratio = None
     if situation.gapped.any():
         scale = gap_scale(situation.scene, laws["compliant"].law, v)
@@ -250,7 +261,7 @@ def _advice(
         candidates=candidates,
         blocks=_with_simplest_laws(situation, candidates, outcomes, reference, tolerance),
         stiffness=k[0],
-        unknown=_effects(situation, unknown, reference, tolerance),
+        unknown=_with_effects(situation, unknown, reference, tolerance),
         rows=len(k),
         gap_ratio=gap_ratio,
         far=tuple(np.flatnonzero(situation.far).tolist()),
@@ -260,7 +271,7 @@ def _advice(
 
 
 def _checked_range(factors: tuple[float, float] | None, known: bool) -> tuple[float, float]:
-    """The range of a stiffness ratio, as factors."""
+    """Low and high factor on each unknown stiffness, checked; `known`: its value was given."""
     if factors is None:
         return (1.0, 1.0) if known else UNKNOWN_RANGE
     ends = np.asarray(factors)
@@ -275,7 +286,7 @@ def _checked_range(factors: tuple[float, float] | None, known: bool) -> tuple[fl
 
 
 def _missing_stiffness(situation: Situation) -> str:
-    """The message where ratios of stiffnesses are not enough."""
+    """Error message: the absolute stiffness must be given, and why."""
     if situation.gapped.any():
         named = ", ".join(str(j + 1) for j in np.flatnonzero(situation.gapped))
         return (
@@ -290,7 +301,10 @@ def _missing_stiffness(situation: Situation) -> str:
 
 
 def situation_of(scene: Scene, velocity: np.ndarray, law: LZB, known: bool) -> Situation:
-    """Blocks and gaps of a scene at v- (n,); `known`: whether the stiffness of `law` is known."""
+    """Blocks of coupled contacts, and the gaps that count, of a scene at v- (n,) [m/s].
+
+    `known`: the stiffness of `law` is that of the contacts, not a placeholder.
+    """
     gamma = np.asarray(gap_velocity(scene, velocity))
     opened = ~np.asarray(scene.closed)
     far = opened & ~_can_close(scene, velocity, law, known)
@@ -298,7 +312,7 @@ def situation_of(scene: Scene, velocity: np.ndarray, law: LZB, known: bool) -> S
         assert scene.gaps is not None
         scene = with_gaps(scene, jnp.where(jnp.asarray(far), jnp.inf, scene.gaps))
     blocks = blocks_of(scene, gamma, np.flatnonzero(~far), law.friction is not None)
-    acting, gapped = np.zeros((2, len(gamma)), bool)
+    acting, gapped = np.zeros((2, len(gamma)), bool)  # in a block that approaches; and open
     for block in blocks:
         contacts = list(block.contacts)
         acting[contacts] = block.approaches
@@ -313,15 +327,17 @@ def situation_of(scene: Scene, velocity: np.ndarray, law: LZB, known: bool) -> S
 
 
 def _can_close(scene: Scene, velocity: np.ndarray, law: LZB, known: bool) -> np.ndarray:
-    """Which contacts (m,) can close while others are loaded; in a chain all, geometry is fixed.
+    """Mask (m,) of contacts that can close while others are loaded; in a chain all.
 
-    No gap velocity exceeds `sqrt(W_jj 2 T)` as long as no energy is gained.
+    Equation: `gap_j <= sqrt(W_jj 2 T-) t`: without a gain of energy no gap velocity exceeds the
+    root. The loads last t = `LONGEST_CONTACT`, or `CONTACT_TIMES delta_c / max(-gamma-)` if the
+    stiffness is `known`.
     """
     if scene.walls is not None or scene.gaps is None:
         return np.ones(scene.contacts, bool)
     mass, normals = dense_mass(scene), np.asarray(scene.normals)
-    inverse = np.sum(normals * np.asarray(solve_mass(scene, scene.normals)), axis=0)
-    fastest = np.sqrt(inverse * (velocity @ mass @ velocity))
+    diagonal = np.sum(normals * np.asarray(solve_mass(scene, scene.normals)), axis=0)  # W_jj
+    fastest = np.sqrt(diagonal * (velocity @ mass @ velocity))
     duration = LONGEST_CONTACT
     approach = float(-np.min(normals.T @ velocity))
     if known and approach > 0:
@@ -333,16 +349,20 @@ def _can_close(scene: Scene, velocity: np.ndarray, law: LZB, known: bool) -> np.
 def blocks_of(
     scene: Scene, gamma: np.ndarray, contacts: np.ndarray, friction: bool
 ) -> tuple[ContactBlock, ...]:
-    """These contacts in blocks that feel each other."""
+    """Blocks of the given `contacts` (indices), with their kinetic angles [deg].
+
+    Two contacts share a block if they are coupled (W_ij is not 0; with `friction` also between
+    normals and tangents), directly or through others. `gamma` (m,) [m/s] are gap velocities.
+    """
     cosine = _largest_cosines(scene, friction)[np.ix_(contacts, contacts)]
     angle = np.degrees(np.asarray(kinetic_angles(scene)))
-    touch = cosine > precision(cosine.dtype).accumulated  # of normals and of M^-1
-    label = components(touch | np.eye(len(contacts), dtype=bool))
+    coupled = cosine > precision(cosine.dtype).accumulated  # rounding of normals and of M^-1
+    label = components(coupled | np.eye(len(contacts), dtype=bool))
     blocks = []
-    for first in np.unique(label):
-        members = np.flatnonzero(label == first)
+    for each in np.unique(label):
+        members = np.flatnonzero(label == each)
         inside = np.ix_(contacts[members], contacts[members])
-        angles = angle[inside][np.triu(touch[np.ix_(members, members)], 1)]
+        angles = angle[inside][np.triu(coupled[np.ix_(members, members)], 1)]
         ends = (float(angles.min()), float(angles.max())) if angles.size else None
         joined = contacts[members]
         blocks.append(ContactBlock(tuple(joined.tolist()), bool((gamma[joined] < 0).any()), ends))
@@ -351,13 +371,17 @@ def blocks_of(
 
 @full_precision
 def _largest_cosines(scene: Scene, friction: bool) -> np.ndarray:
-    """Largest |cosine| (m, m) between normals of two contacts, with friction tangents, too."""
+    """Largest `|W_ij| / sqrt(W_ii W_jj)` (m, m) between the directions of two contacts.
+
+    Directions of a contact are its normal and, with friction, its tangents.
+    """
     if not friction:
         return np.abs(np.cos(np.asarray(kinetic_angles(scene))))
     assert scene.tangents is not None
     columns = jnp.concatenate([scene.normals, scene.tangents], axis=1)
     w = np.asarray(columns.T @ solve_mass(scene, columns))
     size, m = np.sqrt(np.diag(w)), scene.contacts
+    # the contact of each column
     contact = np.concatenate([np.arange(m), np.repeat(np.arange(m), (len(w) - m) // m)])
     largest = np.zeros((m, m))
     np.maximum.at(largest, (contact[:, None], contact[None, :]), np.abs(w / np.outer(size, size)))
@@ -367,7 +391,10 @@ def _largest_cosines(scene: Scene, friction: bool) -> np.ndarray:
 def _unknown_stiffnesses(
     situation: Situation, stiffness: np.ndarray, factors: tuple[float, float], absolute: bool
 ) -> tuple[Unknown, ...]:
-    """The stiffnesses or ratios that are not known; `absolute`: not only ratios count."""
+    """Stiffnesses of coupled contacts known only to a factor; none if both factors are equal.
+
+    Ratios to the first contact of the block, unless the `absolute` stiffness [N/m^eta] counts.
+    """
     if factors[0] == factors[1]:
         return ()
     unknown = []
@@ -382,13 +409,13 @@ def _unknown_stiffnesses(
     return tuple(unknown)
 
 
-def _samples(
+def _stiffnesses_to_try(
     stiffness: np.ndarray, unknown: tuple[Unknown, ...], samples: int, seed: int
 ) -> np.ndarray:
-    """Stiffnesses (r, m): the nominal ones, each unknown by itself, corners, log-uniform samples.
+    """Stiffnesses (r, m) to try: rows of changes of ln k of the unknown ones from the nominal.
 
-    By itself an unknown has the places `ALONE` and a nudge up and down, after those of the one
-    before it.
+    In order: no change; each unknown by itself, at the places `ALONE` of its range and by +- NUDGE;
+    corners of the ranges of all; `samples` log-uniform draws.
     """
     count, random = len(unknown), np.random.default_rng(seed)
     if count == 0:
@@ -398,7 +425,8 @@ def _samples(
     places = np.concatenate(
         [low + np.outer(ALONE, high - low), [[NUDGE] * count, [-NUDGE] * count]]
     )
-    single = places.T[:, :, None] * np.eye(count)[:, None, :]  # unknown, place, change of each
+    # axes: the unknown that changes, its place, change of ln k of every unknown
+    single = places.T[:, :, None] * np.eye(count)[:, None, :]
     if 2**count <= CORNERS:
         ends = np.array(list(itertools.product((0.0, 1.0), repeat=count)))
     else:
@@ -413,7 +441,10 @@ def _samples(
 
 
 def trials(situation: Situation, law: LZB) -> dict[str, Trial]:
-    """Laws with the parameters of `law` by name, the simplest first, with their scenes."""
+    """Laws by name with e, k, eta and mu of `law`, the simplest first, and the scenes to try.
+
+    A law that uses gaps gets the scene with gaps that count; others take its contacts as closed.
+    """
     v, m = situation.velocity, situation.scene.contacts
     e, k = (jnp.broadcast_to(x, (m,)).astype(v.dtype) for x in (law.restitution, law.stiffness))
     mu, touching = law.friction, situation.touching
@@ -435,21 +466,22 @@ def trials(situation: Situation, law: LZB) -> dict[str, Trial]:
 def _outcomes(
     trial: Trial, velocity: np.ndarray, stiffness: np.ndarray, progress: float | None
 ) -> Outcomes:
-    """Outcomes over rows of stiffness (r, m); one row of a law without it."""
-    varied, lanes = trial.varied(velocity, stiffness)
+    """Outcomes of a law at v- (n,) over stiffnesses (r, m); one outcome of a law without them."""
+    varied, batch = trial.varied(velocity, stiffness)
     count = len(next(iter(varied.values())))
     with counting_bar(count, "impacts", progress) as advance:
-        return in_batches(partial(trial.run, velocity), varied, lanes, advance)
+        return in_batches(partial(trial.run, velocity), varied, batch, advance)
 
 
 def _costs(laws: dict[str, Trial], velocity: np.ndarray, stiffness: np.ndarray) -> dict[str, float]:
-    """Time of one impact in a batch over the cheapest law's: medians, side by side."""
+    """Median time of one impact in a full batch by each law, over that of the cheapest law."""
     runs, counts = [], []
     for trial in laws.values():
-        varied, lanes = trial.varied(velocity, stiffness)
-        full = {name: np.resize(x, (lanes, *x.shape[1:])) for name, x in varied.items()}
+        varied, batch = trial.varied(velocity, stiffness)
+        # rows repeated until the batch is full
+        full = {name: np.resize(x, (batch, *x.shape[1:])) for name, x in varied.items()}
         runs.append(partial(trial.run, velocity, jax.device_put(full)))
-        counts.append(lanes)
+        counts.append(batch)
     each = [np.median(times) / count for times, count in zip(in_turns(runs, ROUNDS), counts)]
     return {name: float(x / min(each)) for name, x in zip(laws, each)}
 
@@ -457,8 +489,11 @@ def _costs(laws: dict[str, Trial], velocity: np.ndarray, stiffness: np.ndarray) 
 # -------------------------------------------------------------------------- the evidence
 
 
-def _reclosing(situation: Situation, outcomes: dict[str, Outcomes]) -> float:
-    """Largest distance between LZB and Compliant, both on contacts without gaps."""
+def _reclosing_distance(situation: Situation, outcomes: dict[str, Outcomes]) -> float:
+    """Largest `|v+_LZB - v+_Compliant|_M / |v-|_M` of contacts without gaps; with gaps 0.
+
+    The two differ where contacts open and close again.
+    """
     lzb, compliant = outcomes["lzb"], outcomes["compliant"]
     usable = ~(lzb.failed | compliant.failed)
     if situation.gapped.any() or not usable.any():
@@ -474,7 +509,11 @@ def _candidate(
     random: slice,
     cost: float | None,
 ) -> Candidate:
-    """The record of a law with its outcomes (one row for all, or one each)."""
+    """Summary of a law: v+ and its range, errors against the reference, status, cost.
+
+    The law is used at the nominal stiffness, row 0 of `outcomes`; `reference` has a row for each
+    stiffness tried, `random` are those drawn at random.
+    """
     error = situation.distance(outcomes.velocity[:1] - reference.velocity)
     return Candidate(
         law=trial.law,
@@ -489,10 +528,13 @@ def _candidate(
     )
 
 
-def _loosened(
+def _with_coarsest_rtol(
     candidate: Candidate, situation: Situation, reference: Outcomes, tolerance: float
 ) -> Candidate:
-    """The law with an rtol for this tolerance, tightened until its error is a small part of it."""
+    """The candidate with the coarsest rtol, a power of ten, that suffices for this tolerance.
+
+    It changes v+ by less than `tolerance / SMALL_PART` in the energy norm over that of v-.
+    """
     rtol = min(10.0 ** math.floor(math.log10(tolerance / SMALL_PART)), COARSEST_RTOL)
     finest = default_rtol("time", situation.velocity.dtype)
     while True:
@@ -513,19 +555,23 @@ def _with_simplest_laws(
     reference: Outcomes,
     tolerance: float,
 ) -> tuple[ContactBlock, ...]:
-    """The blocks, each with the simplest law whose impulses there move v+ within tolerance."""
+    """The blocks, each with the simplest law that suffices there; None if none does.
+
+    Equation: the law's impulses in the block, those of the reference elsewhere, change v+ by
+    `M^-1 (N dp + H_t dp_t)`, at most `tolerance` in the energy norm over that of v-.
+    """
     m, blocks = situation.scene.contacts, []
-    moved = jax.vmap(partial(velocity_change, situation.scene))
+    changes = jax.vmap(partial(velocity_change, situation.scene))
     for block in situation.blocks:
         names = candidates if block.approaches else ()
         inside = np.isin(np.arange(m), block.contacts)
         for name in names:
-            out, side = outcomes[name], None
+            out, dp_t = outcomes[name], None
             if t := reference.tangential.shape[1]:
-                each = np.repeat(inside, t // m)
-                side = (out.tangential[:1] - reference.tangential) * each
-            wrong = moved((out.impulse[:1] - reference.impulse) * inside, side)
-            within = np.nanmax(situation.distance(np.asarray(wrong))) <= tolerance
+                of_block = np.repeat(inside, t // m)  # mask (t,) of tangents
+                dp_t = (out.tangential[:1] - reference.tangential) * of_block
+            dv = changes((out.impulse[:1] - reference.impulse) * inside, dp_t)
+            within = np.nanmax(situation.distance(np.asarray(dv))) <= tolerance
             if within and candidates[name].status != "order_dependent":
                 block = block._replace(law=name)
                 break
@@ -533,14 +579,19 @@ def _with_simplest_laws(
     return tuple(blocks)
 
 
-def _effects(
+def _with_effects(
     situation: Situation, unknown: tuple[Unknown, ...], reference: Outcomes, tolerance: float
 ) -> tuple[Unknown, ...]:
-    """The unknown stiffnesses with what each does by itself: its rows follow the nominal one."""
+    """The unknown stiffnesses k with the changes of v+ that each causes by itself.
+
+    Equation: `alone = max |v+(k) - v+(nominal)|` over its range, in the energy norm over that of
+    v-; `needed = tolerance / |d v+ / d ln k|`, the derivative by central differences. Rows of the
+    reference are in the order of `_stiffnesses_to_try`.
+    """
     each, places = [], len(ALONE) + 2
     for i, u in enumerate(unknown):
         v = reference.velocity[1 + i * places :][:places]
-        *_, up, down = v
+        *_, up, down = v  # ln k changed by +- NUDGE
         alone = float(np.nanmax(situation.distance(v[: len(ALONE)] - reference.velocity[0])))
         slope = float(situation.distance(up - down)) / (2 * NUDGE)
         needed = tolerance / slope if slope > 0 else math.inf

@@ -1,4 +1,4 @@
-"""What `advise` reports: half a page, with the numbers of the scene."""
+"""Report of `advise`: half a page, with the numbers of the scene."""
 
 import math
 import textwrap
@@ -72,7 +72,7 @@ class Candidate:
 
     @property
     def usable(self) -> bool:
-        """Whether the status allows to use the outcome, whatever order contacts are numbered in."""
+        """True if the status is no failure, and v+ does not depend on how contacts are numbered."""
         code = CODE[self.status]
         return not STATUS[code].failure and self.status != "order_dependent"
 
@@ -131,7 +131,7 @@ class Advice(Tabular):
 
     @property
     def reason(self) -> str:
-        """What decided, and how far off the simpler laws are."""
+        """Sentence: why this law is advised, and the error of the best simpler law."""
         return "; ".join(filter(None, (_cause(self), _closest_simpler(self))))
 
     def to_dict(self) -> dict[str, Any]:
@@ -152,10 +152,10 @@ class Advice(Tabular):
 
     @property
     def table(self) -> Table:
-        """A row for each law, below the advice: half a page."""
+        """The advice, its reason, and a row for each law: half a page."""
         verdict = "within" if self.within else "NOT within"
         head = [f"Advice: {as_code(self.law)}, {verdict} {share(self.tolerance)}"]
-        for line in (self.reason, *_contacts(self)):
+        for line in (self.reason, *_block_lines(self)):
             head += textwrap.wrap(line, _WIDTH)
         if self.unknown:
             head += ["", *str(_unknown_table(self.unknown)).splitlines()]
@@ -187,7 +187,7 @@ def _from_one(contacts: tuple[int, ...]) -> list[int]:
 
 
 def _unknown_table(unknown: tuple[Unknown, ...]) -> Table:
-    """What each unknown stiffness does by itself, the strongest first."""
+    """Table of unknown stiffnesses, the strongest first: range, change of v+, accuracy needed."""
     columns = (
         Column("unknown"),
         Column("range"),
@@ -216,7 +216,7 @@ def share(x: float) -> str:
 
 
 def as_code(law: Declared) -> str:
-    """The law as one writes it: `LZB(0.9, 1, 1.5, rtol=0.001)`."""
+    """Python expression of a law: `LZB(0.9, 1, 1.5, rtol=0.001)`."""
     words = []
     for each in fields(law):
         value = getattr(law, each.name)
@@ -232,7 +232,7 @@ def as_code(law: Declared) -> str:
 
 
 def _in_code(value: Any) -> str:
-    """A word, a number, or a list of numbers unless all are equal."""
+    """Python expression of a value: a string, one number, or a list of unequal numbers."""
     if isinstance(value, str):
         return repr(value)
     array = np.asarray(value)
@@ -241,8 +241,11 @@ def _in_code(value: Any) -> str:
     return f"[{', '.join(f'{x:.6g}' for x in array)}]"
 
 
-def _contacts(advice: Advice) -> list[str]:
-    """Which contacts are coupled, and the law that suffices there: a line a group."""
+def _block_lines(advice: Advice) -> list[str]:
+    """Lines of the report: contacts of each block, their kinetic angles, the law that suffices.
+
+    Decoupled contacts with the same law share a line.
+    """
     groups: dict[tuple[str, Any], list[int]] = {}
     for block in advice.blocks:
         law = f"{block.law or 'no law'} suffices"
@@ -264,7 +267,7 @@ def _contacts(advice: Advice) -> list[str]:
 
 
 def _cause(advice: Advice) -> str:
-    """What decided: no approach, contacts that act alone, gaps, or stiffnesses."""
+    """Phrase: the cause of the advice (no approach, contacts that act alone, gaps, stiffnesses)."""
     at_work = [block for block in advice.blocks if block.approaches]
     if not at_work:
         slowest = float(advice.gap_velocity.min())
@@ -293,7 +296,7 @@ def _cause(advice: Advice) -> str:
 
 
 def _stiffnesses(advice: Advice, at_work: list[ContactBlock]) -> str:
-    """The unknown stiffnesses with their ranges, or else the ratios within coupled contacts."""
+    """Phrase: unknown stiffnesses with their ranges, else known ratios within coupled contacts."""
     words = [f"{u.name} in [{u.low:.3g}, {u.high:.3g}]" for u in advice.unknown]
     if not words:
         k, pairs = advice.stiffness, [(b.contacts[0], j) for b in at_work for j in b.contacts[1:]]
@@ -303,7 +306,7 @@ def _stiffnesses(advice: Advice, at_work: list[ContactBlock]) -> str:
 
 
 def _closest_simpler(advice: Advice) -> str:
-    """How far off the best of the simpler laws is, or what it violates."""
+    """Phrase: error of the best of the simpler laws, or its failure; '' if there is none."""
     names = list(advice.candidates)
     simpler = {name: advice.candidates[name] for name in names[: names.index(advice.name)]}
     if not simpler or not any(block.approaches for block in advice.blocks):

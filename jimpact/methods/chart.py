@@ -77,13 +77,13 @@ class Point:
 
 @dataclass(frozen=True)
 class Reference:
-    """What errors are measured from: how it was computed, how uncertain it is (relative)."""
+    """Solution of the impact that errors are measured from."""
 
-    how: str
-    uncertainty: dict[str, float]
-    velocity: np.ndarray
-    impulse: np.ndarray
-    duration: float
+    how: str  # it was computed, in words
+    uncertainty: dict[str, float]  # relative, by quantity
+    velocity: np.ndarray  # v+ (n,) [m/s]
+    impulse: np.ndarray  # p (m,) [N s]
+    duration: float  # [s]
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ class WorkPrecision(Tabular):
 
     @property
     def table(self) -> Table:
-        """A row for each point, and how they were measured."""
+        """Table: errors and times, a row for each point; notes say how they were measured."""
         heads = ("v+", "impulse", "energy", "time", "gradient")
         columns = (
             Column("method"),
@@ -238,7 +238,9 @@ def work_precision(
     ladders: dict[str, Any] = {m.name: m.ladder for m in chosen} | dict.fromkeys(laws, (None,))
     truth, other_truth = programs[exact.name].at(FINEST), programs[second.name].at(SECOND)
     with counting_bar(sum(map(len, ladders.values())), "errors", progress) as advance:
-        climbed = {name: partial(_climbed, programs[name], name, advance) for name in ladders}
+        climbed = {
+            name: partial(_outcomes_over_ladder, programs[name], name, advance) for name in ladders
+        }
         solutions, raised = at_points(climbed, ladders)
     rows = [(n, setting, s) for n, row in solutions.items() for setting, s in zip(ladders[n], row)]
     times = _times([(programs[name], setting) for name, setting, _ in rows], repeats, progress)
@@ -268,7 +270,7 @@ def work_precision(
 
 
 def shared_parameters(law: LZB) -> dict[str, Any]:
-    """What an algebraic law has in common with it: restitution, and friction where there is any."""
+    """Parameters that algebraic laws share with LZB: `restitution`, and `friction` if any."""
     friction = {} if law.friction is None else {"friction": law.friction}
     return {"restitution": law.restitution} | friction
 
@@ -315,7 +317,10 @@ def _chosen(
     settings: Mapping[str, Sequence[float]],
     case: Case,
 ) -> tuple[list[Contender], dict[str, str]]:
-    """Contenders with their settings; without names all that support the law, else why not."""
+    """Contenders with the ladders of settings to run, and reasons why others are left out, by name.
+
+    `methods` None: all that support the law of the case; `settings` replaces ladders by name.
+    """
     left_out: dict[str, str] = {}
     if methods is None:
         reasons = {name: each.supports(case.law) for name, each in CONTENDERS.items()}
@@ -332,7 +337,7 @@ def _chosen(
 
 
 def _supporting(argument: str, methods: Sequence[str | Contender], case: Case) -> list[Contender]:
-    """These contenders, if they support the law."""
+    """Contenders by name, checked that they support the law of the case."""
     chosen = contenders_of(argument, methods, CONTENDERS)
     for contender in chosen:
         reason = contender.supports(case.law)
@@ -345,7 +350,7 @@ def _supporting(argument: str, methods: Sequence[str | Contender], case: Case) -
 
 
 def _reference(name: str | None, case: Case) -> Contender:
-    """The contender that errors are measured from."""
+    """The contender that errors are measured from, one with an rtol; None: 'time'."""
     (contender,) = _supporting("reference", [name or "time"], case)
     if contender.setting != "rtol":
         raise ValueError(f"Argument `reference` must take an rtol, but is {name!r}.")
@@ -371,17 +376,23 @@ class Programs:
     compile_time: dict[str, float] = field(default_factory=dict)
 
     def at(self, setting: float | None) -> Outcomes:
-        """Outcomes and Jacobian of the sample, as numpy; evaluations NaN where not counted."""
-        solution = jax.tree.map(np.asarray, self.sampled(setting))
-        work = np.where(solution.evaluations == UNCOUNTED, np.nan, solution.evaluations)
+        """Outcomes (S,) of the sampled impacts at a setting, with Jacobians if known, in NumPy.
+
+        Evaluations are NaN where they are not counted.
+        """
+        outcomes = jax.tree.map(np.asarray, self.sampled(setting))
+        evaluations = np.where(outcomes.evaluations == UNCOUNTED, np.nan, outcomes.evaluations)
         jacobian = None if self.gradient is None else np.asarray(self.gradient(setting))
-        return solution._replace(evaluations=work, jacobian=jacobian)
+        return outcomes._replace(evaluations=evaluations, jacobian=jacobian)
 
 
-def _climbed(
+def _outcomes_over_ladder(
     programs: Programs, name: str, advance: Callable[[int], None], ladders: Mapping[str, Any]
 ) -> list[Outcomes]:
-    """The sample at every setting of a contender's ladder."""
+    """Outcomes of the sampled impacts at every setting of the ladder of contender `name`.
+
+    `advance` is called with the number of settings, even if the contender raises.
+    """
     try:
         return [programs.at(setting) for setting in ladders[name]]
     finally:
@@ -391,18 +402,18 @@ def _climbed(
 def _method_programs(
     contender: Contender, case: Case, gradients: bool, durations: bool
 ) -> Programs:
-    """Programs of a contender at the stiffnesses of the case."""
+    """Programs of a contender over the stiffnesses (batch, m) of the case, jitted and vmapped."""
     if not contender.jax:
         return _host_programs(contender, case)
     names, apart = tuple(shared_parameters(case.law)), contender.duration_apart
 
     def solve(k: jax.Array, case: Case, setting: jax.Array) -> Outcomes:
-        """The impact with stiffness k (m,)."""
+        """Outcome of the case's impact with stiffness k (m,)."""
         law = with_entries(case.law, ("stiffness",), k)
         return solved(contender, law, case.scene, case.velocity, setting)[1]
 
     def timed(k: jax.Array, case: Case, setting: jax.Array) -> Outcomes:
-        """The same, without a duration that would cost a run of its own."""
+        """Outcome with a duration of NaN where it costs a run of its own or is not wanted."""
         solution = solve(k, case, setting)
         return solution._replace(duration=jnp.nan) if apart or not durations else solution
 
@@ -410,7 +421,7 @@ def _method_programs(
         """(d v+ / d ln k, d v+ / d e) (n, 2 m), with friction also d v+ / d mu (n, 3 m)."""
 
         def velocity(at: dict[str, jax.Array]) -> jax.Array:
-            """v+ (n,)."""
+            """v+ (n,) [m/s] at the parameters `at` (m,) by name; 'ln k' is a change of ln k."""
             law = case.law
             for name in names:
                 law = with_entries(law, (name,), at[name])
@@ -424,11 +435,12 @@ def _method_programs(
     k, compile_time = case.stiffness, dict[str, float]()
 
     def batch(name: str, function: Callable[..., Any], rows: int) -> Callable[[Any], Any]:
-        """The function of a setting, over the first stiffnesses."""
+        """Program of a setting: the function at each of the first `rows` stiffnesses."""
         each = jax.vmap(function, in_axes=(0, None, None))
         return _compiled(compile_time, name, each, k[:rows], case)
 
     batched = batch("batched", timed, len(k))
+    # errors need the duration, times do not: two programs if it takes a run of its own
     complete = batch("errors", solve, case.sample) if durations and apart else batched
     return Programs(
         single=_compiled(compile_time, "single", timed, k[0], case),
@@ -443,11 +455,14 @@ def _method_programs(
 def _compiled(
     compile_time: dict[str, float], name: str, function: Callable[..., Any], *arguments: Any
 ) -> Callable[[Any], Any]:
-    """The function of a setting; its first call enters the time of compiling."""
+    """`setting -> function(*arguments, setting)`, compiled at its first call.
+
+    That call enters the time of compiling [s] in `compile_time` under `name`.
+    """
 
     @cache
     def compiled() -> Callable[..., Any]:
-        """The compiled function."""
+        """The compiled program of the arguments and a setting."""
         begin = time.perf_counter()
         program = jax.jit(function).lower(*arguments, jnp.ones((), float)).compile()
         compile_time[name] = time.perf_counter() - begin
@@ -459,17 +474,17 @@ def _compiled(
 
 
 def _host_programs(contender: Contender, case: Case) -> Programs:
-    """The same of a contender that runs on the host: loops."""
+    """Programs of a contender that JAX cannot trace: loops over stiffnesses on the host."""
     laws = [with_entries(case.law, ("stiffness",), k) for k in case.stiffness[:SAMPLE]]
     rows = min(HOST_BATCH, len(laws))
 
     def sampled(setting: Any) -> Outcomes:
-        """All outcomes, one after the other."""
+        """Outcomes of the sampled impacts, one after the other."""
         each = [solved(contender, law, case.scene, case.velocity, setting)[1] for law in laws]
         return jax.tree.map(lambda *a: jnp.stack(a), *each)
 
     def alone(setting: Any, count: int = 1) -> list[Any]:
-        """The solver itself, for its time."""
+        """Solutions of the first `count` impacts, without checks: for the time of the solver."""
         return [contender.solve(law, case.scene, case.velocity, setting) for law in laws[:count]]
 
     batched = partial(alone, count=rows)
@@ -477,12 +492,12 @@ def _host_programs(contender: Contender, case: Case) -> Programs:
 
 
 def _law_programs(law: Law, case: Case) -> Programs:
-    """Programs of another law: it has no setting, and its sample is the impact itself."""
+    """Programs of an algebraic law, which has no setting; its sample is the impact itself."""
     law, batch = in_common_dtype(law, case.velocity)[0], len(case.stiffness)
     compile_time: dict[str, float] = {}
 
     def run(v: jax.Array, law: Law, scene: Scene, setting: jax.Array) -> Outcomes:
-        """One impact."""
+        """Outcome of one impact at v (n,); `setting` is not used."""
         return Outcomes.of(impact(law, scene, v))
 
     many, v = jax.vmap(run, in_axes=(0, None, None, None)), case.velocity
@@ -501,10 +516,14 @@ def _law_programs(law: Law, case: Case) -> Programs:
 
 
 def _errors(case: Case, tried: Outcomes, truth: Outcomes) -> dict[str, float]:
-    """Relative errors, the largest over the impacts that were solved."""
+    """Relative errors by quantity, the largest over the sampled impacts; NaN: not computed.
+
+    Equation: `max |dv| / max |v-|`, `max |dp| / max |p|`, `|d(T+ - T-)| / T-`, duration over the
+    longest, Jacobian over `max |v-|`. At rest the largest |v+| and |T+ - T-| take their places.
+    """
     fastest = float(jnp.max(jnp.abs(case.velocity))) or np.abs(truth.velocity).max()
     before = float(kinetic_energy(case.scene, case.velocity)) or np.abs(truth.energy_change).max()
-    compared = {
+    compared = {  # value, exact value, scale
         "velocity": (tried.velocity, truth.velocity, fastest),
         "impulse": (tried.impulse, truth.impulse, np.abs(truth.impulse).max()),
         "energy": (tried.energy_change, truth.energy_change, before),
@@ -520,9 +539,13 @@ def _errors(case: Case, tried: Outcomes, truth: Outcomes) -> dict[str, float]:
 
 
 def _point(
-    label: str, setting: float | None, error: dict[str, float], tried: Outcomes, timings: Any
+    label: str,
+    setting: float | None,
+    error: dict[str, float],
+    tried: Outcomes,
+    timings: Sequence[Timing],
 ) -> Point:
-    """A row of the chart."""
+    """Point of the chart: its errors, the gravest status, mean evaluations, times per impact."""
     status = STATUS[int(np.max(tried.status))].name
     return Point(label, setting, error, float(np.mean(tried.evaluations)), status, *timings)
 
@@ -530,8 +553,11 @@ def _point(
 def _times(
     rows: list[tuple[Programs, float | None]], repeats: int, progress: float | None
 ) -> list[list[Timing]]:
-    """Single and batched time of each row, and with its gradient if it has one; all in turns."""
-    tasks = [
+    """Times per impact of each row (programs, setting): alone, in a batch, with gradient if any.
+
+    All are measured in turns, `repeats` times.
+    """
+    tasks = [  # row, impacts of a call, the call
         (row, impacts, partial(run, value))
         for row, (programs, value) in enumerate(rows)
         for run, impacts in (

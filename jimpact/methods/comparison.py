@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
+import jax
 import numpy as np
 
 from jimpact.core.audits import Audit, audit, nothing_approaches
@@ -42,7 +43,7 @@ class Entry:
 
     @property
     def verdict(self) -> str:
-        """'ok', or what is violated, and a status that is not ok."""
+        """'ok', or the conditions that the audit finds violated, and a status that is not ok."""
         broken = [f"{name} violated" for name in self.audit.broken]
         if self.status != "ok":
             broken.append(self.status)
@@ -79,8 +80,8 @@ class Comparison(Tabular):
     def distances(self) -> dict[str, float]:
         """Root mean square difference [m/s] of each law's v+ from the measured one, if any.
 
-        Velocities of bodies, some of them in rad/s, count by the root of their inertia over that of
-        the largest one: as m/s with as much energy.
+        Equation: `sqrt(mean_i (M_ii / max M_ii) (v_i+ - measured_i)^2)`, weights of 1 in a chain:
+        rotations in rad/s count as m/s with as much energy.
         """
         if self.measured is None:
             return {}
@@ -106,7 +107,7 @@ class Comparison(Tabular):
 
     @property
     def table(self) -> Table:
-        """A row for each law, and the measured velocities."""
+        """Table: a row for each law, and one for the measured velocities."""
         unit = "m/s" if self.scene.walls is not None else ""  # others may be rad/s
         columns = (
             Column("law"),
@@ -175,6 +176,7 @@ def compare(
             "came with it."
         )
     check_kind("laws", laws, Mapping)
+    # the first calls, with compiling, sort out the laws that raise; then all are timed in turns
     first, raised = at_points({n: partial(_first_call, law, scene) for n, law in laws.items()}, v)
     runs = {name: partial(impact, laws[name], scene, v) for name in first}
     each = dict(zip(runs, in_turns(list(runs.values()), _REPEATS)))
@@ -194,6 +196,6 @@ def compare(
     return Comparison(scene, np.asarray(v), entries, left_out | raised)
 
 
-def _first_call(law: Law, scene: Scene, velocity: Any) -> float:
+def _first_call(law: Law, scene: Scene, velocity: jax.Array) -> float:
     """Time [s] of a law's first impact, with compiling."""
     return seconds(partial(impact, law, scene, velocity))

@@ -66,7 +66,7 @@ class Contender(NamedTuple):
     duration_apart: bool = False
 
     def supports(self, law: LZB) -> str | None:
-        """None, or why it cannot integrate this law: what follows the word "it"."""
+        """None, or the reason why it cannot integrate this law, to follow the word "it"."""
         if law.friction is not None and not self.friction:
             return "has no friction"
         refused = self.divides and np.any(law.restitution == 0)
@@ -87,7 +87,7 @@ class _KnownImpulses(Law):
 
 
 def outcome(law: LZB, scene: Scene, velocity: Any, solution: Solution) -> Impact:
-    """Velocities, energy and full status (`impact`'s own checks included) of a solution."""
+    """The `Impact` of a solution's impulses: velocities, energy, status by `impact`'s checks."""
     if law.friction is not None and solution.tangential is None:
         raise ValueError("A contender with friction must return `tangential` impulses (t,).")
     code = jax.numpy.asarray(solution.code)
@@ -98,7 +98,7 @@ def outcome(law: LZB, scene: Scene, velocity: Any, solution: Solution) -> Impact
 def solved(
     contender: Contender, law: LZB, scene: Scene, velocity: Any, setting: Any
 ) -> tuple[Impact, Outcomes]:
-    """One impact by a contender, and what is compared of it."""
+    """Impact by a contender at one setting, and the same as `Outcomes`, to be compared."""
     solution = contender.solve(law, scene, velocity, setting)
     out = outcome(law, scene, velocity, solution)
     return out, Outcomes.of(out, solution)
@@ -165,7 +165,10 @@ CONTENDERS: dict[str, Contender] = {each.name: each for each in _ALL}
 def contenders_of(
     argument: str, methods: Sequence[str | Contender], known: Mapping[str, Contender]
 ) -> list[Contender]:
-    """Contenders of these names among those known, or ones of your own, with names of their own."""
+    """Contenders by name among those `known`, or a user's own with other names, each once.
+
+    `argument` is the name of the caller's argument in errors.
+    """
     if isinstance(methods, str | Contender):
         raise TypeError(f"Argument `{argument}` must be a list, but is {short_repr(methods)}.")
     chosen = [_contender_of(argument, method, known) for method in methods]
@@ -180,7 +183,7 @@ def contenders_of(
 def _contender_of(
     argument: str, method: str | Contender, known: Mapping[str, Contender]
 ) -> Contender:
-    """The contender of this name, or one of your own."""
+    """The known contender of a name; a user's own is checked and returned."""
     if not isinstance(method, Contender):
         check_choice(argument, method, known)
         return known[method]

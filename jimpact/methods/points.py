@@ -41,60 +41,60 @@ TIMELESS = Solution(None)  # of a law, whose impacts are not integrated in time
 
 
 class Outcomes(NamedTuple):
-    """Impacts at points (r,), what tables of methods compare of them; JAX, then numpy.
+    """Numbers of r impacts, to be compared between laws or methods; JAX arrays, or NumPy's."""
 
-    v+ (r, n) [m/s], p (r, m) and p_t (r, t) [N s], T+ - T- [J] and status (r,); of a contender its
-    own status, duration [s] and field evaluations (r,); a Jacobian of v+ where one was asked for.
-    """
-
-    velocity: Any
-    impulse: Any
-    tangential: Any
-    energy_change: Any
-    status: Any
-    code: Any
-    duration: Any
-    evaluations: Any
-    jacobian: Any = None
+    velocity: Any  # v+ (r, n) [m/s]
+    impulse: Any  # p (r, m) [N s]
+    tangential: Any  # p_t (r, t) [N s]
+    energy_change: Any  # T+ - T- (r,) [J]
+    status: Any  # of the impact (r,)
+    code: Any  # own status of a contender (r,)
+    duration: Any  # (r,) [s], NaN of a law
+    evaluations: Any  # of the field (r,), `UNCOUNTED` of a law
+    jacobian: Any = None  # of v+, where one was asked for
 
     @classmethod
     def of(cls, out: Impact, solution: Solution = TIMELESS) -> "Outcomes":
-        """What is compared of an impact, and of the contender's solution behind it, if any."""
+        """Numbers of an impact, and of the contender's solution that it was made of, if any."""
         energy, work = out.energy_change, (solution.code, solution.duration, solution.evaluations)
         return cls(out.velocity, out.impulse, out.tangential_impulse, energy, out.status, *work)
 
     @property
     def failed(self) -> np.ndarray:
-        """Which of them (r,) have a status that is a failure."""
+        """Mask (r,) of impacts whose status is a failure."""
         return np.array([STATUS[int(code)].failure for code in self.status], bool)
 
     def check_first(self, what: str) -> None:
-        """If the first one failed, a RuntimeError says what that means, and the status."""
+        """Raise a RuntimeError that begins with `what` if the first impact failed."""
         if self.failed[0]:
             raise RuntimeError(f"{what}: {STATUS[int(self.status[0])].message}.")
 
     def where_usable(self) -> "Outcomes":
-        """The same, NaN where it failed."""
+        """Outcomes with v+, p and p_t NaN where the impact failed."""
         lost = self.failed[:, None]
-        v, p, side = jax.tree.map(lambda x: np.where(lost, np.nan, x), self[:3])
-        return self._replace(velocity=v, impulse=p, tangential=side)
+        parts = self.velocity, self.impulse, self.tangential
+        v, p, p_t = (np.where(lost, np.nan, x) for x in parts)
+        return self._replace(velocity=v, impulse=p, tangential=p_t)
 
 
 @precise_jit
 def varied_impacts(law: Law, scene: Scene, velocity: jax.Array, varied: dict[str, Any]) -> Outcomes:
-    """Impacts at v- (n,) over rows (r, ...) of parameters of the law, of `gaps`, of `velocity`."""
+    """Outcomes (r,) of impacts at v- (n,) [m/s] with the arguments `varied`, a row each.
+
+    Names are `velocity` (r, n), `gaps` (r, m) [m], or parameters of the law (r, ...).
+    """
 
     def one(values: dict[str, jax.Array]) -> Outcomes:
-        """One impact."""
-        place, tried, v = scene, law, velocity
+        """Outcome with one row of the arguments `values`."""
+        one_scene, one_law, v = scene, law, velocity
         for name, value in values.items():
             if name == "velocity":
                 v = value
             elif name == "gaps":
-                place = with_gaps(scene, value)
+                one_scene = with_gaps(scene, value)
             else:
-                tried = with_entries(tried, (name,), jnp.ravel(value))
-        return Outcomes.of(impact(tried, place, v))
+                one_law = with_entries(one_law, (name,), jnp.ravel(value))
+        return Outcomes.of(impact(one_law, one_scene, v))
 
     return jax.vmap(one)(varied)
 
@@ -111,7 +111,7 @@ class EnergyNorm(NamedTuple):
 
     @classmethod
     def of(cls, scene: Scene, velocity: np.ndarray, watched: Any = None) -> "EnergyNorm":
-        """For a scene at v- (n,); `watched`: indices of the coordinates that count, None: all."""
+        """Norm of a scene at v- (n,) over the coordinates `watched` (indices), None: all."""
         count = scene.size
         index = np.arange(count) if watched is None else np.atleast_1d(np.asarray(watched))
         whole = index.ndim == 1 and index.size > 0 and np.issubdtype(index.dtype, np.integer)
@@ -125,7 +125,7 @@ class EnergyNorm(NamedTuple):
         return cls(mass[np.ix_(index, index)], before, index)
 
     def __call__(self, change: np.ndarray) -> np.ndarray:
-        """Of differences of velocities (..., n)."""
+        """Norms (...) of differences dv (..., n) of velocities."""
         dv = change[..., self.watched]
         return np.sqrt(np.sum((dv @ self.mass) * dv, axis=-1)) / self.before
 
@@ -136,22 +136,24 @@ def in_batches(
     size: int,
     advance: Callable[[int], Any] = lambda count: None,
 ) -> Any:
-    """`run` of rows, arrays (r, ...) in whatever tree, so many at a time on all cores.
+    """Results of `run` over rows, `size` of them at a time, on all cores.
 
-    `advance` is called with the number of rows of each batch.
+    Rows are a tree of arrays (r, ...), results trees with the same r. `advance` is called with the
+    number of rows of each batch.
     """
     count = len(jax.tree.leaves(rows)[0])
     parts: list[Any] = []
     for _, part in in_parts(run, [rows], size):
         advance(min(size, count - size * len(parts)))
         parts.append(part)
+    # without the rows that filled up the last batch
     return jax.tree.map(lambda *x: np.concatenate(x)[:count], *parts)
 
 
 def at_points(
     candidates: Mapping[str, Callable[[Any], Result]], points: Any
 ) -> tuple[dict[str, Result], dict[str, str]]:
-    """What each candidate, a function of the points, makes of them; and why one is left out.
+    """Results of candidates, functions of the points, by name, and reasons why some are missing.
 
     A user's law or contender may fail in any way: one that raises is left out, the others stand.
     """
@@ -172,12 +174,12 @@ def left_out_notes(left_out: Mapping[str, str], what: str = "is left out") -> li
 
 
 def relative_error(value: Any, exact: Any, scale: Any = 1.0) -> np.ndarray:
-    """Largest |difference| (...) of each row (..., n) over a scale, such as the largest |v-|."""
+    """`max_i |value_i - exact_i| / scale` (...) over the last axis of arrays (..., n)."""
     return np.abs(np.asarray(value) - exact).max(axis=-1) / scale
 
 
 def seconds(run: Callable[[], Any], count: int = 1) -> float:
-    """Mean time [s] of `count` calls, results computed."""
+    """Mean time [s] of `count` calls, until their results are computed."""
     begin = time.perf_counter()
     for _ in range(count):
         jax.block_until_ready(run())
@@ -187,9 +189,10 @@ def seconds(run: Callable[[], Any], count: int = 1) -> float:
 def in_turns(
     runs: Sequence[Callable[[], Any]], repeats: int, advance: Callable[[], Any] = lambda: None
 ) -> list[np.ndarray]:
-    """`repeats` times [s] of each of `runs`, fewer of slow ones; `advance` is called after each.
+    """Times [s] of `repeats` calls of each of `runs`, of fewer if they are slow.
 
-    In turns: a busy machine slows all alike.
+    In turns, one measurement of each run after the other: a busy machine slows all alike. Fast runs
+    are called several times for one measurement. `advance` is called after each.
     """
     warm = [min(seconds(run), seconds(run)) for run in runs]  # the first call may compile
     counts = [int(np.clip(SHORT / max(t, 1e-9), 1, MOST_RUNS)) for t in warm]

@@ -61,7 +61,7 @@ class SceneAdvice(Tabular):
     blocks: tuple[ContactBlock, ...]
 
     def reason(self, contact: int) -> str:
-        """Why this contact (from 0) is kept or left out."""
+        """Phrase: the reason why this contact (from 0) is kept or left out."""
         if contact in self.kept:
             return "kept"
         if self.errors[contact] > 0:
@@ -80,7 +80,7 @@ class SceneAdvice(Tabular):
 
     @property
     def table(self) -> Table:
-        """A row for each contact, the most needed first."""
+        """Table: kept contacts and friction, then a row for each contact, largest error first."""
         m = len(self.names)
         head = [
             f"{len(self.kept)} of {m} contacts suffice within {share(self.tolerance)}; "
@@ -112,7 +112,7 @@ class SceneAdvice(Tabular):
         return Table(columns, rows, [*head, ""])
 
     def __str__(self) -> str:
-        """Half a page: the table, as far as its first rows."""
+        """The first `PRINTED` rows of the table: half a page."""
         table, more = self.table, len(self.names) - PRINTED
         notes = [f"and {more} more"] if more > 0 else []
         return str(replace(table, rows=table.rows[:PRINTED], notes=notes))
@@ -128,7 +128,7 @@ def simplest_scene(
     watched: Any = None,
     runs: int = 256,
 ) -> SceneAdvice:
-    """Which contacts, and which friction, an impact needs for v+ within `tolerance`.
+    """Find the contacts, and the friction, that an impact needs for v+ within `tolerance`.
 
     Equation: error `sqrt(dv^T M dv) / sqrt(v-^T M v-)`, dv the change of v+ by what is left out.
     A contact without impulse can be left out exactly: nothing approaches in its group of coupled
@@ -169,16 +169,16 @@ def simplest_scene(
     labels = ("",) * scene.contacts if names is None else tuple(map(str, names))
     check_shape("names", np.empty(len(labels)), (scene.contacts,), "one per contact")
     norm = EnergyNorm.of(scene, np.asarray(v), watched)
-    trial = _Simpler(law, scene, v, norm)
-    whole = trial.run([()])
-    whole.check_first("The law fails on the whole scene")
-    friction, trial = _frictions(trial, whole, tolerance)
-    working, errors, changes = _alone(trial, runs)
-    kept, error = _together(trial, whole, working, errors, tolerance, runs)
-    taking = scene.closed
+    trial = _Trial(law, scene, v, norm)
+    reference = trial.run([()])
+    reference.check_first("The law fails on the whole scene")
+    friction, trial = _simplest_friction(trial, reference, tolerance)
+    working, errors, changes = _effect_of_each_contact(trial, runs)
+    kept, error = _sufficient_contacts(trial, reference, working, errors, tolerance, runs)
+    taking_part = scene.closed
     if law.uses_gaps and scene.gaps is not None:
-        taking = jnp.isfinite(scene.gaps)
-    couples = getattr(trial.law, "friction", None) is not None
+        taking_part = jnp.isfinite(scene.gaps)
+    has_friction = getattr(trial.law, "friction", None) is not None
     gamma = np.asarray(gap_velocity(scene, v))
     return SceneAdvice(
         law=trial.law,
@@ -188,14 +188,14 @@ def simplest_scene(
         tolerance=float(tolerance),
         friction=friction,
         names=labels,
-        impulses=whole.impulse[0],
+        impulses=reference.impulse[0],
         errors=errors,
         changes=changes,
-        blocks=blocks_of(trial.scene, gamma, np.flatnonzero(np.asarray(taking)), couples),
+        blocks=blocks_of(trial.scene, gamma, np.flatnonzero(np.asarray(taking_part)), has_friction),
     )
 
 
-class _Simpler(NamedTuple):
+class _Trial(NamedTuple):
     """A law on a scene of which contacts are left out, at v- (n,), with the norm of errors."""
 
     law: Law
@@ -204,12 +204,12 @@ class _Simpler(NamedTuple):
     norm: EnergyNorm
 
     def without(self, left_out: Any) -> Scene:
-        """The scene whose contacts of these indices have an infinite gap."""
+        """The scene with an infinite gap at the contacts of these indices."""
         gaps = self.gaps([left_out])[0]
         return with_gaps(self.scene, jnp.asarray(gaps)) if len(left_out) else self.scene
 
     def gaps(self, left_out: Sequence[Any]) -> np.ndarray:
-        """Gaps (r, m) where row i leaves these contacts out."""
+        """Gaps (r, m) [m], infinite in row i at the contacts `left_out[i]` (indices)."""
         scene = self.scene
         own = np.zeros(scene.contacts) if scene.gaps is None else np.asarray(scene.gaps)
         gaps = np.tile(own.astype(scene.mass.dtype), (len(left_out), 1))
@@ -218,83 +218,94 @@ class _Simpler(NamedTuple):
         return gaps
 
     def run(self, left_out: Sequence[Any]) -> Outcomes:
-        """An impact for each set of contacts to leave out, some at a time."""
+        """Outcomes (r,) of the impact without each set of contacts in `left_out`, in batches."""
         m = self.scene.contacts
         lanes = max(1, min(LANES, m + 1, ENTRIES // m**2))
         run = partial(varied_impacts, self.law, self.scene, self.velocity)
         return in_batches(run, {"gaps": self.gaps(left_out)}, lanes)
 
-    def changes(self, left_out: Sequence[Any], whole: Outcomes) -> np.ndarray:
+    def changes(self, left_out: Sequence[Any], reference: Outcomes) -> np.ndarray:
         """Changes (r, n) of v+ from that of the whole scene; NaN where the law fails."""
-        return self.run(left_out).where_usable().velocity - whole.velocity[0]
+        return self.run(left_out).where_usable().velocity - reference.velocity[0]
 
 
-def _frictions(
-    trial: _Simpler, whole: Outcomes, tolerance: float
-) -> tuple[dict[str, float], _Simpler]:
-    """The error of each simpler friction, and the simplest that is within tolerance."""
+def _simplest_friction(
+    trial: _Trial, reference: Outcomes, tolerance: float
+) -> tuple[dict[str, float], _Trial]:
+    """Errors of v+ by way to treat friction, and the simplest way that is within tolerance.
+
+    Ways are 'none', and 'one direction' of the tangents at each contact in space.
+    """
     law, scene = trial.law, trial.scene
     if getattr(law, "friction", None) is None or scene.tangents is None:
         return {}, trial
     simpler: Any = replace(law, friction=None)  # type: ignore[call-arg]
     ways = {"none": trial._replace(law=simpler, scene=_with_tangents(scene, None))}
     if scene.tangents.shape[1] == 2 * scene.contacts:
-        along = _with_tangents(scene, _along(scene, whole))
+        along = _with_tangents(scene, _tangents_along_impulses(scene, reference))
         ways["one direction"] = trial._replace(scene=along)
     errors, chosen = {}, None
     for name, way in ways.items():
-        errors[name] = float(trial.norm(way.changes([()], whole))[0])
+        errors[name] = float(trial.norm(way.changes([()], reference))[0])
         if chosen is None and errors[name] <= tolerance:
             chosen = way
     return errors, chosen or trial
 
 
 def _with_tangents(scene: Scene, tangents: jax.Array | None) -> Scene:
-    """The scene with other tangents."""
+    """The scene with tangents (n, t) in place of its own."""
     return eqx.tree_at(lambda tree: tree.tangents, scene, tangents)
 
 
-def _along(scene: Scene, whole: Outcomes) -> jax.Array:
-    """One tangent (n, m) of each contact, along its tangential impulse."""
-    m = scene.contacts
-    impulse = whole.tangential[0].reshape(m, 2)
-    size = np.linalg.norm(impulse, axis=1, keepdims=True)
-    way = np.where(size > 0, impulse / np.where(size > 0, size, 1.0), [[1.0, 0.0]])
-    tangents = np.asarray(scene.tangents).reshape(-1, m, 2)
-    return jnp.asarray(np.sum(tangents * way[None], axis=2).astype(tangents.dtype))
+def _tangents_along_impulses(scene: Scene, reference: Outcomes) -> jax.Array:
+    """One tangent (n, m) for each contact in space, along its tangential impulse.
 
-
-def _alone(trial: _Simpler, runs: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Contacts with an impulse, and of each contact (m,) the error and change of v+ without it.
-
-    Without impulse a contact leaves no trace in v+, whatever the law.
+    Equation: `T_j d_j`, T_j (n, 2) the tangents of contact j, `d_j = p_t,j / |p_t,j|` (2,), the
+    first tangent where p_t,j = 0.
     """
-    whole, norm = trial.run([()]), trial.norm
-    p = np.abs(whole.impulse[0])
+    m = scene.contacts
+    impulse = reference.tangential[0].reshape(m, 2)
+    size = np.linalg.norm(impulse, axis=1, keepdims=True)
+    direction = np.where(size > 0, impulse / np.where(size > 0, size, 1.0), [[1.0, 0.0]])
+    tangents = np.asarray(scene.tangents).reshape(-1, m, 2)
+    return jnp.asarray(np.sum(tangents * direction[None], axis=2).astype(tangents.dtype))
+
+
+def _effect_of_each_contact(trial: _Trial, runs: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Effect of leaving out each contact by itself.
+
+    Returns the indices of contacts with an impulse, and for all m contacts the error of v+ in the
+    energy norm over that of v- and the largest change of a velocity [m/s, rad/s]. Both are 0 for a
+    contact without impulse, and NaN beyond the first `runs` contacts with the largest
+    `p_j sqrt(W_jj)`.
+    """
+    reference, norm = trial.run([()]), trial.norm
+    p = np.abs(reference.impulse[0])
     working = np.flatnonzero(p)
     weight = p * np.sqrt(np.asarray(diagonal(delassus_matrix(trial.scene))))
     largest = working[np.argsort(-weight[working], kind="stable")][:runs]
     errors, changes = np.zeros(len(p)), np.zeros(len(p))
     errors[working] = changes[working] = np.nan
     if len(largest):
-        change = trial.changes([(j,) for j in largest], whole)
+        change = trial.changes([(j,) for j in largest], reference)
         errors[largest] = norm(change)
         changes[largest] = np.abs(change[:, norm.watched]).max(axis=1)
     return working, errors, changes
 
 
-def _together(
-    trial: _Simpler,
-    whole: Outcomes,
+def _sufficient_contacts(
+    trial: _Trial,
+    reference: Outcomes,
     working: np.ndarray,
     errors: np.ndarray,
     tolerance: float,
     runs: int,
 ) -> tuple[np.ndarray, float]:
-    """Contacts that suffice, as few as this order allows, and the error of v+.
+    """Indices of contacts that suffice for v+ within `tolerance`, and the error of v+.
 
-    Contacts whose error is not known come first: they have less impulse. As many of the first ones
-    as possible are left out together, the next one is kept, and so on with those after it.
+    Greedy: the contacts `working` with an impulse are sorted by their `errors`, unknown ones (with
+    less impulse) first. As many of the first as possible are left out together, the next is kept,
+    and so on with those after it, for at most `runs` impacts.
     """
     order = working[np.argsort(np.nan_to_num(errors[working], nan=-1.0), kind="stable")]
     left_out = np.flatnonzero(~np.isin(np.arange(len(errors)), working)).tolist()
@@ -302,9 +313,10 @@ def _together(
     waiting = order.tolist()
     while True:
         last = max(len(waiting) - (not kept), 0)  # one is always kept
+        # numbers of waiting contacts to leave out, all from 0 to `last` if `runs` allows it
         counts = np.unique(np.linspace(0, last, min(runs, last) + 1, dtype=int))
         sets = [left_out + waiting[:count] for count in counts]
-        error = trial.norm(trial.changes(sets, whole))
+        error = trial.norm(trial.changes(sets, reference))
         suffice = np.flatnonzero(error <= tolerance)
         best = int(suffice[-1]) if len(suffice) else 0
         left_out, left = sets[best], waiting[counts[best] :]

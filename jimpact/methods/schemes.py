@@ -23,7 +23,7 @@ is touched for the first time has a closed form. It has no time, so the duration
 import dataclasses
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -64,18 +64,21 @@ _FORCES_A_STEP = 3  # normal forces that an implicit step asks for: a whole one 
 
 
 class Scaled(NamedTuple):
-    """The dimensionless problem; where nothing `happens` it is a placeholder."""
+    """Dimensionless impact of closed contacts; a placeholder if nothing `happens` ()."""
 
     dynamics: Dynamics
     happens: jax.Array
 
-    def solution(self, p: Any, t: Any, evaluations: Any, code: Any, side: Any) -> Solution:
-        """In SI units; nothing where nothing happens, `not_finite` where it is not."""
+    def solution(self, p: Any, t: Any, evaluations: Any, code: Any, p_t: Any) -> Solution:
+        """Solution in SI units of dimensionless p (m,), duration t (), p_t (t,).
+
+        Impulses are 0 if nothing happens; the status is `not_finite` if an impulse is not finite.
+        """
         units, tangential = self.dynamics.units, None
         impulse = jnp.where(self.happens, p * units.momentum, 0.0)
         finite = jnp.all(jnp.isfinite(impulse))
         if self.dynamics.problem.tangential is not None:
-            tangential = jnp.where(self.happens, side * per_tangent(units.momentum, side), 0.0)
+            tangential = jnp.where(self.happens, p_t * per_tangent(units.momentum, p_t), 0.0)
             finite = finite & jnp.all(jnp.isfinite(tangential))
         code = jnp.where(self.happens, code, CODE["ok"])
         return Solution(
@@ -88,11 +91,12 @@ class Scaled(NamedTuple):
 
 
 def scaled(law: LZB, scene: Scene, velocity: Any, rtol: Any = 1.0) -> Scaled:
-    """The impact in dimensionless form, without open contacts."""
+    """Dimensionless form of an impact of closed contacts at v- (n,), to be solved to `rtol`."""
     v = as_float_array("velocity", velocity)
     law, scene, v = in_common_dtype(law, scene, v)
     contact = law.contact(scene, v)
     gamma, happens = contact.gap_velocity, contact.happens
+    # any approach will do for the placeholder, if its numbers are finite
     harmless = jnp.where(happens, gamma, -jnp.ones_like(gamma))
     contact = eqx.tree_at(lambda c: c.gap_velocity, contact, harmless)
     return Scaled(law.dynamics(contact, jnp.asarray(rtol, v.dtype)), happens)
@@ -116,56 +120,62 @@ def time_scale(law: LZB, scene: Scene, velocity: Any) -> jax.Array:
 
 
 class Field(NamedTuple):
-    """The flow in time form, of JAX arrays or of NumPy's."""
+    """Right-hand sides of the dimensionless flow in time (module docstring); JAX or NumPy arrays.
 
-    x: Any  # (m,) before the impact, as `gamma` and `slip`
-    gamma: Any
-    slip: Any
-    coupling: Any  # G
-    cross: Any  # K_nt
-    tangent: Any  # K_tt
-    friction: Any
-    omega: Any
-    restitution: Any
-    exponent: Any
+    In its methods x (m,) are indentations, p (m,) and p_t (t,) impulses.
+    """
+
+    x: Any  # indentations (m,) before the impact
+    gamma: Any  # gap velocities gamma- (m,)
+    slip: Any  # slip velocities u- (t,)
+    coupling: Any  # G (m, m)
+    cross: Any  # K_nt (m, t)
+    tangent: Any  # K_tt (t, t)
+    friction: Any  # mu (m,)
+    omega: Any  # frequencies omega_j (m,)
+    restitution: Any  # e (m,)
+    exponent: Any  # eta () or (m,)
 
     @property
     def start(self) -> tuple[Any, Any, Any]:
-        """Indentations, and impulses, normal and tangential ones."""
+        """Indentations x (m,) and impulses p (m,) and p_t (t,), the impulses 0."""
         return self.x, 0.0 * self.gamma, 0.0 * self.slip
 
-    def gap_velocity(self, p: Any, side: Any) -> Any:
-        """gamma (m,)."""
-        return self.gamma + self.coupling @ p + self.cross @ side
+    def gap_velocity(self, p: Any, p_t: Any) -> Any:
+        """`gamma = gamma- + G p + K_nt p_t` (m,)."""
+        return self.gamma + self.coupling @ p + self.cross @ p_t
 
     def closing(self, now: Any) -> Any:
-        """x' (m,) at gap velocities."""
+        """`x' = -omega c gamma` (m,) at gap velocities `now`; c = 1, or 1/e^2 where they open."""
         return -self.omega * _where(now > 0, 1 / self.restitution**2, 1.0) * now
 
     def force(self, x: Any) -> Any:
-        """p' (m,) at indentations."""
+        """`p' = F = (eta + 1)/2 omega x^eta` (m,), 0 where x < 0."""
         if isinstance(x, np.ndarray):
             eta = np.asarray(self.exponent, float)
             return (eta + 1) / 2 * self.omega * np.maximum(x, 0.0) ** eta
         return (jnp.asarray(self.exponent, x.dtype) + 1) / 2 * self.omega * power(x, self.exponent)
 
-    def drag(self, force: Any, p: Any, side: Any, slow: Any) -> Any:
-        """p_t' (t,), regularized below the slip `slow` (m,) or ()."""
-        u = (self.slip + self.cross.T @ p + self.tangent @ side).reshape(len(force), -1)
+    def drag(self, force: Any, p: Any, p_t: Any, slow: Any) -> Any:
+        """`p_t' = -mu F u / sqrt(|u|^2 + slow^2)` (t,) of normal forces F (m,).
+
+        `u = u- + K_tn p + K_tt p_t`; `slow` (m,) or () is the slip that regularizes it.
+        """
+        u = (self.slip + self.cross.T @ p + self.tangent @ p_t).reshape(len(force), -1)
         square = (u**2).sum(axis=1) + slow**2
         moves = square > 0
         drag = self.friction * force / _where(moves, square, 1.0) ** 0.5
         return -(_where(moves, drag, 0.0)[:, None] * u).ravel()
 
-    def rates(self, x: Any, p: Any, side: Any, slow: Any) -> tuple[Any, Any, Any]:
+    def rates(self, x: Any, p: Any, p_t: Any, slow: Any) -> tuple[Any, Any, Any]:
         """(x', p', p_t'); an open contact stays at its x <= 0, as solvers cannot clamp."""
-        closing, force = self.closing(self.gap_velocity(p, side)), self.force(x)
+        closing, force = self.closing(self.gap_velocity(p, p_t)), self.force(x)
         opened = (x <= 0) & (closing < 0)
-        return _where(opened, 0.0, closing), force, self.drag(force, p, side, slow)
+        return _where(opened, 0.0, closing), force, self.drag(force, p, p_t, slow)
 
-    def at_work(self, x: Any, p: Any, side: Any) -> Any:
-        """Positive while a contact is loaded or approaches."""
-        return (-self.gap_velocity(p, side)).max().clip(x.max())
+    def at_work(self, x: Any, p: Any, p_t: Any) -> Any:
+        """`max(x_j, -gamma_j)` (): positive while a contact is loaded or approaches."""
+        return (-self.gap_velocity(p, p_t)).max().clip(x.max())
 
 
 def _where(condition: Any, yes: Any, no: Any) -> Any:
@@ -175,13 +185,13 @@ def _where(condition: Any, yes: Any, no: Any) -> Any:
 
 
 def field_of(problem: Scaled) -> Field:
-    """The field of a problem."""
+    """Right-hand sides of a dimensionless impact; G as sparse as its contacts are coupled."""
     dynamics, inputs = problem.dynamics, problem.dynamics.problem
     m, off, one = len(inputs.gamma), inputs.off_diagonal, jnp.ones_like(inputs.gamma)
     coupling: Any = Tridiagonal(one, off)
     if isinstance(dynamics.structure, Neighbours):
         coupling = Sparse(one, off, dynamics.structure)
-    elif dynamics.structure is None:
+    elif dynamics.structure is None:  # dense; its diagonal is 1, `off` the upper triangle by rows
         upper = jnp.zeros((m, m), off.dtype).at[jnp.triu_indices(m, 1)].set(off)
         coupling = unit(upper) + upper + upper.T
     none = jnp.zeros((m, 0), off.dtype)
@@ -201,7 +211,7 @@ def field_of(problem: Scaled) -> Field:
 
 
 def aligned(law: LZB, scene: Scene, velocity: Any, setting: Any) -> Solution:
-    """What `impact` does: no step straddles a change of phase (`events/stepper.py`).
+    """Event-aligned steps, as in `impact`: none straddles a change of phase; `setting` is the rtol.
 
     Impulses are of the run that ends an isolated contact in closed form; the duration takes a
     second run, without it (which the compiler leaves out where the duration is not used).
@@ -209,124 +219,146 @@ def aligned(law: LZB, scene: Scene, velocity: Any, setting: Any) -> Solution:
     problem = scaled(law, scene, velocity, setting)
     dynamics = problem.dynamics._replace(method="time")
     program, leaves = dynamics.program(), dynamics.columns()[0]
-    p, side, _, code, passes = evaluate(program, leaves)
+    p, p_t, _, code, passes = evaluate(program, leaves)
     _, _, t, _, _ = evaluate(dataclasses.replace(program, with_end_time=True), leaves)
     evaluations = (STAGES + 1) * passes[0, 0]  # of all passes, rejected ones included
-    return problem.solution(p[:, 0], t[0, 0], evaluations, code[0, 0], side[:, 0])
+    return problem.solution(p[:, 0], t[0, 0], evaluations, code[0, 0], p_t[:, 0])
 
 
 def implicit(law: LZB, scene: Scene, velocity: Any, setting: Any) -> Solution:
-    """The law's own method without events."""
+    """The law's method 'implicit', without events; `setting` is the rtol."""
     problem = scaled(law, scene, velocity, setting)
     dynamics = problem.dynamics._replace(method="implicit")
-    p, side, t, code, passes = evaluate(dynamics.program(), dynamics.columns()[0])
+    p, p_t, t, code, passes = evaluate(dynamics.program(), dynamics.columns()[0])
     forces = _FORCES_A_STEP * passes[0, 0]
-    return problem.solution(p[:, 0], t[0, 0], forces, code[0, 0], side[:, 0])
+    return problem.solution(p[:, 0], t[0, 0], forces, code[0, 0], p_t[:, 0])
 
 
 # ---------------------------------------------------------------------------- fixed steps
 
 
 class Walk(NamedTuple):
-    """Indentation, impulses (m,), (t,), gap velocity and force (m,), and the steps taken."""
+    """State of an integration in time steps, dimensionless."""
 
-    x: jax.Array
-    p: jax.Array
-    side: jax.Array
-    gamma: jax.Array
-    force: jax.Array
-    steps: jax.Array
+    x: jax.Array  # indentations (m,)
+    p: jax.Array  # normal impulses (m,)
+    p_t: jax.Array  # tangential impulses (t,)
+    gamma: jax.Array  # gap velocities (m,)
+    force: jax.Array  # contact forces (m,)
+    steps: jax.Array  # steps taken ()
 
     @property
     def at_work(self) -> jax.Array:
-        """Whether a contact is loaded or approaches."""
+        """True while a contact is loaded or approaches."""
         return jnp.any((self.x > 0) | (self.gamma < 0))
 
 
-# (field, h, walk) -> x (to be clamped), p, p_t, force
-Step = Callable[[Field, jax.Array, Walk], tuple[jax.Array, ...]]
+class StepEnd(NamedTuple):
+    """State at the end of a time step; x (m,) is not clamped at 0 yet."""
+
+    x: jax.Array
+    p: jax.Array
+    p_t: jax.Array
+    force: jax.Array
 
 
-def until_over(advance: Callable[[Any], Any], walk: Any, most: int) -> tuple[Any, jax.Array]:
-    """Where a walk ends that takes steps while it is `at_work`, `most` of them, and its status."""
+Step = Callable[[Field, jax.Array, Walk], StepEnd]  # of the field, the step size h, the state
+
+
+State = TypeVar("State", Walk, "ImpulseWalk")
+
+
+def until_over(
+    advance: Callable[[State], State], walk: State, most: int
+) -> tuple[State, jax.Array]:
+    """Last state of an integration that advances while it is `at_work`, and its status.
+
+    `walk` is the first state, a `Walk` or `ImpulseWalk`; after `most` steps the status is
+    `max_steps`.
+    """
     end = jax.lax.while_loop(lambda x: x.at_work & (x.steps < most), advance, walk)
     return end, jnp.where(end.at_work, CODE["max_steps"], CODE["ok"])
 
 
 def in_time(step: Step, stages: int) -> Solve:
-    """Fixed steps in time of `stages` evaluations each, the setting their size."""
+    """Solver with fixed time steps of `stages` evaluations each; the setting is their size."""
 
     def solve(law: LZB, scene: Scene, velocity: Any, setting: Any) -> Solution:
-        """The impact with this time step."""
+        """Impulses at v- (n,) with time steps of `setting`, in units of `time_scale`."""
         problem = scaled(law, scene, velocity)
         field = field_of(problem)
         h = jnp.asarray(setting, field.gamma.dtype)
 
         def advance(walk: Walk) -> Walk:
-            """One step."""
-            x, p, side, force = step(field, h, walk)
-            now = field.gap_velocity(p, side)
-            return Walk(jnp.maximum(x, 0.0), p, side, now, force, walk.steps + 1)
+            """State after one step, indentations clamped at 0."""
+            x, p, p_t, force = step(field, h, walk)
+            gamma = field.gap_velocity(p, p_t)
+            return Walk(jnp.maximum(x, 0.0), p, p_t, gamma, force, walk.steps + 1)
 
         first = Walk(*field.start, field.gamma, field.force(field.x), jnp.zeros((), jnp.int32))
         end, code = until_over(advance, first, problem.dynamics.max_steps)
         time = h * end.steps.astype(h.dtype)
-        return problem.solution(end.p, time, stages * end.steps, code, end.side)
+        return problem.solution(end.p, time, stages * end.steps, code, end.p_t)
 
     return solve
 
 
-def rk4(field: Field, h: jax.Array, walk: Walk) -> tuple[jax.Array, ...]:
-    """A classical Runge-Kutta step."""
-    now = walk.x, walk.p
-    change = total = jax.tree.map(jnp.zeros_like, now)
+def rk4(field: Field, h: jax.Array, walk: Walk) -> StepEnd:
+    """A classical Runge-Kutta step h of `x' = -omega c gamma(p)`, `p' = F(x)`, without friction."""
+    start = walk.x, walk.p
+    rates = total = jax.tree.map(jnp.zeros_like, start)
     for node, weight in ((0.0, 1 / 6), (0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6)):
-        x, p = (a + node * h * b for a, b in zip(now, change))
-        change = field.closing(field.gap_velocity(p, walk.side)), field.force(x)
-        total = total[0] + weight * h * change[0], total[1] + weight * h * change[1]
-    return walk.x + total[0], walk.p + total[1], walk.side, walk.force
+        x, p = (a + node * h * rate for a, rate in zip(start, rates))
+        rates = field.closing(field.gap_velocity(p, walk.p_t)), field.force(x)
+        total = total[0] + weight * h * rates[0], total[1] + weight * h * rates[1]
+    # p_t and the force at the end are not needed by further steps
+    return StepEnd(walk.x + total[0], walk.p + total[1], walk.p_t, walk.force)
 
 
-def verlet(field: Field, h: jax.Array, walk: Walk) -> tuple[jax.Array, ...]:
-    """A step of velocity Verlet.
+def verlet(field: Field, h: jax.Array, walk: Walk) -> StepEnd:
+    """A step h of velocity Verlet: half a kick `p += h/2 F(x)`, `x += h x'(p)`, half a kick.
 
-    Friction is regularized below the slip that it stops within half a step, `mu F h/2 |K_tt|` with
-    the largest absolute row sum: stable for whatever step; what should stick creeps by O(step).
+    Friction acts in both half kicks. It is regularized below the slip that it stops within one of
+    them, `mu F h/2 |K_tt|` with the largest absolute row sum: stable for whatever step; contacts
+    that should stick creep by O(step).
     """
     stiffest = jnp.max(jnp.sum(jnp.abs(field.tangent), axis=1), initial=0.0)
 
-    def dragged(force: jax.Array, p: jax.Array, side: jax.Array) -> jax.Array:
+    def dragged(force: jax.Array, p: jax.Array, p_t: jax.Array) -> jax.Array:
         """Tangential impulses (t,) after friction has acted for half a step."""
         slow = field.friction * force * 0.5 * h * stiffest
-        return side + 0.5 * h * field.drag(force, p, side, slow)
+        return p_t + 0.5 * h * field.drag(force, p, p_t, slow)
 
     p = walk.p + 0.5 * h * walk.force
-    side = dragged(walk.force, p, walk.side)
-    x = jnp.maximum(walk.x + h * field.closing(field.gap_velocity(p, side)), 0.0)
+    p_t = dragged(walk.force, p, walk.p_t)
+    x = jnp.maximum(walk.x + h * field.closing(field.gap_velocity(p, p_t)), 0.0)
     force = field.force(x)
     p = p + 0.5 * h * force
-    return x, p, dragged(force, p, side), force
+    return StepEnd(x, p, dragged(force, p, p_t), force)
 
 
 # ------------------------------------------------------------- steps in impulse (published)
 
 
 class ImpulseWalk(NamedTuple):
-    """Gap velocity, potential energy and impulse (m,), and the steps taken."""
+    """State of an integration in steps of the primary impulse, dimensionless."""
 
-    gamma: jax.Array
-    energy: jax.Array
-    p: jax.Array
-    steps: jax.Array
+    gamma: jax.Array  # gap velocities (m,)
+    energy: jax.Array  # potential energies E_j (m,)
+    p: jax.Array  # normal impulses (m,)
+    steps: jax.Array  # steps taken ()
 
     @property
     def at_work(self) -> jax.Array:
-        """Whether a contact is loaded or approaches."""
+        """True while a contact is loaded or approaches."""
         return jnp.any((self.energy > 0) | (self.gamma < 0))
 
 
 def impulse_euler(law: LZB, scene: Scene, velocity: Any, setting: Any) -> Solution:
-    """Explicit steps in the primary impulse; the setting is their size."""
+    """Explicit steps in the impulse of the primary contact, the published scheme.
+
+    The setting is their size, in units of the impact's momentum.
+    """
     problem = scaled(law, scene, velocity, setting)
     inputs, field = problem.dynamics.problem, field_of(problem)
     none, zero = jnp.zeros_like(inputs.gamma), jnp.zeros((), jnp.int32)
@@ -340,8 +372,8 @@ def _impulse_step(field: Field, dp: jax.Array, walk: ImpulseWalk) -> ImpulseWalk
     """One explicit step of `dp` in the impulse of the primary contact i, that of the largest force.
 
     Equation: `dp_j = F_j / F_i dp`, `F_j(E) = (eta + 1) / 2 omega (2 E)^(eta / (eta + 1))`, and
-    `E_j` falls by the work of dp_j. A contact with E_j = 0 that approaches at w_j has
-    `E_j = w_j dp_j` in this step, so that `dp_j = (dp / F_i F_j(w_j))^(eta + 1)`.
+    `E_j` falls by the work of dp_j, `c_j gamma_j dp_j`. A contact with E_j = 0 that approaches at
+    w_j has `E_j = w_j dp_j` in this step, so that `dp_j = ((dp / F_i) F_j(w_j))^(eta + 1)`.
     """
     gamma, energy = walk.gamma, walk.energy
     eta = jnp.asarray(field.exponent, gamma.dtype)
@@ -375,17 +407,20 @@ def _impulse_step(field: Field, dp: jax.Array, walk: ImpulseWalk) -> ImpulseWalk
 def _emptying(
     field: Field, walk: ImpulseWalk, is_primary: jax.Array, increment: jax.Array
 ) -> jax.Array:
-    """Fraction of the step at which the primary contact is unloaded; 1 if it is not.
+    """Fraction s () of the step at which the primary contact is unloaded; 1 if it is not.
 
-    Ending there, not on a fixed step, is what the derivative of the outcome depends on.
+    Equation: `gamma s + dgamma s^2 / 2 = b`, `b = E e^2 / dp`, dgamma the change of its gap
+    velocity in the whole step: `s = 2 b / (gamma + sqrt(gamma^2 + 2 dgamma b))`. The derivative of
+    the outcome depends on ending there, not on a fixed step.
     """
     values = walk.gamma, walk.energy, increment, field.coupling @ increment, field.restitution
-    gamma, energy, dp, bend, e = (jnp.sum(jnp.where(is_primary, x, 0.0)) for x in values)
-    budget = energy * e**2 / dp
-    expands = (gamma + 0.5 * bend > 0) & (energy > 0)
-    root = jnp.sqrt(jnp.maximum(jnp.where(expands, gamma**2 + 2 * bend * budget, 1.0), 0.0))
+    # of the primary contact alone
+    gamma, energy, dp, dgamma, e = (jnp.sum(jnp.where(is_primary, x, 0.0)) for x in values)
+    b = energy * e**2 / dp
+    expands = (gamma + 0.5 * dgamma > 0) & (energy > 0)
+    root = jnp.sqrt(jnp.maximum(jnp.where(expands, gamma**2 + 2 * dgamma * b, 1.0), 0.0))
     denominator = jnp.where(expands, gamma + root, 1.0)
-    fraction = 2 * budget / jnp.where(denominator > 0, denominator, 1.0)
+    fraction = 2 * b / jnp.where(denominator > 0, denominator, 1.0)
     return jnp.where(expands & (denominator > 0) & (fraction < 1), fraction, 1.0)
 
 
@@ -393,13 +428,13 @@ def _emptying(
 
 
 def by_diffrax(solver: "diffrax.AbstractSolver", stages: int | None) -> Solve:
-    """A solver of diffrax, ended by an event; `stages`: new ones a step (None: not known)."""
+    """Solver by diffrax, ended by an event; `stages`: evaluations a step (None: not known)."""
 
     def solve(law: LZB, scene: Scene, velocity: Any, setting: Any) -> Solution:
-        """The impact at this rtol, to the end of the step in which it is over.
+        """Impulses at v- (n,) with rtol `setting`, to the end of the step in which it is over.
 
-        That changes no impulse, but the duration is not known. The event must be crossed downwards:
-        it begins at the approach itself.
+        That changes no impulse, but the duration is not known. The event `max(x, -gamma) = rtol`
+        must be crossed downwards: the impact begins at the approach itself.
         """
         problem = scaled(law, scene, velocity)
         field = field_of(problem)
@@ -436,10 +471,10 @@ class _GaveUpError(Exception):
 
 
 def by_scipy(name: str) -> Solve:
-    """A solver of `scipy.integrate.solve_ivp`, ended by an event."""
+    """Solver by the method `name` of `scipy.integrate.solve_ivp`, ended by an event."""
 
     def solve(law: LZB, scene: Scene, velocity: Any, setting: Any) -> Solution:
-        """The impact at this rtol, which is the slip below which friction is regularized, too."""
+        """Impulses at v- (n,) with rtol `setting`, also the slip that regularizes friction."""
         from scipy.integrate import solve_ivp  # late: scipy is slow to import
 
         problem, traced = _on_host(law, scene, velocity)
@@ -450,18 +485,18 @@ def by_scipy(name: str) -> Solve:
         count, reached = 0, (0.0, np.concatenate(field.start))
 
         def rates(t: float, y: np.ndarray) -> np.ndarray:
-            """The field, counted: `nfev` leaves out what the solver's own differences take."""
+            """Rates of (x, p, p_t) (2 m + t,); counted, as `nfev` omits the solver's Jacobians."""
             nonlocal count, reached
             count, reached = count + 1, (t, y)
             if count > most:
                 raise _GaveUpError
-            x, p, side = np.split(y, parts)
-            return np.concatenate(field.rates(x, p, side, rtol))
+            x, p, p_t = np.split(y, parts)
+            return np.concatenate(field.rates(x, p, p_t, rtol))
 
         def at_work(_: float, y: np.ndarray) -> float:
-            """Positive while a contact is loaded or approaches."""
-            x, p, side = np.split(y, parts)
-            return field.at_work(x, p, side) - rtol
+            """Event function `max(x, -gamma) - rtol`: positive while the impact lasts."""
+            x, p, p_t = np.split(y, parts)
+            return field.at_work(x, p, p_t) - rtol
 
         at_work.terminal, at_work.direction = True, -1.0  # type: ignore[attr-defined]
         options = {"method": name, "rtol": rtol, "atol": rtol, "events": at_work}
@@ -472,16 +507,16 @@ def by_scipy(name: str) -> Solve:
         else:
             ended, reached = result.status == 1, (float(result.t[-1]), result.y[:, -1])
         time, y = reached
-        _, p, side = (jnp.asarray(x, traced.gamma.dtype) for x in np.split(y, parts))
+        _, p, p_t = (jnp.asarray(x, traced.gamma.dtype) for x in np.split(y, parts))
         code = CODE["ok" if ended else "max_steps"]
-        return problem.solution(p, jnp.asarray(time), count, code, side)
+        return problem.solution(p, jnp.asarray(time), count, code, p_t)
 
     return solve
 
 
 @precise_jit
 def _on_host(law: LZB, scene: Scene, velocity: Any) -> tuple[Scaled, Field]:
-    """The problem, and its field with a dense G."""
+    """Dimensionless form of an impact, and its right-hand sides with a dense G, for NumPy."""
     problem = scaled(law, scene, velocity)
     field = field_of(problem)
     return problem, field._replace(coupling=as_matrix(field.coupling))

@@ -51,7 +51,7 @@ class Axis(NamedTuple):
     least: float = 0.0
 
     def values(self, count: int) -> np.ndarray:
-        """So many values over the range."""
+        """`count` values from `low` to `high`: evenly spaced, or geometric if `least` > 0."""
         if not self.least:
             return np.linspace(self.low, self.high, count)
         zero = [] if self.low else [0.0]
@@ -107,12 +107,12 @@ class Slice(NamedTuple):
 
 
 class Confirmation(NamedTuple):
-    """How many references another integrator could confirm, and the largest difference there."""
+    """Check of reference velocities v+ by another integrator."""
 
-    points: int
-    tried: int
-    confirmed: int
-    difference: float
+    points: int  # with a reference
+    tried: int  # solved by the other integrator, too
+    confirmed: int  # of them: v+ differs by at most `within`
+    difference: float  # the largest one
     within: float = CONFIRMED
 
 
@@ -145,13 +145,13 @@ class StabilityMap(Tabular):
     picture = "stability_map"
 
     def counts(self, method: str) -> dict[str, int]:
-        """Points of each class of a method, over all slices and samples."""
+        """Number of points in each class, over all slices and samples of a `method` (a name)."""
         slices = *self.slices[method], self.sampled[method]
         codes = np.concatenate([each.codes.ravel() for each in slices])
         return dict(zip(CLASSES, np.bincount(codes, minlength=len(CLASSES)).tolist()))
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything, as a JSON file can hold it."""
+        """Axes, classes, errors and counts of classes by method, as a JSON file can hold them."""
         by_method = {
             name: {"counts": self.counts(name), "slices": self.slices[name], "sampled": sampled}
             for name, sampled in self.sampled.items()
@@ -161,7 +161,7 @@ class StabilityMap(Tabular):
 
     @property
     def table(self) -> Table:
-        """Points of each class, by method; docs/stability.md says why methods fail."""
+        """Table: number of points in each class by method; docs/stability.md says why they fail."""
         base = ", ".join(f"{name.replace('_', ' ')} {x:g}" for name, x in self.base.items())
         checked, others = self.confirmation, ""
         if checked.confirmed < checked.tried:
@@ -195,7 +195,7 @@ def stability_map(
     seed: int = 0,
     progress: float | None = None,
 ) -> StabilityMap:
-    """Where methods integrate the LZB law correctly, and where they do not, over six axes.
+    """Map of points where methods integrate the LZB law correctly, or fail, over six axes.
 
     A point is a chain of N touching balls of which the first strikes the others: kappa is the
     stiffness ratio of its halves, mu the mass ratio of its middle ball (`chain_of`); and a
@@ -243,24 +243,24 @@ def stability_map(
     samples, max_steps = as_whole("samples", samples, 0), as_whole("max_steps", max_steps, 1)
     if not jnp.zeros(()).dtype == jnp.float64:
         raise ValueError("A stability map needs double precision: enable jax_enable_x64.")
-    place = _place(scene, velocity)
-    chosen = _methods(methods, place)
-    lines = _axis_values(axes, as_whole("resolution", resolution, 2), place.axes)
+    setup = _checked_setup(scene, velocity)
+    chosen = _methods(methods, setup)
+    values = _axis_values(axes, as_whole("resolution", resolution, 2), setup.axes)
     start = {name: axis.base for name, axis in _AXES.items()}
-    start |= {name: float(x) for name, x in _checked("base", base or {}, place.axes).items()}
-    axis_sets: list[tuple[str, ...]] = [(name,) for name in lines]
+    start |= {name: float(x) for name, x in _checked("base", base or {}, setup.axes).items()}
+    axis_sets: list[tuple[str, ...]] = [(name,) for name in values]
     if slices == "pairs":
-        axis_sets += list(combinations(lines, 2))
-    parts = [_slice_points(start, lines, names) for names in axis_sets]
-    sampled = _sample_points(start, lines, samples, seed)
+        axis_sets += list(combinations(values, 2))
+    parts = [_slice_points(start, values, names) for names in axis_sets]
+    sampled = _sample_points(start, values, samples, seed)
     points = np.concatenate([*(part.reshape(-1, len(AXES)) for part in parts), sampled])
-    runners = cache(partial(runner, max_steps, place))
+    runners = cache(partial(runner, max_steps, setup))
     total = len(points) * (len(chosen) + 1)
     with counting_bar(total, "impacts", progress) as advance:
-        exact, confirmation = references(points, place, runners, advance)
-        classes = {m.name: partial(classes_of, m, place, exact, runners, advance) for m in chosen}
+        exact, confirmation = references(points, setup, runners, advance)
+        classes = {m.name: partial(classes_of, m, setup, exact, runners, advance) for m in chosen}
         classified, left_out = at_points(classes, points)
-    ends = np.cumsum([part[..., 0].size for part in parts])
+    ends = np.cumsum([part[..., 0].size for part in parts])  # of slices among all points
     by_slice, by_sample = {}, {}
     for name, columns in classified.items():
         codes, errors = (np.split(column, ends) for column in columns)
@@ -271,8 +271,8 @@ def stability_map(
         by_sample[name] = Slice(("samples",), codes[-1], errors[-1])
     return StabilityMap(
         methods=tuple(by_slice),
-        axes=lines,
-        base={name: start[name] for name in place.axes},
+        axes=values,
+        base={name: start[name] for name in setup.axes},
         slices=by_slice,
         samples=sampled,
         sampled=by_sample,
@@ -282,20 +282,23 @@ def stability_map(
     )
 
 
-class Place(NamedTuple):
-    """What the points are of: one scene at v- (n,) with 1 as the largest; None: chains of balls."""
+class Setup(NamedTuple):
+    """Scene of all points at v- (n,), the largest |v-| 1; None: chains whose first ball strikes.
+
+    A point is a row (7,) of numbers in the order of `AXES`.
+    """
 
     scene: Scene | None = None
     velocity: Any = None
 
     @property
     def friction(self) -> bool:
-        """Whether contacts have friction."""
+        """True if contacts have friction: a scene with tangents."""
         return self.scene is not None and self.scene.tangents is not None
 
     @property
     def axes(self) -> tuple[str, ...]:
-        """The axes that there are."""
+        """Names of the axes that count: a scene has no masses and balls, a chain no friction."""
         if self.scene is None:
             return tuple(name for name in AXES if name != "friction")
         missing = {"mass_ratio", "balls"} | (set() if self.friction else {"friction"})
@@ -303,11 +306,11 @@ class Place(NamedTuple):
         return tuple(name for name in AXES if name not in missing)
 
     def size(self, balls: int) -> int:
-        """Number of velocities."""
+        """Number n of velocities."""
         return balls if self.scene is None else self.scene.size
 
     def impact_at(self, point: Any, balls: int, max_steps: int) -> tuple[LZB, Scene, jax.Array]:
-        """Law, scene and v- of a point; the law's friction is None where there is none."""
+        """Law, scene and v- (n,) of a point (7,), without its setting; `balls` is N of a chain."""
         _, kappa, eta, e, mass_ratio, _, friction = point
         if self.scene is None:
             mass, stiffness = chain_of(kappa, mass_ratio, balls)
@@ -319,36 +322,42 @@ class Place(NamedTuple):
         return law, self.scene, self.velocity
 
     def groups(self, points: np.ndarray) -> Iterator[tuple[np.ndarray, int]]:
-        """Points (indices) of equal shapes, and their number of balls."""
+        """Groups of points (P, 7) with equal numbers of balls: indices (L,), and N (0: a scene).
+
+        One function is compiled for each group.
+        """
         balls = points[:, AXES.index("balls")] if self.scene is None else np.zeros(len(points))
         for n in np.unique(balls):
             yield np.flatnonzero(balls == n), int(n)
 
 
-def _place(scene: Scene | None, velocity: Any) -> Place:
-    """The scene with its velocity, checked; without one chains."""
+def _checked_setup(scene: Scene | None, velocity: Any) -> Setup:
+    """The scene with its v-, scaled to 1 as the largest and checked; without a scene, chains."""
     if scene is None:
         if velocity is not None:
             raise ValueError("Argument `velocity` must be None without a `scene`.")
-        return Place()
+        return Setup()
     if velocity is None:
         raise ValueError("Argument `velocity` must be given with a `scene`, but is None.")
     v = as_velocity(scene, velocity, finite=True)
     if not bool(LZB(1.0).contact(scene, v).happens):
         raise ValueError("Argument `velocity` must let a closed contact approach.")
-    return Place(scene, v / jnp.max(jnp.abs(v)))
+    return Setup(scene, v / jnp.max(jnp.abs(v)))
 
 
-def _methods(methods: Sequence[str | Contender] | None, place: Place) -> list[Contender]:
-    """Contenders, those of these names, or those to map by default."""
-    able = [m for m in CONTENDERS.values() if m.jax and (m.friction or not place.friction)]
+def _methods(methods: Sequence[str | Contender] | None, setup: Setup) -> list[Contender]:
+    """Contenders to map, by name or a user's own; None: the default ones, with friction if needed.
+
+    Only those that JAX can batch are known.
+    """
+    able = [m for m in CONTENDERS.values() if m.jax and (m.friction or not setup.friction)]
     known = {m.name: m for m in able}
-    defaults = FRICTION_NAMES if place.friction else NAMES
+    defaults = FRICTION_NAMES if setup.friction else NAMES
     return contenders_of("methods", defaults if methods is None else methods, known)
 
 
 def _checked(argument: str, values: Mapping[str, Any], names: tuple[str, ...]) -> Mapping[str, Any]:
-    """Values by axis, checked."""
+    """Values by axis, checked: names among `names`, numbers in the range of their axis."""
     check_kind(argument, values, Mapping)
     for name, value in values.items():
         check_choice(argument, name, names)
@@ -359,8 +368,8 @@ def _checked(argument: str, values: Mapping[str, Any], names: tuple[str, ...]) -
     return values
 
 
-def default_axes(r: int, names: tuple[str, ...] = Place().axes) -> dict[str, np.ndarray]:
-    """r values of each axis (number of balls: at most six)."""
+def default_axes(r: int, names: tuple[str, ...] = Setup().axes) -> dict[str, np.ndarray]:
+    """`r` values of each axis by name (numbers of balls: six, or three below `_FEW`)."""
     balls = np.array(BALLS if r >= _FEW else _FEW_BALLS, float)
     return {name: balls if name == "balls" else _AXES[name].values(r) for name in names}
 
@@ -368,17 +377,17 @@ def default_axes(r: int, names: tuple[str, ...] = Place().axes) -> dict[str, np.
 def _axis_values(
     axes: Mapping[str, Sequence[float]] | None, r: int, names: tuple[str, ...]
 ) -> dict[str, np.ndarray]:
-    """The values of the axes to map."""
+    """Values of the axes to map by name: `axes`, sorted, or by default r values of all."""
     if axes is None:
         return default_axes(r, names)
-    axes = _checked("axes", axes or {"": ()}, names)
+    axes = _checked("axes", axes or {"": ()}, names)  # no axis at all is an error
     return {name: np.unique(np.asarray(axes[name], float)) for name in AXES if name in axes}
 
 
 def _slice_points(
     base: Mapping[str, float], axes: Mapping[str, np.ndarray], varied: tuple[str, ...]
 ) -> np.ndarray:
-    """Points (K_1 .. K_d, 7) in which the axes `varied` run over their values."""
+    """Points (K_1 .. K_d, 7) over the values of the d axes `varied`, elsewhere at the base."""
     columns = [axes[name] if name in varied else np.array([base[name]]) for name in AXES]
     grid = np.stack(np.meshgrid(*columns, indexing="ij"), axis=-1)
     return grid.reshape(*(len(axes[name]) for name in varied), len(AXES))
@@ -387,19 +396,23 @@ def _slice_points(
 def _sample_points(
     base: Mapping[str, float], axes: Mapping[str, np.ndarray], samples: int, seed: int
 ) -> np.ndarray:
-    """Latin-hypercube points (samples, 7), between the values of `axes`; others from `base`."""
+    """Latin-hypercube points (samples, 7), between the values of `axes`; others from `base`.
+
+    Uniform in the index of an axis' values, between two values linear, or in the logarithm where
+    all are positive (but for the exponent). Numbers of balls are those of the axis.
+    """
     from scipy.stats import qmc  # late: slow to import
 
     points = np.tile([base[name] for name in AXES], (samples, 1))
     unit = qmc.LatinHypercube(len(axes), rng=np.random.default_rng(seed)).random(samples)
     for column, (name, values) in zip(unit.T, axes.items()):
-        place = column * (len(values) - 1)
+        index = column * (len(values) - 1)
         if name == "balls":
-            points[:, AXES.index(name)] = values[np.round(place).astype(int)]
+            points[:, AXES.index(name)] = values[np.round(index).astype(int)]
             continue
         powers = bool((values > 0).all()) and name != "exponent"
         scaled = np.log(values) if powers else values
-        between = np.interp(place, np.arange(len(values)), scaled)
+        between = np.interp(index, np.arange(len(values)), scaled)
         points[:, AXES.index(name)] = np.exp(between) if powers else between
     return points
 
@@ -408,7 +421,9 @@ def _sample_points(
 
 
 def setting_of(kind: str, level: Any) -> Any:
-    """The number a method takes at `level` in [0, 1].
+    """Setting of a method at `level` in [0, 1] from coarse to fine.
+
+    Equation: `coarse (fine / coarse)^level`, the ends as in `SETTINGS`.
 
     >>> from jimpact.methods.stability import setting_of
     >>> round(float(setting_of("rtol", 0.6)), 12)
@@ -448,19 +463,22 @@ Runner = Callable[[np.ndarray, Any], tuple[Outcomes, np.ndarray]]
 Runners = Callable[[Contender, int], Runner]
 
 
-def runner(max_steps: int, place: Place, method: Contender, balls: int) -> Runner:
-    """A function of points (L, 7) and settings: one method on chains of N balls or a scene."""
+def runner(max_steps: int, setup: Setup, method: Contender, balls: int) -> Runner:
+    """Function of points (L, 7) and settings that runs one method on chains of N balls or a scene.
+
+    It returns outcomes (L,) and gains of energy over T- (L,).
+    """
 
     def one(point: jax.Array, setting: jax.Array) -> tuple[Outcomes, jax.Array]:
-        """The outcome at one point."""
-        law, scene, v = place.impact_at(point, balls, max_steps)
+        """Outcome at one point (7,), and the energy gained over T-."""
+        law, scene, v = setup.impact_at(point, balls, max_steps)
         out, compared = solved(method, law, scene, v, setting)
         return compared, audit(scene, v, out).energy_gain
 
     batch = jax.jit(jax.vmap(one))
 
     def run(points: np.ndarray, settings: Any) -> tuple[Outcomes, np.ndarray]:
-        """The outcomes at all points, a batch at a time."""
+        """Outcomes and gains of energy at all points (L, 7), a batch at a time."""
         rows = points, np.broadcast_to(settings, len(points))
         return in_batches(lambda part: batch(*part), rows, BATCH)
 
@@ -471,36 +489,44 @@ def runner(max_steps: int, place: Place, method: Contender, balls: int) -> Runne
 
 
 def references(
-    points: np.ndarray, place: Place, runners: Runners, advance: Callable[[int], None]
+    points: np.ndarray, setup: Setup, runners: Runners, advance: Callable[[int], None]
 ) -> tuple[np.ndarray, Confirmation]:
-    """v+ of each point (P, largest n), NaN where no run ends; how many scipy confirms."""
-    groups = list(place.groups(points))
-    exact = np.full((len(points), max((place.size(n) for _, n in groups), default=0)), np.nan)
+    """Reference v+ of the points (P, largest n), NaN if no run ends, and its check by scipy.
+
+    Runs of 'time' at `REFERENCE_RTOL`.
+    """
+    groups = list(setup.groups(points))
+    exact = np.full((len(points), max((setup.size(n) for _, n in groups), default=0)), np.nan)
     for at, n in groups:
+        # points that differ in their setting alone (column 0) share a run
         unique, back = np.unique(points[at, 1:], axis=0, return_inverse=True)
         rows = np.column_stack([np.zeros(len(unique)), unique])
         out, _ = runners(CONTENDERS["time"], n)(rows, REFERENCE_RTOL)
         ended = (out.code == CODE["ok"]) | (out.code == CODE["plastic_limit"])
         velocity = np.where(ended[:, None], out.velocity, np.nan)[np.ravel(back)]
-        exact[at, : place.size(n)] = velocity
+        exact[at, : setup.size(n)] = velocity
         advance(len(at))
-    return exact, _confirm(points, place, exact)
+    return exact, _confirm(points, setup, exact)
 
 
-def _confirm(points: np.ndarray, place: Place, exact: np.ndarray) -> Confirmation:
-    """Differences from scipy's integrator at points spread over those that it solves quickly."""
-    quick = np.array([_is_quick(point, place) for point in points])
+def _confirm(points: np.ndarray, setup: Setup, exact: np.ndarray) -> Confirmation:
+    """Differences of the reference v+ `exact` from scipy's, at a few points that it solves soon.
+
+    Up to `CHECKED` of them, spread over the points (P, 7).
+    """
+    quick = np.array([_is_quick(point, setup) for point in points])
     candidates = np.flatnonzero(np.isfinite(exact[:, 0]) & quick)
+    # of points that differ in their setting alone (column 0) the first
     _, first = np.unique(points[candidates, 1:], axis=0, return_index=True)
     candidates = candidates[np.sort(first)]
     stride = max(1, -(-len(candidates) // CHECKED))
     name, rtol, within = "scipy_dop853", CHECK_RTOL, CONFIRMED
-    if place.friction:
+    if setup.friction:
         name, rtol, within = "scipy_radau", FRICTION_RTOL, FRICTION_CONFIRMED
     differences = []
     for i in candidates[::stride]:
         balls = int(points[i, AXES.index("balls")])
-        law, scene, v = place.impact_at(list(map(float, points[i])), balls, CHECK_STEPS)
+        law, scene, v = setup.impact_at(list(map(float, points[i])), balls, CHECK_STEPS)
         _, out = solved(CONTENDERS[name], law, scene, v, rtol)
         differences.append(float(relative_error(out.velocity, exact[i, : len(v)])))
     agree = sum(x <= within for x in differences)
@@ -508,15 +534,15 @@ def _confirm(points: np.ndarray, place: Place, exact: np.ndarray) -> Confirmatio
     return Confirmation(len(points), len(differences), agree, largest, within)
 
 
-def _is_quick(point: np.ndarray, place: Place) -> bool:
-    """Whether scipy solves the point soon, and does not end it too early (small e).
+def _is_quick(point: np.ndarray, setup: Setup) -> bool:
+    """True for a point (7,) that scipy solves soon, and does not end too early (small e).
 
-    By the largest frequency of the linearized flow, at most `sqrt(2) eta / e` of the fastest
-    contact's, times the ratio of that to the slowest contact's.
+    Equation: `sqrt(2) eta / e spread < QUICK_RATIO`: the largest frequency of the linearized flow
+    is at most `sqrt(2) eta / e` of the fastest contact's, and that `spread` of the slowest's.
     """
     _, kappa, eta, e, mass_ratio, balls, _ = map(float, point)
     spread = max(kappa, 1 / kappa) ** (1 / (eta + 1)) * max(mass_ratio, 1 / mass_ratio) ** 0.5
-    few = (balls if place.scene is None else place.scene.contacts) <= QUICK_BALLS
+    few = (balls if setup.scene is None else setup.scene.contacts) <= QUICK_BALLS
     return few and e >= RECLOSING and np.sqrt(2) * eta / e * spread < QUICK_RATIO
 
 
@@ -525,22 +551,26 @@ def _is_quick(point: np.ndarray, place: Place) -> bool:
 
 def classes_of(
     method: Contender,
-    place: Place,
+    setup: Setup,
     exact: np.ndarray,
     runners: Runners,
     advance: Callable[[int], None],
     points: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Class and error (over the largest |v-|, which is 1) of every point."""
+    """Class (index of `CLASSES`) and error of v+ of every point (P, 7) by one method.
+
+    Errors are the largest |v+ - exact|, over the largest |v-|, which is 1. A wrong result is tried
+    again at a finer setting: `stalls` if its error does not fall.
+    """
     codes, errors = np.full(len(points), FLAGGED), np.full(len(points), np.nan)
     level = points[:, AXES.index("setting")]
     setting = setting_of(method.setting, level)
     fixed = np.full(len(points), FIXED_STEP_RIGHT)
     allowed = HONEST * setting if method.setting == "rtol" else fixed
     e = points[:, AXES.index("restitution")]
-    for group, n in place.groups(points):
-        run, size = runners(method, n), place.size(n)
-        at = group[e[group] > 0] if method.divides else group
+    for group, n in setup.groups(points):
+        run, size = runners(method, n), setup.size(n)
+        at = group[e[group] > 0] if method.divides else group  # refused at e = 0: flagged
         if len(at):
             out, gain = run(points[at], setting[at])
             errors[at] = relative_error(out.velocity, exact[at, :size])
@@ -557,7 +587,11 @@ def classes_of(
 def _classified(
     out: Outcomes, gain: np.ndarray, error: np.ndarray, allowed: np.ndarray
 ) -> np.ndarray:
-    """Classes (L,) before a finer setting is tried; `error` NaN where there is no reference."""
+    """Classes (L,) before a finer setting is tried: the first case that holds.
+
+    `gain` is energy over T-, `error` of v+ NaN without a reference, `allowed` the largest error
+    that is right; all (L,).
+    """
     status = np.where(out.code == CODE["ok"], out.status, out.code)
     cases = {
         NOT_FINITE: status == CODE["not_finite"],

@@ -50,13 +50,15 @@ class ValidityMap(Tabular):
         return relative_error(self.velocity, self.laws[law], np.abs(self.before).max())
 
     def limit(self, law: str, tolerance: float = 1e-2) -> np.ndarray:
-        """Ratio (x,) from which on Moreau's law, or up to which binary, is within `tolerance`.
+        """Stiffness ratios (x,) that bound the range in which a law is within `tolerance`.
 
-        The last sampled ratio of the unbroken run from that end of the map; NaN: not even there.
+        Moreau's law is right from this ratio to the largest of the map, binary collisions from the
+        smallest to this one; NaN: not even there.
         """
         check_values("tolerance", tolerance, low=0.0, open_low=True)
         inside = self.error(law) <= tolerance
         order = slice(None, None, -1) if law == "moreau" else slice(None)
+        # number of ratios from that end of the map that are all within
         run = np.logical_and.accumulate(inside[:, order], axis=1).sum(axis=1)
         at = self.ratios[order][np.maximum(run - 1, 0)]
         return np.where(run > 0, at, np.nan)
@@ -68,7 +70,7 @@ class ValidityMap(Tabular):
 
     @property
     def table(self) -> Table:
-        """Where each law is within 1 %, by exponent."""
+        """Table: the stiffness ratios for which each law is within 1 %, by exponent."""
         columns = (
             Column("exponent", ".3g"),
             Column("binary_up_to", _range("<="), "binary within 1 %"),
@@ -78,7 +80,7 @@ class ValidityMap(Tabular):
 
 
 def _range(sign: str) -> Callable[[Any], str]:
-    """The ratios that a law is right for, in words."""
+    """Format of a stiffness ratio that bounds a range: "ratio <= 0.1"; NaN: "nowhere"."""
     return lambda ratio: "nowhere" if np.isnan(ratio) else f"ratio {sign} {ratio:.3g}"
 
 
@@ -132,6 +134,7 @@ def validity_map(
         raise ValueError("Argument `ratios` must rise, but does not.")
     e = as_numbers("restitution", restitution, low=0.0, high=1.0, contacts=scene.contacts)
     shape = len(eta), len(ratio)
+    # one impact for each exponent and ratio; k (x r, m) = ratio^(j - 1)
     exponents, ratios = (x.ravel() for x in jnp.meshgrid(eta, ratio, indexing="ij"))
     k = ratios[:, None] ** jnp.arange(scene.contacts).astype(v.dtype)[None, :]
     law = LZB(e.astype(v.dtype), k[0], eta[0])

@@ -1,4 +1,4 @@
-"""What `monte_carlo` returns, and its report in words."""
+"""Result of `monte_carlo`, and its report in words."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -28,7 +28,7 @@ _OUTCOMES = {row.name: row for row in OUTCOMES}
 
 @dataclass(frozen=True, eq=False)
 class BadSample:
-    """A sample that failed: its number, status, gaps (m,) [m] and velocities before (n,) [m/s].
+    """A failed sample: its number from 0, status, gaps (m,) [m] and velocities v- (n,) [m/s].
 
     Gaps or velocities that are the same for all samples are empty here.
     """
@@ -94,7 +94,7 @@ class MonteCarlo(Tabular):
 
     @property
     def standard_error(self) -> np.ndarray:
-        """Of the mean (n,) [m/s]."""
+        """Standard error of the mean, `std / sqrt(count)` (n,) [m/s]."""
         return np.sqrt(np.diag(self.covariance) / max(self.count, 1))
 
     @property
@@ -116,7 +116,7 @@ class MonteCarlo(Tabular):
 
     @property
     def unit(self) -> str:
-        """Of the velocities."""
+        """Unit of the velocities, for tables and pictures."""
         return velocity_unit(self.run.scene)
 
     def replay(self, index: int) -> tuple[Law, Scene, jax.Array]:
@@ -142,7 +142,7 @@ class MonteCarlo(Tabular):
 
     @property
     def table(self) -> Table:
-        """A row for each velocity after, with quantiles."""
+        """Table: mean, its error, std, quantiles and range of each velocity v+, with notes."""
         columns = (
             Column("coordinate", head=f"[{self.unit}]"),
             Column("mean", ".6f"),
@@ -163,7 +163,7 @@ class MonteCarlo(Tabular):
         return Table(columns, rows, head, notes)
 
     def _rate(self) -> str:
-        """Samples a second, and how many were read."""
+        """Phrase: samples a second, and the number of samples that were read from the folder."""
         if self.resumed == self.samples:
             return "all read from the folder"
         rate = f"{self.rate:,.0f}"
@@ -171,14 +171,14 @@ class MonteCarlo(Tabular):
         return text + (f", {self.resumed:,} read from the folder" if self.resumed else "")
 
     def _tolerance_lines(self) -> list[str]:
-        """How finely the impacts were integrated, where that was chosen for the run."""
+        """Line on the tolerance of the impacts, if one was chosen for the run."""
         if not self.rtol_error:
             return []
         text = f"integrated to rtol = {self.rtol:g}: its error in means and deviations is at most"
         return [f"{text} {self.rtol_error:.1g} standard errors"]
 
     def _gap_lines(self) -> list[str]:
-        """Mean and standard deviation of the random gaps."""
+        """Lines on mean and standard deviation of each random gap, in m and over delta_c."""
         lines = []
         for j, mean in enumerate(self.gap_mean):
             std = np.sqrt(self.gap_covariance[j, j])
@@ -190,7 +190,7 @@ class MonteCarlo(Tabular):
         return [*lines, DELTA_C] if lines and self.gap_scale is not None else lines
 
     def _status_lines(self) -> list[str]:
-        """How often each status occurred, and the first failed samples."""
+        """Lines on the number of samples of each status, and on the first failed samples."""
         lines = []
         for name, count in self.statuses.items():
             left_out = ", left out" if _OUTCOMES[name].failure else ""
@@ -204,9 +204,13 @@ class MonteCarlo(Tabular):
 def result_of(
     run: Run, total: Chunk, resumed: int, rate: float, gap_scale: np.ndarray | None
 ) -> MonteCarlo:
-    """The result of a run from the statistics of all its chunks."""
+    """Result of a run from `total`, the joined statistics of all its chunks (see `statistics.py`).
+
+    `resumed` samples were read, `rate` [1/s] were computed, `gap_scale` is delta_c (m,) [m].
+    """
     n, count, bad = len(total["ends"]), int(total["used"]), part(total, "bad")
     mean, (rtol, error) = total["mean"], total["tolerance"]
+    # of n velocities after, then of m gaps
     covariance = total["products"] / (count - 1 if count > 1 else np.nan)
     failed = zip(bad["index"], bad["status"], bad["gaps"], bad["velocity_before"])
     return MonteCarlo(
@@ -228,7 +232,7 @@ def result_of(
         rate=rate,
         resumed=resumed,
         rtol=float(rtol) or None,
-        rtol_error=float(error * np.sqrt(count)),
+        rtol_error=float(error * np.sqrt(count)),  # from standard deviations to standard errors
         description=run.description,
         run=run,
     )

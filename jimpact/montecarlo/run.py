@@ -115,7 +115,7 @@ def monte_carlo(
     if keep_samples and folder is None:
         raise ValueError("Argument `folder` must be given to keep samples, but is None.")
     store = None if folder is None else Store(folder, run.identity)
-    total, resumed, rate = _total(run, executor, workers, store, progress)
+    total, resumed, rate = _all_chunks(run, executor, workers, store, progress)
     result = result_of(run, total, resumed, rate, _gap_scale(run.sources, scene))
     failed = result.samples - result.count
     if failed:
@@ -134,20 +134,20 @@ def monte_carlo(
     return result
 
 
-def _total(
+def _all_chunks(
     run: Run, executor: Any, workers: int, store: Store | None, progress: float | None
 ) -> tuple[Chunk, int, float]:
-    """All chunks joined in their order, how many samples were read, and computed a second.
+    """Statistics of all chunks, joined in their order, samples that were read, samples a second.
 
     The first chunk sets the histograms and the tolerance of all. If it is computed it compiles the
     program, and does not count for the rate.
     """
 
     def read(number: int) -> Chunk | None:
-        """The chunk as it is stored, if it is."""
+        """Statistics of a chunk from the folder; None if it is not stored."""
         return store.read(number, run.count(number), run.keep_samples) if store else None
 
-    stored, recorded = set(), None
+    stored, recorded = set(), None  # numbers of stored chunks, and their tolerance
     for number in range(run.chunks):
         if chunk := read(number):
             stored.add(number)
@@ -156,7 +156,7 @@ def _total(
     times = [(resumed, time.perf_counter())]
 
     def new(chunk: Chunk) -> Chunk:
-        """A computed chunk, stored and counted."""
+        """Store a computed chunk, count its samples and note the time; returns it."""
         nonlocal finished
         if store:
             store.write(chunk)
@@ -171,7 +171,7 @@ def _total(
             tolerance = Tolerance(*map(float, total["tolerance"]))
             missing = (n for n in range(1, run.chunks) if n not in stored)
             tasks = (run.task(number, tolerance, total["ends"]) for number in missing)
-            with closing(_computed(executor, workers, run, tasks)) as chunks:
+            with closing(_computed_chunks(executor, workers, run, tasks)) as chunks:
                 for number in range(1, run.chunks):
                     chunk = read(number) if number in stored else new(next(chunks))
                     if chunk is None:
@@ -185,12 +185,16 @@ def _total(
             else f"they are in '{store.folder}': the same call continues from there."
         )
         raise KeyboardInterrupt(text) from None
+    # samples and time after the first computed chunk, and at the end
     (before, begin), (after, end) = times[1 if len(times) > 2 else 0], times[-1]
     return total, resumed, (after - before) / (end - begin) if after > before else 0.0
 
 
 def _gap_scale(sources: Sources, scene: Scene) -> np.ndarray | None:
-    """delta_c (m,), where law and velocity are constant and the law's contacts indent."""
+    """Indentations delta_c (m,) [m] of contacts, see `ji.theory.gap_scale`.
+
+    None if law or velocity is random, or the law has no contact force or does not use gaps.
+    """
     law, velocity = sources.law, sources.velocity
     if not (isinstance(law, Law) and isinstance(velocity, jax.Array)):
         return None
@@ -204,39 +208,44 @@ def _gap_scale(sources: Sources, scene: Scene) -> np.ndarray | None:
 # ------------------------------------------ where chunks are computed, which changes no result
 
 
-def _computed(executor: Any, workers: int, run: Run, tasks: Iterable[Task]) -> Generator[Chunk]:
-    """`run(task)` for every task, in order."""
+def _computed_chunks(
+    executor: Any, workers: int, run: Run, tasks: Iterable[Task]
+) -> Generator[Chunk]:
+    """Chunks `run(task)` of all tasks, in their order, by 'threads', 'serial' or an executor."""
     if executor in ("threads", "serial"):
         yield from in_threads(run, tasks, workers if executor == "threads" else 1)
         return
     remaining = iter(tasks)
-    with _opened(executor, run) as (mapped, work):
+    with _mapping_of(executor, run) as (mapped, work):
         while window := list(itertools.islice(remaining, WINDOW)):
             for each in mapped(work, window):
                 yield each.result() if hasattr(each, "result") else each  # Dask maps to futures
 
 
 @contextmanager
-def _opened(executor: Any, run: Run) -> Iterator[tuple[Callable[..., Any], Work]]:
-    """The `map` of an executor, and what it maps tasks by."""
+def _mapping_of(executor: Any, run: Run) -> Iterator[tuple[Callable[..., Any], Work]]:
+    """The `map` of an executor, and the function to map over tasks, while it is open.
+
+    `executor` is 'devices', 'dask', the address of a Dask scheduler, or an object with a `map`.
+    """
     if executor == "devices":
         devices = jax.devices()  # each compiles the program once
         with ThreadPoolExecutor(len(devices)) as pool:
             yield pool.map, lambda task: run(task, devices[task.number % len(devices)])
     elif isinstance(executor, str):
         distributed = needed("distributed", "pip install 'jimpact[distributed]'")
-        here = {"threads_per_worker": 1, "dashboard_address": None}  # processes on this machine
-        options = here if executor == "dask" else {"address": executor}
+        local = {"threads_per_worker": 1, "dashboard_address": None}  # processes on this machine
+        options = local if executor == "dask" else {"address": executor}
         with distributed.Client(**options) as client:
-            yield client.map, _shipped(run)
+            yield client.map, _picklable(run)
     else:
-        yield executor.map, _shipped(run)
+        yield executor.map, _picklable(run)
 
 
-def _shipped(run: Run) -> Work:
-    """A run that other processes can compute with; as it is where it cannot be pickled.
+def _picklable(run: Run) -> Work:
+    """Function of a task that other processes can unpickle; the run itself if it refuses pickling.
 
-    Functions in it are pickled where cloudpickle is installed, which Dask brings.
+    Functions in it are pickled if cloudpickle is installed, which Dask brings.
     """
     try:
         from cloudpickle import dumps  # type: ignore[import-untyped]
@@ -249,12 +258,12 @@ def _shipped(run: Run) -> Work:
 
 
 def _compute(run: bytes, x64: bool, task: Task) -> Chunk:
-    """One chunk of a pickled run."""
+    """Statistics of the chunk of a task, by a pickled run in precision x64 or not."""
     return _unpacked(run, x64)(task)
 
 
 @functools.lru_cache(maxsize=4)
 def _unpacked(run: bytes, x64: bool) -> Run:
-    """The same object for the same bytes, so that a worker compiles a run only once."""
+    """The run of these bytes, the same object each time: a worker compiles it only once."""
     with jax.enable_x64(x64):  # else a worker would read float64 arrays as float32
         return pickle.loads(run)

@@ -1,4 +1,4 @@
-"""What determines the samples of a run: checked, in one precision, named by a hash.
+"""Inputs that determine the samples of a run: checked, in one precision, named by a hash.
 
 A chunk is always computed at its full size, on one device, by the same program; the statistics are
 numpy's, in float64. So they depend neither on the executor nor on the number of devices. (A program
@@ -55,7 +55,7 @@ class Sources(eqx.Module):
 
     @property
     def random(self) -> dict[str, bool]:
-        """Which of the sources differ from sample to sample."""
+        """True by name of a source, 'law', 'velocity' or 'gaps', that differs between samples."""
         return {
             name: not (x is None or isinstance(x, Law) or getattr(x, "ndim", 0) == 1)
             for name, x in vars(self).items()
@@ -66,11 +66,15 @@ class Sources(eqx.Module):
 def draw(
     sources: Sources, scene: Scene, key: jax.Array, lanes: jax.Array, rows: dict[str, jax.Array]
 ) -> Sources:
-    """The chunk's law, velocities and gaps; `key` is the chunk's, `rows` are given samples."""
+    """Law, velocities (C, n) and gaps (C, m) of a chunk; what is constant has no axis of samples.
+
+    `key` is the chunk's, `lanes` (C,) are 0, 1, ...; `rows` holds given samples by name.
+    """
+    # (C, 3): for law, velocity and gaps of each sample
     keys = jax.vmap(lambda lane: jax.random.split(jax.random.fold_in(key, lane), 3))(lanes)
 
     def entries(name: str, size: int, each: jax.Array, non_negative: bool) -> Any:
-        """Draws (C, size) of a source, its rows, or its constant."""
+        """Draws (C, size) of a source by the keys `each` (C,); else its given rows or constant."""
         source = getattr(sources, name)
         if isinstance(source, Distribution):
             dtype = jnp.result_type(*jax.tree.leaves(source))
@@ -86,22 +90,23 @@ def draw(
 def impacts(
     drawn: Sources, scene: Scene, random: dict[str, bool], size: int, rtol: np.ndarray | None
 ) -> tuple[jax.Array, jax.Array]:
-    """Velocities (C, n) and statuses (C,) of a chunk; a bad draw has a code of its own.
+    """Velocities v+ (C, n) and statuses (C,) of the C = `size` samples of a chunk.
 
-    `rtol` () as of `impact`.
+    A bad draw has a code of its own, see `OUTCOMES`. `random` tells which sources have an axis of
+    samples; `rtol` () is that of `impact`, None: the law's own.
     """
 
     def one(law: Law, velocity: jax.Array, gaps: jax.Array | None) -> tuple[jax.Array, jax.Array]:
-        """v+ (n,) and status () of one sample."""
+        """v+ (n,) and status () of one sample with v- `velocity` (n,) and gaps (m,)."""
         code = jnp.where(within_domains(law), 0, BAD_LAW)
         code = jnp.where(jnp.all(jnp.isfinite(velocity)), code, BAD_VELOCITY)
-        place = scene
+        one_scene = scene
         if gaps is not None:
             fine = jnp.isfinite(gaps) & (rounded_gaps(gaps) >= 0)
             code = jnp.where(jnp.all(fine), code, BAD_GAP)
-            place = with_gaps(scene, jnp.where(fine, gaps, 0))
+            one_scene = with_gaps(scene, jnp.where(fine, gaps, 0))
         velocity = jnp.where(code == 0, velocity, 0)  # at rest: over at once
-        out = impact(law, place, velocity, rtol=rtol)
+        out = impact(law, one_scene, velocity, rtol=rtol)
         return out.velocity, jnp.where(code == 0, out.status, code.astype(jnp.int32))
 
     axes = tuple(eqx.if_array(0) if random[name] else None for name in vars(drawn))
@@ -132,11 +137,14 @@ class Run:
         return self.reduced(task, self.outcomes(task, device))
 
     def reduced(self, task: Task, outcomes: Chunk) -> Chunk:
-        """The statistics of the outcomes of a task."""
+        """Statistics of the outcomes (C samples) of a task."""
         return reduced(task, outcomes, self.bins, self.keep_samples)
 
     def outcomes(self, task: Task, device: jax.Device | None = None) -> Chunk:
-        """All samples of a chunk: what was drawn, velocities and statuses."""
+        """Samples of a chunk by name: v- and gaps that were drawn, v+ `velocity`, `status`.
+
+        Arrays (C, n), (C, m), (C, n), (C,); without columns for what is constant.
+        """
         random, rtol = self.sources.random, task.tolerance.rtol
         with self.flags():
             drawn, scene = self._drawn(task, device)
@@ -158,13 +166,16 @@ class Run:
         return -(-self.samples // self.size)
 
     def count(self, number: int) -> int:
-        """How many samples of a chunk are used."""
+        """Number of samples of a chunk that are used: fewer than its size in the last one."""
         return min(self.size, self.samples - number * self.size)
 
     def task(
         self, number: int, tolerance: Tolerance = AS_THE_LAW, ends: np.ndarray | None = None
     ) -> Task:
-        """The task of a chunk."""
+        """Task of chunk `number`; `ends` (n, 2) of its histograms, None: from its own samples.
+
+        Given rows of the last chunk are filled up with copies of the last row.
+        """
         size = self.size
         rows = {}
         for name, values in self.rows.items():
@@ -173,10 +184,11 @@ class Run:
         return Task(number, self.count(number), ends, rows, tolerance)
 
     def sample(self, index: int) -> tuple[Law, Scene, jax.Array]:
-        """Law, scene and velocity of sample `index`, the same bits as in the run."""
+        """Law, scene and v- of sample `index`, by the same draws as in the run, bit by bit."""
         number, lane = divmod(index, self.size)
         with self.flags():
             drawn, _ = self._drawn(self.task(number), None)
+        # random sources have an axis of samples
         law, velocity, gaps = (
             jax.tree.map(lambda x: x[lane] if eqx.is_array(x) else x, getattr(drawn, name))
             if random
@@ -187,12 +199,12 @@ class Run:
 
     @contextlib.contextmanager
     def flags(self) -> Iterator[None]:
-        """What precision and draws depend on, in this thread only: workers have their own."""
+        """Set precision and kind of random bits of the run in JAX, in this thread, while open."""
         with jax.enable_x64(self.x64), jax.threefry_partitionable(self.threefry_partitionable):
             yield
 
     def _drawn(self, task: Task, device: jax.Device | None) -> tuple[Sources, Scene]:
-        """The draws of the task; where its inputs are, there a program runs."""
+        """Draws of a task's chunk, and the scene, on a device: programs run where inputs are."""
         key = jax.random.wrap_key_data(jnp.asarray(self.key), impl=self.key_kind)
         key = jax.random.fold_in(key, np.uint32(task.number))
         lanes = np.arange(self.size, dtype=np.uint32)
@@ -204,7 +216,7 @@ class Run:
 
     @property
     def identity(self) -> dict[str, str]:
-        """A hash of each thing that determines the chunks; the number of samples does not."""
+        """Hashes by name of all that determines the chunks; the number of samples does not."""
         parts = {
             "law": self.sources.law,
             "scene": self.scene,
@@ -220,7 +232,7 @@ class Run:
 
     @property
     def description(self) -> str:
-        """The run in one line."""
+        """Law, sizes of the scene, random sources and v- of the run in one line."""
         sources, scene = self.sources, self.scene
         law = type(sources.law).__name__ if isinstance(sources.law, Law) else _named(sources.law)
         size = counted(scene.size, "coordinate"), counted(scene.contacts, "contact")
@@ -245,7 +257,7 @@ def planned_run(
     bins: int,
     keep_samples: bool,
 ) -> Run:
-    """The run of these arguments; raises where one of them is bad."""
+    """Run of these arguments, as of `monte_carlo`, checked; `chunk` is the size of a chunk."""
     check_kind("scene", scene, Scene)
     sources = _checked_sources(sources, scene)
     rows = {name: np.asarray(x) for name, x in vars(sources).items() if getattr(x, "ndim", 1) == 2}
@@ -275,7 +287,7 @@ def planned_run(
 
 
 def _checked_sources(sources: Sources, scene: Scene) -> Sources:
-    """Checked sources, all floating-point values in the widest type among them."""
+    """Sources of law, velocity and gaps, checked, with numbers in the widest float type of all."""
     law, gaps = sources.law, sources.gaps
     if isinstance(law, type) or not (isinstance(law, Law) or callable(law)):
         raise TypeError(f"Argument `law` must be a Law or a function key -> Law, but is {law!r}.")
@@ -288,6 +300,7 @@ def _checked_sources(sources: Sources, scene: Scene) -> Sources:
             "Argument `gaps` must be given where neither the velocity nor the law is random: all "
             "samples would be the same."
         )
+    # a function of a key is called once, to look at its law
     drawn = law if isinstance(law, Law) else law(jax.random.key(0, impl="threefry2x32"))
     if not isinstance(drawn, Law):
         raise TypeError(f"Argument `law` must give a Law for a key, but gives {drawn!r}.")
@@ -302,14 +315,14 @@ def _checked_sources(sources: Sources, scene: Scene) -> Sources:
 
 
 def _named(source: Any) -> str:
-    """A source in words."""
+    """Text on a source: the distribution with its parameters, or the name of a function."""
     if isinstance(source, eqx.Module):
         return repr(source)
     return f"function {getattr(source, '__qualname__', type(source).__name__)}"
 
 
 def _key(key: Any) -> tuple[np.ndarray, str]:
-    """Raw data and kind of a key; an integer is a seed."""
+    """Raw data and kind of a JAX random key; an integer is a seed of a threefry key."""
     if not isinstance(key, bool) and isinstance(key, int | np.integer):
         if not -(2**63) <= key < 2**63:
             raise ValueError(f"Argument `key` must have at most 64 bits, but is {key}.")

@@ -1,4 +1,4 @@
-"""Statistics in float64 on the host: what a chunk of samples reduces to, and how chunks are joined.
+"""Statistics in float64 on the host: of a chunk of samples, and of chunks that are joined.
 
 A chunk is a mapping of arrays, as its file holds them: `number`, `count` of its samples, `statuses`
 (how many ended with each code), `used` of them that did not fail with their `mean` and `products`
@@ -33,7 +33,7 @@ Chunk = dict[str, np.ndarray]
 
 
 class Tolerance(NamedTuple):
-    """How finely a run integrates."""
+    """Tolerance of the impacts of a run, and the error that it makes."""
 
     rtol: float = 0.0  # of `impact`; 0: the law's own
     error: float = 0.0  # beside the law's default, in standard deviations: see `tolerance.py`
@@ -44,23 +44,26 @@ AS_THE_LAW = Tolerance()
 
 @dataclass(frozen=True)
 class Task:
-    """What a chunk needs besides the plan: its number, how many samples count, bins, given rows."""
+    """Inputs of one chunk, besides those of the run."""
 
-    number: int
-    count: int
+    number: int  # from 0
+    count: int  # samples that are used, the first ones
     ends: np.ndarray | None  # (n, 2) of the histograms; None: from this chunk
-    rows: dict[str, np.ndarray]
+    rows: dict[str, np.ndarray]  # given samples by name of the source
     tolerance: Tolerance = AS_THE_LAW
 
 
 def part(chunk: Chunk, prefix: str) -> Chunk:
-    """The arrays whose names begin with `prefix.`, without it."""
+    """Arrays of a chunk whose names begin with `prefix.`, by the rest of their names."""
     start = f"{prefix}."
     return {k.removeprefix(start): v for k, v in chunk.items() if k.startswith(start)}
 
 
 def moments(values: np.ndarray) -> Chunk:
-    """Of `values` (d, count), one row a quantity; in float64 whatever their type.
+    """Number, mean (d,) and sums of products of deviations (d, d) of `values` (d, count).
+
+    Equation: `mean = sum_k x_k / count`, `products = sum_k (x_k - mean)(x_k - mean)^T`, in float64
+    whatever their type.
 
     >>> import numpy as np
     >>> from jimpact.montecarlo.statistics import moments
@@ -77,10 +80,11 @@ def moments(values: np.ndarray) -> Chunk:
 
 
 def merged(a: Chunk, b: Chunk) -> Chunk:
-    """Moments of both together.
+    """Moments (see `moments`) of the samples of a and b together.
 
-    Equation: `mean = mean_a + d n_b / n`, `S = S_a + S_b + d d^T n_a n_b / n`, with
-    `d = mean_b - mean_a`. Not associative in floating point: merge in a fixed order.
+    Equation: `mean = mean_a + d n_b / n`, `S = S_a + S_b + d d^T n_a n_b / n`, with n the numbers
+    `used`, S the `products`, `d = mean_b - mean_a`. Not associative in floating point: merge in a
+    fixed order.
 
     Source: Chan, Golub and LeVeque, Am. Statistician 37 (1983) 242.
 
@@ -100,7 +104,10 @@ def merged(a: Chunk, b: Chunk) -> Chunk:
 
 
 def bin_range(values: np.ndarray) -> np.ndarray:
-    """Low and high ends (d, 2) for the bins of `values` (d, count), with a margin."""
+    """Low and high ends (d, 2) for the bins of `values` (d, count): the range with a margin.
+
+    Equation: `[low - margin, high + margin]`, margin = `MARGIN` (high - low).
+    """
     low, high = values.min(axis=1).astype(float), values.max(axis=1).astype(float)
     size = np.maximum(np.abs(low), np.abs(high))
     flat = FLAT * np.where(size > 0, size, 1.0)
@@ -121,7 +128,7 @@ def bin_counts(values: np.ndarray, ends: np.ndarray, bins: int) -> np.ndarray:
 
 
 def bin_edges(ends: np.ndarray, bins: int) -> np.ndarray:
-    """Bin edges (d, bins + 1)."""
+    """Bin edges (d, bins + 1), evenly spaced between the ends (d, 2)."""
     return np.linspace(ends[:, 0], ends[:, 1], bins + 1, axis=1)
 
 
@@ -130,8 +137,8 @@ def binned_quantiles(
 ) -> np.ndarray:
     """The q-quantiles (..., d), right to one bin width where they lie inside the bins.
 
-    Linear inside the bin; `low` and `high` (d,), the smallest and largest values, bound what lies
-    outside the bins.
+    The inverse of the cumulated `counts` (d, bins + 2) over the edges, linear inside a bin; `low`
+    and `high` (d,), the smallest and largest values, are the ends of the two outer bins.
 
     >>> import numpy as np
     >>> from jimpact.montecarlo.statistics import binned_quantiles
@@ -141,6 +148,7 @@ def binned_quantiles(
     """
     first, last = np.minimum(low, ends[:, 0]), np.maximum(high, ends[:, 1])
     edges = np.column_stack([first, bin_edges(ends, counts.shape[1] - 2), last])
+    # number of values below each edge
     below = np.cumsum(np.column_stack([np.zeros(len(counts)), counts]), axis=1)
     # from above: of an empty stretch between two bins the lower end is taken
     quantiles = [
@@ -150,9 +158,13 @@ def binned_quantiles(
 
 
 def reduced(task: Task, samples: Chunk, bins: int, keep_samples: bool) -> Chunk:
-    """The statistics of the first `task.count` samples of a chunk."""
+    """Statistics of the first `task.count` of the `samples` of a chunk, see the module docstring.
+
+    Failed samples count by status only; `keep_samples`: all raw samples are among them.
+    """
     status, n, count = samples["status"], samples["velocity"].shape[1], task.count
     fine = ~FAILURE[status]
+    # (n + m, C): velocities after and random gaps of the C samples
     values = np.concatenate([samples["velocity"].T, samples["gaps"].T]).astype(np.float64)
     ends = task.ends
     if ends is None:  # the first chunk sets the histograms
@@ -163,7 +175,7 @@ def reduced(task: Task, samples: Chunk, bins: int, keep_samples: bool) -> Chunk:
             )
         ends = bin_range(values[:n, fine])
     used = values[:, :count][:, fine[:count]]
-    lanes = np.flatnonzero(~fine[:count])[:LISTED]
+    lanes = np.flatnonzero(~fine[:count])[:LISTED]  # of failed samples
     raw = count if keep_samples else min(count, IN_MEMORY) if task.number == 0 else 0
     return {
         "number": np.array(task.number),
@@ -176,13 +188,13 @@ def reduced(task: Task, samples: Chunk, bins: int, keep_samples: bool) -> Chunk:
         "ends": ends,
         "counts": bin_counts(used[:n], ends, bins),
         "bad.index": task.number * len(status) + lanes,
-        **{f"bad.{name}": values[lanes] for name, values in samples.items()},
-        **({f"raw.{name}": values[:raw].copy() for name, values in samples.items()} if raw else {}),
+        **{f"bad.{name}": x[lanes] for name, x in samples.items()},
+        **({f"raw.{name}": x[:raw].copy() for name, x in samples.items()} if raw else {}),
     }
 
 
 def joined(before: Chunk, chunk: Chunk) -> Chunk:
-    """The statistics of all chunks before and of the next one, with the first ones' samples."""
+    """Statistics of all chunks `before` together with the next one; raw samples of the first."""
     assert chunk["number"] == before["number"] + 1  # floating-point sums depend on the order
     bad = {k: np.concatenate([v, chunk[k]])[:LISTED] for k, v in before.items() if k[:4] == "bad."}
     return {
@@ -197,5 +209,5 @@ def joined(before: Chunk, chunk: Chunk) -> Chunk:
 
 
 def named(counts: np.ndarray) -> dict[str, int]:
-    """Status counts by name, those that occurred."""
+    """Counts of samples by name of the status, from counts by code; without zeros."""
     return {OUTCOMES[code].name: int(counts[code]) for code in np.flatnonzero(counts)}

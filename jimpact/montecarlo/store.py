@@ -15,6 +15,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
+from types import FunctionType
 from typing import Any
 
 import jax
@@ -41,7 +42,11 @@ def fingerprint(value: Any) -> str:
 
 
 def _described(value: Any, inside: tuple[int, ...]) -> Any:
-    """The value as tuples of words; `inside` are the ids of what holds it (functions may recur)."""
+    """A value as nested tuples of texts and bytes, equal for equal values, to be hashed.
+
+    `inside` are the ids of the objects that hold it: one that holds itself, as a recursive
+    function does, is named there, not entered again.
+    """
     name = _name(type(value))
     if id(value) in inside:
         return name, "itself"
@@ -75,8 +80,8 @@ def _described(value: Any, inside: tuple[int, ...]) -> Any:
         return name
 
 
-def _source(function: Any) -> Any:
-    """Source of a function, or its byte code."""
+def _source(function: FunctionType) -> Any:
+    """Source text of a function; if there is none, its byte code with names and constants."""
     try:
         return inspect.getsource(function)
     except (OSError, TypeError):
@@ -99,7 +104,7 @@ class Store:
     """
 
     def __init__(self, folder: str | Path, identity: dict[str, str]):
-        """Open the folder of the run that has this identity, or begin it."""
+        """Open the folder of a run, or begin it; `identity` are hashes by name, see `Run`."""
         identity = identity | FORMAT
         if not isinstance(folder, str | Path):
             raise TypeError(f"Argument `folder` must be a path, but is {folder!r}.")
@@ -139,7 +144,11 @@ class Store:
         _write(self.path(int(chunk["number"])), buffer.getvalue())
 
     def read(self, number: int, count: int, all_samples: bool) -> Chunk | None:
-        """A chunk with `count` samples; None where there is none, or only an unusable one."""
+        """Statistics of chunk `number` from its file; None if it is missing or cannot be used.
+
+        It must have `count` samples, with `all_samples` each of them raw, too. A damaged file makes
+        a warning.
+        """
         path = self.path(number)
         if not path.exists():
             return None
@@ -194,7 +203,10 @@ def read_samples(folder: str | Path) -> Iterator[dict[str, np.ndarray]]:
 
 
 def _checked(path: Path, run: str) -> Chunk:
-    """The arrays of a chunk file of this run; zip checks the sums of their bytes."""
+    """Arrays of a chunk's file by name; a ValueError unless it is of the run with the hash `run`.
+
+    zip checks the sums of their bytes.
+    """
     with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
         arrays = {name: file[name] for name in file.files}
     owner = str(arrays.pop("run"))
@@ -209,7 +221,7 @@ def _run(identity: dict[str, str]) -> str:
 
 
 def _identity(folder: Path) -> dict[str, str]:
-    """The content of a manifest, or a ValueError."""
+    """Hashes by name in the manifest of a folder; a ValueError if it is damaged."""
     path = folder / MANIFEST
     try:
         content = json.loads(path.read_text(encoding="utf-8"))

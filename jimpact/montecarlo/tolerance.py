@@ -1,4 +1,4 @@
-"""How finely a run integrates: its tolerance may cost a small part of its standard errors.
+"""Tolerance of the impacts of a run: its error may be a small part of the standard errors.
 
 The samples of the first chunk are computed at the law's default tolerance and at a coarser one. The
 differences of each velocity x, and of `(x - mean)^2`, are the errors of mean and variance that the
@@ -29,12 +29,17 @@ WORTH_LOOKING = 8
 
 
 def first_chunk(run: Run, recorded: Tolerance | None) -> Chunk:
-    """Chunk 0 at the tolerance of the run: the recorded one, or the coarsest that suffices."""
+    """Statistics of chunk 0 at the tolerance of the run: the recorded one, or a coarse one.
+
+    That is the coarsest of `COARSER` times the law's default whose error in means and variances is
+    at most `SHARE` of their standard errors; the default itself for short runs.
+    """
     if recorded is not None:
         return run(run.task(0, recorded))
     default = open_tolerance(run)
     task = run.task(0, AS_THE_LAW if default is None else Tolerance(default))
     fine = run.outcomes(task)
+    # laws with a tolerance of their own, short runs and raw samples keep that of the law
     if default is None or run.chunks < WORTH_LOOKING or run.keep_samples:
         return run.reduced(task, fine)
     for times in COARSER:
@@ -50,10 +55,10 @@ def first_chunk(run: Run, recorded: Tolerance | None) -> Chunk:
 def open_tolerance(run: Run) -> float | None:
     """The default tolerance of a law that would take another one; None: it has its own, or none."""
     law, scene, velocity = run.sample(0)
-    found: list[Any] = []
+    found: list[Any] = []  # filled while JAX traces `look`: nothing is computed
 
     def look(velocity: jax.Array) -> jax.Array:
-        """Note the default, and whether another one is taken."""
+        """Enter in `found` the law's accuracy, and if it is the contact's rtol where one is set."""
         contact = law.contact(scene, velocity)
         other = contact.integrated_to(jnp.ones((), velocity.dtype))
         taken: Any = law.accuracy(other)
@@ -67,9 +72,11 @@ def open_tolerance(run: Run) -> float | None:
 
 
 def added_error(fine: Chunk, coarse: Chunk) -> float:
-    """Of the same samples at two tolerances, for mean or variance of a velocity, the largest.
+    """Largest error of a mean or a variance of v+ between two tolerances of the same samples.
 
-    In standard deviations of the quantity; infinite where statuses differ.
+    Equation: for each velocity x, and for `y = (x - mean)^2`, with d the coarse minus the fine
+    values: `(|mean(d)| + 2 std(d) / sqrt(N)) / std`, std that of the fine values. Infinite if
+    statuses differ.
 
     >>> import numpy as np
     >>> from jimpact.montecarlo.tolerance import added_error

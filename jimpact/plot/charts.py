@@ -89,22 +89,22 @@ def work_precision(result: WorkPrecision, title: str = "") -> Figure:
     styles, ends = _styles(result.points), []
     for axes, (quantity, against, label) in zip(panels, _PANELS):
         for name, row in result.points.items():
-            at = _draw(axes, row, quantity, against, styles[name])
+            at = _draw_errors(axes, row, quantity, against, styles[name])
             if at is not None and styles[name]["ls"] != "none":
                 ends.append(LineEnd(axes, at, name, styles[name]["color"]))
-        _finish(axes, result.reference.uncertainty[quantity], label, _ERRORS[quantity])
+        _finish_errors(axes, result.reference.uncertainty[quantity], label, _ERRORS[quantity])
     if not gradients:
-        legend_below(figure, 2, note=_note(result))
+        legend_below(figure, 2, note=_reading_note(result))
     else:  # next to the three panels
         lines = {x.get_label(): x for axes in panels for x in axes.get_legend_handles_labels()[0]}
         panels[3].axis("off")
-        panels[3].legend(handles=list(lines.values()), title=_note(result), loc="center")
+        panels[3].legend(handles=list(lines.values()), title=_reading_note(result), loc="center")
     label_ends(figure, ends)
     return figure
 
 
 def _styles(points: Mapping[str, tuple[Point, ...]]) -> dict[str, dict[str, Any]]:
-    """How each method is drawn: methods by colour, laws (one point each) grey by marker."""
+    """Options of matplotlib by name: methods by colour, laws (one point each) grey by marker."""
     laws = [name for name, row in points.items() if row[0].setting is None]
     methods = [name for name in points if name not in laws]
     styles: dict[str, dict[str, Any]] = {}
@@ -126,11 +126,16 @@ _PANELS = (  # error, and what it is drawn against
 )
 
 
-def _draw(
+def _draw_errors(
     axes: Axes, row: tuple[Point, ...], quantity: str, against: str, style: dict[str, Any]
 ) -> tuple[float, float] | None:
-    """One line, and where it ends; None where no point has a time or a count, and an error."""
+    """Draw the error of a `quantity` over times [µs] or counts, one point for each setting.
+
+    `against` is the field of `Point` on the x axis. Returns the end (x, y) of the line; None if no
+    point has both an error and a time or a count.
+    """
     given = [getattr(point, against) for point in row]
+    # median and quartiles of a time [µs], or three times the same count
     spans = [
         1e6 * np.array(x) if isinstance(x, Timing) else np.full(3, np.nan if x is None else x)
         for x in given
@@ -156,7 +161,7 @@ def _draw(
     return float(x[known][-1]), float(y[known][-1])
 
 
-def _finish(axes: Axes, uncertainty: float, x: str, y: str) -> None:
+def _finish_errors(axes: Axes, uncertainty: float, x: str, y: str) -> None:
     """Logarithmic axes with labels, and the grey band up to the uncertainty of the reference."""
     axes.set(xlabel=x, ylabel=y, yscale="log")
     low, high = axes.get_ylim()
@@ -168,8 +173,8 @@ def _finish(axes: Axes, uncertainty: float, x: str, y: str) -> None:
     logarithmic(axes, "y")
 
 
-def _note(result: WorkPrecision) -> str:
-    """How to read the chart."""
+def _reading_note(result: WorkPrecision) -> str:
+    """Note below the chart: how errors and times were measured, and what grey and hollow mean."""
     return (
         f"errors: largest of {result.sample} impacts, stiffness\nspread over a factor "
         f"{result.spread:g}; times: median\nand quartiles of {result.repeats}, batch of "
@@ -204,7 +209,7 @@ def stability_map(result: StabilityMap, title: str = "") -> Figure:
         _ticks(axes, "x", name, result.axes[name])
         axes.set_yticks(range(len(result.methods)), result.methods, fontsize=SMALL)
         axes.tick_params(labelleft=i % COLUMNS == 0)
-        axes.plot(_place(result, name), -0.62, "v", color="black", ms=5, clip_on=False)
+        axes.plot(_base_position(result, name), -0.62, "v", color="black", ms=5, clip_on=False)
         axes.set_ylim(len(result.methods) - 0.5, -0.5)
     _legend_of_classes(figure, result)
     return figure
@@ -240,27 +245,27 @@ def stability_pairs(result: StabilityMap, method: str, title: str = "") -> Figur
     figure, grid = new_figure(1.6 + 1.5 * size, title or method, size, size, squeeze=False)
     for each in pairs:
         column, row = (names.index(name) for name in each.axes)
-        _pair(grid[row - 1, column], result, each)
+        _draw_pair(grid[row - 1, column], result, each)
     for above in grid[np.triu_indices(size, 1)]:
         above.remove()
     _legend_of_classes(figure, result)
     return figure
 
 
-def _pair(axes: Axes, result: StabilityMap, each: Slice) -> None:
-    """The classes over two axes; a ring marks the base point."""
+def _draw_pair(axes: Axes, result: StabilityMap, each: Slice) -> None:
+    """Draw the classes of a slice over two axes; a ring marks the base point."""
     _draw_classes(axes, each.codes.T)
     axes.invert_yaxis()
     for which, name in zip("xy", each.axes):
         _ticks(axes, which, name, result.axes[name], 3)
     axes.label_outer()
-    x, y = (_place(result, name) for name in each.axes)
+    x, y = (_base_position(result, name) for name in each.axes)
     axes.plot(x, y, "o", ms=7, mfc="none", mec="white", mew=2.5)
     axes.plot(x, y, "o", ms=7, mfc="none", mec="black", mew=1.2)
 
 
 def _draw_classes(axes: Axes, codes: np.ndarray) -> None:
-    """A coloured cell for each class code (rows, columns)."""
+    """Draw a cell for each code (rows, columns) in the colour of its class, white lines between."""
     axes.imshow(codes, aspect="auto", interpolation="nearest", **by_code(CLASS_COLOURS))
     rows, columns = codes.shape
     axes.set_xticks(np.arange(columns + 1) - 0.5, minor=True)
@@ -272,21 +277,21 @@ def _draw_classes(axes: Axes, codes: np.ndarray) -> None:
 
 
 def _ticks(axes: Axes, which: str, name: str, values: np.ndarray, most: int = _TICKS) -> None:
-    """At most so many values of a map's axis as ticks of a panel's axis 'x' or 'y'."""
+    """Label at most `most` values of a map's axis `name` on a panel's axis 'x' or 'y'."""
     at = range(0, len(values), -(-len(values) // most))
     axis = axes.xaxis if which == "x" else axes.yaxis
     axis.set_ticks(at, [in_words(float(f"{values[i]:.2g}")) for i in at], fontsize=SMALL)
     axis.set_label_text(_LABELS.get(name, name.replace("_", " ")), fontsize=SMALL)
 
 
-def _place(result: StabilityMap, name: str) -> float:
-    """Where the base lies among the values of an axis."""
+def _base_position(result: StabilityMap, name: str) -> float:
+    """Position of the base point on a panel's axis: its index among the values, interpolated."""
     values = result.axes[name]
     return float(np.interp(result.base[name], values, np.arange(len(values))))
 
 
 def _legend_of_classes(figure: Figure, result: StabilityMap) -> None:
-    """The classes that occur."""
+    """Draw a legend of the classes that occur in the slices."""
     codes = [each.codes.ravel() for name in result.methods for each in result.slices[name]]
     labels = [_CLASS_LABELS.get(name, name) for name in CLASSES]
     occurring = np.unique(np.concatenate(codes))
@@ -318,7 +323,7 @@ def validity_map(result: ValidityMap, tolerance: float = 1e-2, title: str = "") 
     """
     default = "Where the stiffness ratio may be left out"
     figure, (top, bottom) = new_figure(6.8, title or default, 2, 1, sharex=True)
-    for i, eta in enumerate(result.exponents):
+    for i, eta in enumerate(result.exponents):  # a colour an exponent, a line style a law
         top.plot(result.ratios, result.dispersion[i], label=f"LZB, exponent {eta:g}")
         for name, style in _STYLES.items():
             error = np.maximum(result.error(name)[i], _LEAST)
@@ -366,7 +371,7 @@ def advice(result: Advice, title: str = "", names: Sequence[str] = ()) -> Figure
     verdict = f"{'within' if result.within else 'not within'} {share(result.tolerance)}"
     figure.axes[0].set_title(f"{title}\n{as_code(result.law)}: {verdict}", fontsize="large")
     x = np.arange(len(laws))
-    for top, velocities in tops:
+    for top, velocities in tops:  # a panel for each unit: index, name and factor of each velocity
         for (i, word, factor), offset in zip(velocities, side_by_side(len(velocities))):
             label = word if len(velocities) <= len(COLOURS) else None
             v, low, high = factor * np.array([(c.velocity[i], c.low[i], c.high[i]) for c in rows]).T

@@ -1,5 +1,6 @@
 """Motions as films in real time: GIF, MP4, or a page that plays them."""
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,6 @@ from jimpact.plot.motions import (
     one_motion,
     plane_of,
     set_limits,
-    stretch_of,
 )
 from jimpact.plot.style import GREY
 from jimpact.tools.checks import check_values
@@ -113,7 +113,9 @@ def animation(
 
 
 def readable_speed(duration: float) -> float:
-    """1, or the largest of .5, .2, .1, .. at which a motion of this duration [s] takes long enough.
+    """Speed of a film: 1, or the largest of .5, .2, .1, .. at which it lasts 2 s (`_SHORTEST`).
+
+    `duration` [s] is that of the motion, `duration / speed` that of the film.
 
     >>> from jimpact.plot.films import readable_speed
     >>> [readable_speed(x) for x in (8.0, 1.0, 0.03, 0.0)]
@@ -129,7 +131,7 @@ def readable_speed(duration: float) -> float:
 def _frames(
     system: System, motion: Motion, title: str, speed: float | None, rate: float
 ) -> tuple[int, FuncAnimation]:
-    """How many frames a motion has, and these."""
+    """Number of frames, and the film of a motion at `speed`, with `rate` frames a second."""
     course, body = course_of(motion), system.body
     known = np.isfinite(course.q).all(axis=1) & np.isfinite(course.v).all(axis=1)
     at, q, v = course.time[known], course.q[known], course.v[known]
@@ -138,7 +140,7 @@ def _frames(
     speed = readable_speed(at[-1] - at[0]) if speed is None else float(speed)
     count = int((at[-1] - at[0]) / speed * rate + 1e-9) + 1
     time = at[0] + np.arange(count) * speed / rate
-    slopes = np.asarray(jax.vmap(body.rates)(jnp.asarray(q), jnp.asarray(v)))
+    slopes = np.asarray(jax.vmap(body.rates)(jnp.asarray(q), jnp.asarray(v)))  # dq/dt
     q, ground = positions(at, q, slopes, time), np.zeros((count, 2))
     point = POINT * (np.ptp(q) or 1.0)
     if system.base is not None:
@@ -152,23 +154,31 @@ def _frames(
     digits = max(2, int(np.ceil(-np.log10(speed / rate))))  # in which frames differ
     slow = "" if speed == 1 else f" (speed {speed:g})"
     captions = [f"{title}\n{t:.{digits}f} s{slow}".lstrip() for t in time]
-    return count, _drawn(body, curves, colours_of(body, q[0], point), ground, captions)
+    return count, _film(body, curves, colours_of(body, q[0], point), ground, captions)
 
 
-def _drawn(
-    body: Body, curves: Any, colours: list[str], ground: np.ndarray, captions: list[str]
+def _film(
+    body: Body,
+    curves: Sequence[Sequence[np.ndarray]],
+    colours: list[str],
+    ground: np.ndarray,
+    captions: list[str],
 ) -> FuncAnimation:
-    """Curves, planes and a caption, frame by frame."""
+    """Film of curves in their `colours`, the planes that a body stands on, and captions.
+
+    For each frame: outlines `curves[k]` (points, 2) of the body [m], displacement `ground[k]` (2,)
+    of the planes, caption.
+    """
     figure = Figure(figsize=(4.8, 4.8), dpi=80)
     axes = figure.add_axes(_PLACE)
     floors = [plane_of(*floor) for floor in body.floors]
     set_limits(axes, curves, ground, floors)
     lines = [axes.plot([], [], color=colour)[0] for colour in colours]
     planes = [axes.plot([], [], color=GREY, lw=2)[0] for _ in floors]
-    view = np.array([axes.get_xlim(), axes.get_ylim()])
+    view = np.array([axes.get_xlim(), axes.get_ylim()])  # limits of x, of y
 
     def draw(k: int) -> list[Any]:
-        """Frame k."""
+        """Set lines, planes and title to frame k; returns what has changed."""
         for line, points in zip(lines, curves[k], strict=True):
             line.set_data(*points.T)
         for line, floor in zip(planes, floors, strict=True):
@@ -179,8 +189,23 @@ def _drawn(
     return FuncAnimation(figure, draw, frames=len(captions))
 
 
+def stretch_of(n: np.ndarray, offset: float, view: np.ndarray, ground: np.ndarray) -> np.ndarray:
+    """Ends (2, 2), a column each, of the part of a plane `n^T (x - ground) = offset` in view.
+
+    `view` (2, 2) are the limits of x and of y, `ground` (2,) is the displacement of the plane. The
+    middle is the foot of the perpendicular from the centre of the view.
+    """
+    middle, reach = view.mean(axis=1), np.ptp(view[0])
+    foot = middle - (n @ (middle - ground) - offset) * n
+    return foot[:, None] + reach * np.array([-1, 1]) * np.array([n[1], -n[0]])[:, None]
+
+
 def positions(at: np.ndarray, q: np.ndarray, slopes: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """q (K, n) at `time` (K,), by cubics between the states at `at` (S,), which may repeat.
+    """q (K, n) at `time` (K,), by cubics between states q (S, n), dq/dt (S, n) at `at` (S,).
+
+    Equation: Hermite's `q = (1 + 2 s)(1 - s)^2 q_k + s^2 (3 - 2 s) q_(k+1)
+    + s (1 - s)^2 h q'_k - s^2 (1 - s) h q'_(k+1)`, `s = (t - t_k) / h`. Times may repeat: states
+    before and after an event.
 
     >>> import numpy as np
     >>> from jimpact.plot.films import positions

@@ -52,7 +52,7 @@ def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> F
     measured, predicted = _in_rows(fit.problem.measured), _in_rows(fit.predicted)
     shots, bodies = predicted.shape
     dodge = side_by_side(bodies)
-    x = np.arange(shots)[:, None] + dodge[None, :]
+    x = np.arange(shots)[:, None] + dodge[None, :]  # (shots, bodies)
     size = float(np.clip(220 / (shots * bodies), 3, 8))
     speed = "" if data is None else " m/s"
     heading = title or f"{type(fit.law).__name__}, rms {fit.rms:.3g}{speed}"
@@ -61,7 +61,7 @@ def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> F
     units, error = list(dict.fromkeys(each)), _error_bars(fit)
     grid: Any = {"sharex": True, "squeeze": False, "height_ratios": (3, 1.4)}
     figure, panels = new_figure(6.0, heading, 2, len(units), **grid)
-    for (top, bottom), unit in zip(panels.T, units):
+    for (top, bottom), unit in zip(panels.T, units):  # a column of panels for each unit
         members = [i for i, own in enumerate(each) if own == unit]
         for i in members:
             bars = None if error is None else error[:, i]
@@ -76,8 +76,8 @@ def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> F
         top.set_ylabel(f"{what} [{unit}]" if unit else what)
         bottom.set_ylabel(f"measured − fitted [{unit}]" if unit else "measured − fitted")
         bottom.axhline(0, color=GREY, lw=0.8)
-        _shot_axis(bottom, fit, dodge)
-    _legend(figure, fit, others or {}, error is not None)
+        _label_shots(bottom, fit, dodge)
+    _draw_legend(figure, fit, others or {}, error is not None)
     for axes in figure.axes:
         axes.grid(False, axis="x")
     return figure
@@ -122,21 +122,24 @@ def contour(result: Contour, title: str = "") -> Figure:
 
 
 def _in_rows(values: np.ndarray) -> np.ndarray:
-    """A row a shot, a sample of a motion, or a value."""
+    """Values as an array of two axes, with a row for each shot, sample of a motion, or value."""
     values = np.asarray(values, float)
     return values.reshape(len(values) if values.ndim else 1, -1)
 
 
 def _error_bars(fit: Fit) -> np.ndarray | None:
-    """Sigma, else the estimated noise, a row a shot; None where neither is known."""
+    """Error bars, in the rows of `_in_rows`: sigma, else the noise; None if neither is known."""
     shape = fit.predicted.shape
     if fit.problem.sigma is not None:
         return _in_rows(np.broadcast_to(np.asarray(fit.problem.sigma, float), shape))
     return _in_rows(np.full(shape, fit.noise)) if np.isfinite(fit.noise) else None
 
 
-def _shot_axis(axes: Axes, fit: Fit, dodge: np.ndarray) -> None:
-    """Bodies on the axis of a single shot; else shots, all labelled or every so many."""
+def _label_shots(axes: Axes, fit: Fit, dodge: np.ndarray) -> None:
+    """Label the x axis: bodies, at the offsets `dodge`, for a single shot; else shots or values.
+
+    At most `_LABELLED` of them have a label.
+    """
     data, labels = fit.experiments, fit.problem.labels
     if data is not None and len(labels) == 1:
         axes.set_xticks(dodge, [f"{i + 1}" for i in range(len(dodge))])
@@ -150,8 +153,8 @@ def _shot_axis(axes: Axes, fit: Fit, dodge: np.ndarray) -> None:
     axes.set_xlim(-0.6, len(labels) - 0.4)
 
 
-def _legend(figure: Figure, fit: Fit, others: Mapping[str, Fit], has_bars: bool) -> None:
-    """Markers of measured and fitted values, of other fits, and of bodies."""
+def _draw_legend(figure: Figure, fit: Fit, others: Mapping[str, Fit], has_bars: bool) -> None:
+    """Draw a legend: markers of measured and fitted values and of other fits, colours of bodies."""
     bars = ""
     if has_bars:
         bars = ", ± noise" if fit.problem.sigma is None else ", ± sigma"

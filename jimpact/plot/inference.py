@@ -48,6 +48,7 @@ def profiles(result: tuple[Profile, ...] | list[Profile]) -> Figure:
         check_kind("result", each, Profile)
     figure, grid = new_panels(len(result), 2.8)
     for axes, each in zip(grid, result):
+        # sqrt(deviance) is linear between computed points: a parabola is drawn as one
         places = np.linspace(0, len(each.value) - 1, _PARTS * (len(each.value) - 1) + 1)
         between = np.interp(places, range(len(each.value)), each.value)
         root = np.interp(between, each.value, np.sqrt(each.deviance))
@@ -94,7 +95,7 @@ def correlation(fit: Fit) -> Figure:
     image = axes.imshow(finite, vmin=-1, vmax=1, cmap="RdBu_r")
     axes.set_xticks(range(count), fit.names, rotation=90)
     axes.set_yticks(range(count), fit.names)
-    if count <= 8:
+    if count <= 8:  # numbers fit into the cells, white on dark ones
         for i, j in np.argwhere(np.isfinite(fit.correlation)):
             colour = "white" if abs(fit.correlation[i, j]) > 0.6 else "black"
             write(axes, (j, i), f"{fit.correlation[i, j]:.2f}", color=colour)
@@ -126,25 +127,26 @@ def residuals(fit: Fit) -> Figure:
     """
     problem = fit.problem
     measured = np.asarray(problem.measured, float)
-    here = ~np.isnan(measured)
+    is_measured = ~np.isnan(measured)
     sigma = fit.noise if problem.sigma is None else np.asarray(problem.sigma, float)
-    noise = np.broadcast_to(sigma, measured.shape)[here]
+    noise = np.broadcast_to(sigma, measured.shape)[is_measured]
     known = np.isfinite(noise).all() and (noise > 0).all()
-    scaled = fit.residual[here] / (noise if known else 1.0)
+    scaled = fit.residual[is_measured] / (noise if known else 1.0)
     unit = "standard errors" if known else "as measured"
     figure, (first, second, third) = new_panels(3, 3.0)
     units = [] if fit.experiments is None else dict.fromkeys(fit.experiments.units)
     values = f" [{', '.join(units)}]" if units else ""
     style: dict[str, Any] = {"ls": "none", "marker": "o", "mfc": "none", "ms": 4}
-    first.axline((float(measured[here].mean()),) * 2, slope=1.0, color=GREY, lw=0.8)
-    first.plot(fit.predicted[here], measured[here], color=COLOURS[0], **style)
+    first.axline((float(measured[is_measured].mean()),) * 2, slope=1.0, color=GREY, lw=0.8)
+    first.plot(fit.predicted[is_measured], measured[is_measured], color=COLOURS[0], **style)
     first.set(xlabel=f"fitted{values}", ylabel=f"measured{values}")
-    over, label = _over(fit)
+    over, label = _residual_axis(fit)
     second.axhline(0, color=GREY, lw=0.8)
-    second.plot(np.broadcast_to(over, here.shape)[here], scaled, color=COLOURS[0], **style)
+    abscissa = np.broadcast_to(over, is_measured.shape)[is_measured]
+    second.plot(abscissa, scaled, color=COLOURS[0], **style)
     second.set(xlabel=label, ylabel=f"residual [{unit}]")
     ordered = np.sort(scaled)
-    normal = ndtri((np.arange(len(ordered)) + 0.5) / len(ordered))
+    normal = ndtri((np.arange(len(ordered)) + 0.5) / len(ordered))  # expected of normal noise
     third.plot(normal, ordered, color=COLOURS[0], **style)
     third.axline((0.0, 0.0), slope=1.0 if known else float(np.std(scaled)) or 1.0, color=GREY)
     third.set(xlabel="normal quantile [standard errors]", ylabel=f"residual [{unit}]")
@@ -154,8 +156,11 @@ def residuals(fit: Fit) -> Figure:
     return figure
 
 
-def _over(fit: Fit) -> tuple[np.ndarray, str]:
-    """The abscissa of residuals: the fastest approach (K, 1) of shots, else the fitted values."""
+def _residual_axis(fit: Fit) -> tuple[np.ndarray, str]:
+    """Values and label of the x axis of residuals.
+
+    The fastest approach (K, 1) [m/s] of K shots; of other data the fitted values.
+    """
     data, scene = fit.experiments, fit.problem.scene
     if data is None:
         return np.asarray(fit.predicted), "fitted"
@@ -195,16 +200,16 @@ def corner(fit: Fit, draws: Any = None, names: Sequence[str] | None = None) -> F
     shown = [i for i in usable if names is None or fit.names[i] in names][:MOST]
     if not shown:
         raise ValueError("Argument `fit` must have a standard error to show, but has none.")
-    values = None if draws is None else _drawn(fit, draws)
+    values = None if draws is None else _draws_of(fit, draws)
     count = len(shown)
     height = float(np.clip(1.6 * count + 0.8, 3.0, 7.2))
     figure, grid = new_figure(height, "", count, count, squeeze=False, sharex="col")
     for above in grid[np.triu_indices(count, 1)]:
         above.remove()
-    for k, i in enumerate(shown):
-        _one(grid[k, k], fit, i, values)
+    for k, i in enumerate(shown):  # densities on the diagonal, pairs below it
+        _draw_density(grid[k, k], fit, i, values)
         for axes, j in zip(grid[k, :k], shown):
-            _pair(axes, fit, j, i, values)
+            _draw_ellipses(axes, fit, j, i, values)
     for axes, i in zip(grid[-1], shown):
         axes.set_xlabel(fit.names[i])
     for axes, name in zip(grid[:, 0], ["density", *(fit.names[i] for i in shown[1:])]):
@@ -212,8 +217,8 @@ def corner(fit: Fit, draws: Any = None, names: Sequence[str] | None = None) -> F
     return figure
 
 
-def _drawn(fit: Fit, draws: Any) -> np.ndarray:
-    """Draws (N, P) of the parameters of a fit."""
+def _draws_of(fit: Fit, draws: Any) -> np.ndarray:
+    """Draws (N, P) of a fit's P parameters, from an array, a bootstrap or ArviZ's posterior."""
     if hasattr(draws, "posterior"):
         columns = [np.ravel(draws.posterior[name]) for name in fit.names]
         return np.stack(columns, axis=1)
@@ -226,8 +231,11 @@ def _drawn(fit: Fit, draws: Any) -> np.ndarray:
     return values
 
 
-def _one(axes: Axes, fit: Fit, i: int, values: np.ndarray | None) -> None:
-    """The density of one parameter."""
+def _draw_density(axes: Axes, fit: Fit, i: int, values: np.ndarray | None) -> None:
+    """Draw the normal density of parameter i from value and standard error; draws: a histogram.
+
+    `values` are draws (N, P) of all parameters, if any.
+    """
     z, error = np.linspace(-_WIDE, _WIDE, 121), fit.standard_error[i]
     density = np.exp(-0.5 * z**2) / (error * np.sqrt(2 * np.pi))
     if values is not None:
@@ -236,8 +244,12 @@ def _one(axes: Axes, fit: Fit, i: int, values: np.ndarray | None) -> None:
     axes.set_yticks([])
 
 
-def _pair(axes: Axes, fit: Fit, i: int, j: int, values: np.ndarray | None) -> None:
-    """The region of two parameters."""
+def _draw_ellipses(axes: Axes, fit: Fit, i: int, j: int, values: np.ndarray | None) -> None:
+    """Draw the ellipses in which parameters i and j lie with 68 and 95 %; draws: points.
+
+    Equation: `(x - x_fit)^T C^-1 (x - x_fit) = chi^2`, C their covariance and chi^2 the quantile
+    of two degrees of freedom; on it `x = x_fit + sqrt(chi^2) L (cos a, sin a)`, `L L^T = C`.
+    """
     if values is not None:
         axes.plot(values[:, i], values[:, j], ".", ms=2, color=COLOURS[4], alpha=0.5)
     factor = np.linalg.cholesky(fit.covariance[np.ix_([i, j], [i, j])])

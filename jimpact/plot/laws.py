@@ -67,7 +67,7 @@ def comparison(
     figure, tops, bottom = panels_of_laws(laws, result.scene, names, title, 1.2)
     at, velocity = np.arange(len(entries)), np.array([x.outcome.velocity for x in entries])
     wrong = ~np.array([bool(entry.audit.consistent) for entry in entries])
-    for top, velocities in tops:
+    for top, velocities in tops:  # a panel for each unit: index, name and factor of each velocity
         for (i, label, factor), offset in zip(velocities, side_by_side(len(velocities))):
             x, y, colour = at + offset, factor * velocity[:, i], colour_of(i)
             top.plot(x, y, "o", color=colour, label=label)
@@ -128,7 +128,7 @@ def energy_plane(result: Comparison, title: str = "") -> Figure:
 
 
 def _kept_and_spread(result: Comparison, after: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """K_ER and C_KE (k,) of velocities after (k, n)."""
+    """Energy ratio K_ER = T+/T- (k,) and energy dispersion C_KE (k,) of velocities v+ (k, n)."""
     v, scene = jnp.asarray(after), result.scene
     kept = jax.vmap(lambda x: energy_ratio(scene, result.velocity, x))(v)
     return np.asarray(kept), np.asarray(jax.vmap(lambda x: energy_dispersion(scene, x))(v))
@@ -186,12 +186,13 @@ def contact_loop(result: History, contact: int = -1, title: str = "") -> Figure:
     _check_one(result)
     force, rate = np.asarray(result.force[:, contact]), np.asarray(result.gap_velocity[:, contact])
     touching = np.flatnonzero(force > 0)
-    until = slice(0, touching[-1] + 2 if len(touching) else 1)
+    until = slice(0, touching[-1] + 2 if len(touching) else 1)  # to the first state without force
     unit, size = readable_unit("m", float(np.max(np.abs(result.approach[:, contact]))))
     x, force = np.asarray(result.approach[until, contact]) / size, force[until]
     figure, axes = new_figure(4.4, title)
     axes.plot(x, force, color=COLOURS[0], lw=1.8)
     axes.fill(x, force, color=COLOURS[4], alpha=0.2, lw=0)
+    # states at which the gap velocity changes sign
     turns = np.flatnonzero(np.diff(rate[until] > 0)) if len(touching) else np.zeros(0, int)
     names = [f"{'MR'[i % 2]}{i // 2 + 1}" for i in range(len(turns))]
     for name, i in zip(["O", *names, "B"], [0, *turns, len(x) - 1], strict=True):

@@ -56,18 +56,19 @@ def monte_carlo(result: MonteCarlo, title: str = "") -> Figure:
     panels = figure.subplot_mosaic(mosaic)
     for body in bodies:
         axes = panels[str(body)]
-        _histogram(axes, result, body)
+        _draw_histogram(axes, result, body)
     axes.set_xlabel(f"{axes.get_xlabel()}\n(dot: mean, bar: 5 % to 95 %)")
     if mapped:
-        _map(panels["map"], result, int(scattered[0]))
+        _draw_map(panels["map"], result, int(scattered[0]))
     return figure
 
 
-def _histogram(axes: Axes, result: MonteCarlo, body: int) -> None:
-    """Share of the samples by velocity; above it mean, and the 5 % and 95 % quantiles."""
+def _draw_histogram(axes: Axes, result: MonteCarlo, body: int) -> None:
+    """Draw the share of the samples [%] by v+ of a body, its mean, and 5 % to 95 % as a bar."""
+    # without the counts below the first edge and above the last one
     counts, edges = result.counts[body, 1:-1], result.edges[body]
-    each = max(1, len(counts) // _BARS)
-    whole = len(counts) // each * each
+    each = max(1, len(counts) // _BARS)  # bins of a bar
+    whole = len(counts) // each * each  # bins in whole bars; the last bar takes the rest
     bars = counts[:whole].reshape(-1, each).sum(axis=1)
     bars[-1] += counts[whole:].sum()
     share = 100 * bars / max(result.count, 1)
@@ -88,38 +89,46 @@ def _histogram(axes: Axes, result: MonteCarlo, body: int) -> None:
     axes.grid(False, axis="x")
 
 
-def _that_matter(result: MonteCarlo, body: int) -> list[int]:
-    """At most two gaps: those with which the velocity of a body is most correlated."""
+def _most_correlated_gaps(result: MonteCarlo, body: int) -> list[int]:
+    """Indices of at most two gaps with which v+ of a body is most correlated.
+
+    Equation: the largest `|cov(v+, gap_j)| / std(gap_j)`; of equal ones the larger std.
+    """
     std = np.sqrt(np.diag(result.gap_covariance))
     varies = std > 0
-    share = np.abs(result.cross_covariance[body]) / np.where(varies, std, 1.0)
-    return sorted(np.lexsort((-std, -np.where(varies, share, -1.0)))[:2].tolist())
+    correlation = np.abs(result.cross_covariance[body]) / np.where(varies, std, 1.0)
+    # by the last key first
+    return sorted(np.lexsort((-std, -np.where(varies, correlation, -1.0)))[:2].tolist())
 
 
-def _map(axes: Axes, result: MonteCarlo, body: int) -> None:
-    """The first samples over the two gaps that matter most, coloured by the velocity of a body."""
+def _draw_map(axes: Axes, result: MonteCarlo, body: int) -> None:
+    """Draw the first samples over their two most correlated gaps, coloured by v+ of a body.
+
+    Of a single random gap: v+ over this gap.
+    """
     first = result.first
     fine = np.isfinite(first["velocity"]).all(axis=1) & ~FAILURE[first["status"]]
     velocity = first["velocity"][fine, body]
-    gaps = _that_matter(result, body)
-    x = [_in_units(result, first["gaps"][fine, gap], gap) for gap in gaps]
-    axes.set_xlabel(x[0][1])
+    gaps = _most_correlated_gaps(result, body)
+    x, x_label = _in_units(result, first["gaps"][fine, gaps[0]], gaps[0])
+    axes.set_xlabel(x_label)
     axes.set_title(f"{fine.sum():,} samples", fontsize=SMALL)
     axes.grid(False)
     label = f"velocity of body {body + 1} [{result.unit}]"
     if len(gaps) == 1:
-        axes.plot(x[0][0], velocity, ".", ms=3, color=colour_of(body))
+        axes.plot(x, velocity, ".", ms=3, color=colour_of(body))
         axes.set_ylabel(label)
         return
-    axes.set_ylabel(x[1][1])
+    y, y_label = _in_units(result, first["gaps"][fine, gaps[1]], gaps[1])
+    axes.set_ylabel(y_label)
     colours = matplotlib.colormaps["cividis"]
-    dots = axes.scatter(x[0][0], x[1][0], s=_DOT, c=velocity, cmap=colours, lw=0, rasterized=True)
+    dots = axes.scatter(x, y, s=_DOT, c=velocity, cmap=colours, lw=0, rasterized=True)
     axes.figure.colorbar(dots, ax=axes, label=label)
-    axes.set_aspect("equal" if _alike(x[0][0], x[1][0]) else "auto")
+    axes.set_aspect("equal" if _alike(x, y) else "auto")
 
 
 def _in_units(result: MonteCarlo, gap: np.ndarray, contact: int) -> tuple[np.ndarray, str]:
-    """Gaps in units of delta_c where it is known, else in the metric unit that fits; the label."""
+    """Gaps over delta_c of a contact if it is known, else in nm, µm, mm or m; the axis' label."""
     name = f"gap {contact + 1}"
     if result.gap_scale is not None:
         scale = result.gap_scale[contact]
@@ -130,6 +139,6 @@ def _in_units(result: MonteCarlo, gap: np.ndarray, contact: int) -> tuple[np.nda
 
 
 def _alike(x: np.ndarray, y: np.ndarray) -> bool:
-    """Whether both axes reach over similar ranges."""
+    """True if the ranges of x and y differ by less than a factor of 2."""
     a, b = np.ptp(x), np.ptp(y)
     return bool(0.5 < a / b < 2) if b > 0 else False

@@ -82,6 +82,7 @@ def motion(
     course = course_of(motion)
     columns = [_by_unit(labels, bodies), _by_unit(rates, bodies)]
     rows = max(map(len, columns)) + 1
+    # left coordinates, right velocities, a row for each unit; in the last row gaps and energy
     figure, panels = new_figure(2.7 * rows + 0.4, title, rows, 2, sharex=True, squeeze=False)
     scales = _scales(labels, motion)
     for j, (units, values) in enumerate(zip(columns, (course.q, course.v), strict=True)):
@@ -92,27 +93,27 @@ def motion(
             at, words = zip(*which, strict=True)
             axes.plot(course.time, values[:, at], label=words)
             if j == 0 and unit == "m" and system is not None:
-                _moving_base(axes, system, motion)
+                _draw_base(axes, system, motion)
             what = words[0] if len(which) == 1 else ("coordinates", "velocities")[j]
             axes.set_ylabel(f"{what} [{unit}]" if unit else what)
-            _finish(axes, scales.get(unit, 1.0), f"{_FEW} of {count}" if count > _FEW else "")
+            _finish_panel(axes, scales.get(unit, 1.0), f"{_FEW} of {count}" if count > _FEW else "")
         for axes in panels[len(units) : -1, j]:
             axes.remove()
-    left_out = _gaps(panels[-1, 0], motion, _shown_contacts(motion, system, bodies, contacts))
-    _finish(panels[-1, 0], scales["m"], left_out)
-    _ledger(panels[-1, 1], motion, course, system)
-    _finish(panels[-1, 1], float(np.nanmax(np.abs(motion.energy), initial=0.0)) or 1.0)
+    note = _draw_gaps(panels[-1, 0], motion, _shown_contacts(motion, system, bodies, contacts))
+    _finish_panel(panels[-1, 0], scales["m"], note)
+    _draw_energies(panels[-1, 1], motion, course, system)
+    _finish_panel(panels[-1, 1], float(np.nanmax(np.abs(motion.energy), initial=0.0)) or 1.0)
     for axes in figure.axes:
         if axes is not panels[-1, 1]:
-            _event_lines(axes, motion)
+            _draw_events(axes, motion)
     for axes in panels[-1]:
         axes.set_xlabel("time [s]")
     legend_below(figure, 4, [Line2D([], [], label=x, **y) for x, y in _event_styles(motion)])
     return figure
 
 
-def _finish(axes: Axes, scale: float, note: str = "") -> None:
-    """Legend with a note, and limits that do not enlarge rounding, of panels of a motion."""
+def _finish_panel(axes: Axes, scale: float, note: str = "") -> None:
+    """Draw a panel's legend with a note, and set limits that do not enlarge rounding of `scale`."""
     axes.grid(False, axis="x")
     low, high = axes.dataLim.intervaly
     if high - low < _FLAT * scale:
@@ -126,7 +127,7 @@ def _finish(axes: Axes, scale: float, note: str = "") -> None:
 
 
 def _scales(labels: list[str], motion: Motion) -> dict[str, float]:
-    """Sizes of the values of each unit; of rates what would change these over the motion."""
+    """Largest sizes of coordinates and gaps by unit (1 for 0, and in rad); of rates over time."""
     scales = {"m": float(np.nanmax(np.abs(motion.gaps), initial=0.0))}
     sizes = np.nanmax(np.abs(motion.q), axis=0, initial=0.0).tolist()
     for label, size in zip(labels, sizes, strict=True):
@@ -138,7 +139,7 @@ def _scales(labels: list[str], motion: Motion) -> dict[str, float]:
 
 
 def _largest(entries: list[Any], sizes: Sequence[Any]) -> list[Any]:
-    """The few entries with the largest sizes, in their order."""
+    """The `_FEW` entries with the largest `sizes`, in their own order."""
     best = sorted(range(len(entries)), key=lambda i: sizes[i], reverse=True)[:_FEW]
     return [entries[i] for i in sorted(best)]
 
@@ -149,7 +150,7 @@ def _shown_contacts(
     bodies: Sequence[int] | None,
     contacts: Sequence[int] | None,
 ) -> list[int] | None:
-    """The contacts that were chosen; None: all."""
+    """Contacts (from 0) that were chosen, by number or by their bodies; None: no choice."""
     count = motion.gaps.shape[1]
     if contacts is not None:
         for contact in contacts:
@@ -166,7 +167,10 @@ def _shown_contacts(
 def _labels(
     motion: Motion, names: Sequence[str], system: System | None
 ) -> tuple[list[str], list[str]]:
-    """Names, with units, of coordinates and velocities."""
+    """Names, with units as in "x [m]", of the coordinates and of the velocities of a motion.
+
+    The given names, else those of the system's body, else q1, q2, ... and v1, v2, ...
+    """
     n, rates = motion.q.shape[-1], motion.velocity.shape[-1]
     known = () if system is None else system.body.names
     labels = [*known, *(f"q{i + 1}" for i in range(len(known), n))]
@@ -180,7 +184,10 @@ def _labels(
 
 
 def _by_unit(names: list[str], bodies: Sequence[int] | None) -> dict[str, list[tuple[int, str]]]:
-    """Index and word of the names of these bodies by their unit; None: of all."""
+    """Names of coordinates grouped by unit, as (index, name without unit).
+
+    Only those of `bodies` (from 0), the numbers at the end of x1, y1, ...; None: all.
+    """
     by_unit: dict[str, list[tuple[int, str]]] = {}
     numbers = [re.search(r"\d*(?='?$)", split_name(name)[0]) for name in names]
     owners = [int(found[0]) - 1 if found and found[0] else None for found in numbers]
@@ -196,21 +203,23 @@ def _by_unit(names: list[str], bodies: Sequence[int] | None) -> dict[str, list[t
 
 
 class _Course(NamedTuple):
-    """The samples, and the states before and after every event, in time."""
+    """States in the order of time: the samples, and those before and after every event."""
 
-    time: np.ndarray  # (S,)
+    time: np.ndarray  # (S,) [s]
     q: np.ndarray  # (S, n)
     v: np.ndarray  # (S, n)
-    after: np.ndarray  # (S,) whether it is the state after an event
+    after: np.ndarray  # mask (S,) of the states after an event
 
 
 def course_of(motion: Motion) -> _Course:
-    """The samples and events of a motion in the order of time."""
+    """States of a motion in the order of time: samples, and before and after each event."""
     events, rows = motion.events, np.asarray(motion.events.kind) > 0
+    # rows of the record that hold an event: its velocities before and after (E, 2, n)
     jumps = np.stack([events.velocity_before, events.velocity_after], axis=1)[rows]
     time = np.concatenate([motion.time, np.repeat(np.asarray(events.time)[rows], 2)])
     q = np.concatenate([motion.q, np.repeat(np.asarray(events.q)[rows], 2, axis=0)])
     v = np.concatenate([motion.velocity, jumps.reshape(-1, jumps.shape[-1])])
+    # samples up to 0, then before an event at 1, 3, ..., after it at 2, 4, ...
     after = np.arange(len(time)) - len(motion.time) + 1
     # stable: of events at one time before and after of the first, then of the second
     order = np.argsort(time, kind="stable")
@@ -218,7 +227,11 @@ def course_of(motion: Motion) -> _Course:
 
 
 def base_path(system: System, time: np.ndarray) -> np.ndarray:
-    """Displacement of the base (S, d) along the directions of the body, where it has them."""
+    """Displacement of the base (S, d) [m] at times (S,) [s], along directions of the body if any.
+
+    Along the body's directions B (columns) the components x solve `B x = D u` in least squares, u
+    the displacements along the base's own directions D.
+    """
     assert system.base is not None
     path = np.asarray(jax.vmap(lambda t: jnp.atleast_1d(system.base(t)))(jnp.asarray(time)))  # type: ignore[misc]
     directions = system.body.base_directions
@@ -228,8 +241,8 @@ def base_path(system: System, time: np.ndarray) -> np.ndarray:
     return np.linalg.lstsq(np.asarray(directions), moved.T, rcond=None)[0].T
 
 
-def _moving_base(axes: Axes, system: System, motion: Motion) -> None:
-    """Where the base is, along the directions in which it moves."""
+def _draw_base(axes: Axes, system: System, motion: Motion) -> None:
+    """Draw the displacement of the base over time, a line for each direction in which it moves."""
     if system.base is None:
         return
     reached = np.asarray(motion.time)[np.isfinite(np.asarray(motion.energy))]
@@ -243,15 +256,16 @@ def _moving_base(axes: Axes, system: System, motion: Motion) -> None:
             axes.plot(time, values, style, color="black", lw=0.8, label=f"base{word}")
 
 
-def _gaps(axes: Axes, motion: Motion, shown: list[int] | None) -> str:
-    """Gaps, 0 at the events of their contacts; a note on how many are left out.
+def _draw_gaps(axes: Axes, motion: Motion, shown: list[int] | None) -> str:
+    """Draw the gaps over time, 0 at events of their contacts; a note says how many are shown.
 
-    Unless contacts are chosen these are not those far above all of contacts that closed, and the
-    few with the most events, or the least gaps.
+    `shown` None: the `_FEW` contacts with the most events, then the least gaps, without those that
+    are always wider open than all that ever closed.
     """
     values, events = np.asarray(motion.gaps), motion.events
+    # a gap for each contact; else only the least gap is known
     single = events.contacts.shape[-1] == values.shape[1]
-    closed = np.zeros((len(events.time), values.shape[1]), bool)
+    closed = np.zeros((len(events.time), values.shape[1]), bool)  # contacts of each event
     if single:
         closed = (np.asarray(events.kind) > 0)[:, None] & np.asarray(events.contacts)
     note = ""
@@ -272,7 +286,7 @@ def _gaps(axes: Axes, motion: Motion, shown: list[int] | None) -> str:
 
 
 def _event_styles(motion: Motion) -> list[tuple[str, dict[str, Any]]]:
-    """Kinds of events that a motion has and that are marked, and how their lines are drawn."""
+    """Kinds of events to mark, with the style of their lines; impacts if there are few."""
     styles: dict[str, dict[str, Any]] = {}
     if len(motion.event_times("impact")) <= _MANY:
         styles["impact"] = {"color": GREY, "lw": 0.4}
@@ -281,28 +295,29 @@ def _event_styles(motion: Motion) -> list[tuple[str, dict[str, Any]]]:
     return [(kind, style) for kind, style in styles.items() if len(motion.event_times(kind))]
 
 
-def _event_lines(axes: Axes, motion: Motion) -> None:
-    """A line at each impact, and at events of the marked kinds."""
+def _draw_events(axes: Axes, motion: Motion) -> None:
+    """Draw a vertical line at each event of the marked kinds."""
     for kind, style in _event_styles(motion):
         for t in motion.event_times(kind)[:_MANY]:
             axes.axvline(t, zorder=0, **style)
 
 
-def _ledger(axes: Axes, motion: Motion, course: _Course, system: System | None) -> None:
-    """Energy, and what has gone where since the start; of a known system with its jumps.
+def _draw_energies(axes: Axes, motion: Motion, course: _Course, system: System | None) -> None:
+    """Draw energies [J] over time: T, T + V, and the work of contacts, base and forces.
 
-    V counts from its least value, so that losses can be seen.
+    V counts from its least value, so that losses can be seen. T and T + V of a known system jump at
+    events, else they are those of the samples.
     """
     time = np.asarray(motion.time)
     if system is None:
-        drawn = time, motion.kinetic_energy, motion.energy
+        at, kinetic_energy, energy = time, motion.kinetic_energy, motion.energy
     else:
         q, v = jnp.asarray(course.q), jnp.asarray(course.v)
-        moving = jax.vmap(partial(kinetic, system))(q, v)
-        drawn = course.time, moving, moving + jax.vmap(partial(potential, system))(q)
-    least = np.nanmin(drawn[2] - drawn[1], initial=np.inf)
-    axes.plot(drawn[0], drawn[2] - least, color="black", label="T + V − min V")
-    axes.plot(drawn[0], drawn[1], color=GREY, lw=0.8, label="T")
+        at, kinetic_energy = course.time, jax.vmap(partial(kinetic, system))(q, v)
+        energy = kinetic_energy + jax.vmap(partial(potential, system))(q)
+    least = np.nanmin(energy - kinetic_energy, initial=np.inf)
+    axes.plot(at, energy - least, color="black", label="T + V − min V")
+    axes.plot(at, kinetic_energy, color=GREY, lw=0.8, label="T")
     # the sum: in a multiple impact the shares of single contacts may have either sign
     normal, tangential = np.asarray(motion.contact_work).sum(axis=-1).T
     axes.plot(time, -normal, color=COLOURS[0], label="contacts took")
@@ -367,7 +382,7 @@ def phase_portrait(
     rate = pairs[coordinate]
     figure, axes = new_figure(5.0, title)
     position, speed = course.q[:, coordinate], course.v[:, rate]
-    cut = np.flatnonzero(course.after)
+    cut = np.flatnonzero(course.after)  # the line breaks between before and after an event
     axes.plot(np.insert(position, cut, np.nan), np.insert(speed, cut, np.nan), color=COLOURS[0])
     jumps = np.stack([cut - 1, cut])
     lines = axes.plot(position[jumps], speed[jumps], "--", color=COLOURS[1], lw=0.8, zorder=0)
@@ -386,14 +401,14 @@ def _range(values: np.ndarray) -> float:
 
 
 def draw_body(axes: Axes, body: Body, q: np.ndarray) -> None:
-    """A body at q, with what it stands on."""
-    point = POINT * (np.ptp(q) or 1.0)
+    """Draw a body at its configuration q, and the planes that it stands on."""
+    point = POINT * (np.ptp(q) or 1.0)  # radius of a point mass [m]
     curves, floors = body.outlines(q, point), [plane_of(*floor) for floor in body.floors]
     set_limits(axes, [curves], np.zeros((1, 2)), floors)
     for points, colour in zip(curves, colours_of(body, q, point), strict=True):
         axes.plot(*points.T, color=colour)
     for angle, offset in body.floors:
-        foot = (-offset * np.sin(angle), offset * np.cos(angle))
+        foot = (-offset * np.sin(angle), offset * np.cos(angle))  # nearest to the origin
         axes.axline(foot, slope=np.tan(angle), color=GREY, lw=2)
 
 
@@ -403,20 +418,21 @@ def colours_of(body: Body, q: np.ndarray, point: float) -> list[str]:
     return [colour_of(i) for i, curves in each for _ in curves]
 
 
-def stretch_of(n: np.ndarray, offset: float, view: np.ndarray, ground: np.ndarray) -> np.ndarray:
-    """A piece (2, 2) of a plane that reaches across the view."""
-    middle, reach = view.mean(axis=1), np.ptp(view[0])
-    foot = middle - (n @ (middle - ground) - offset) * n
-    return foot[:, None] + reach * np.array([-1, 1]) * np.array([n[1], -n[0]])[:, None]
-
-
-def plane_of(angle: Any, offset: Any) -> tuple[np.ndarray, float]:
-    """Normal (2,) and offset of a plane."""
+def plane_of(angle: float, offset: float) -> tuple[np.ndarray, float]:
+    """Normal n (2,) and offset of the plane `n^T x = offset` inclined by `angle` [rad]."""
     return np.array([-np.sin(angle), np.cos(angle)]), float(offset)
 
 
-def set_limits(axes: Axes, curves: list[Any], ground: np.ndarray, floors: list[Any]) -> None:
-    """Equal limits that hold all curves and a point of each plane."""
+def set_limits(
+    axes: Axes,
+    curves: Sequence[Sequence[np.ndarray]],
+    ground: np.ndarray,
+    floors: Sequence[tuple[np.ndarray, float]],
+) -> None:
+    """Set equal limits that hold the curves of all frames, and a point of each plane.
+
+    That is the foot, on `n^T (x - ground[0]) = offset`, of the middle of the curves.
+    """
     points = np.concatenate([curve for frame in curves for curve in frame])
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     feet = [middle - (n @ (middle - ground[0]) - offset) * n for n, offset in floors]

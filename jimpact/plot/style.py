@@ -1,4 +1,4 @@
-"""What the pictures share: the style sheet, figures of panels, legends, logarithmic axes."""
+"""Parts of all pictures: the style sheet, figures of panels, legends, logarithmic axes."""
 
 import functools
 import inspect
@@ -43,15 +43,19 @@ R = TypeVar("R")
 
 
 def styled(kind: type = object) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Draw in the style sheet, and leave matplotlib's settings alone, what is of this kind."""
+    """Decorator of a function that draws: its first argument must be a `kind`, else a TypeError.
+
+    It draws in the style sheet, which leaves matplotlib's own settings as they were, and writes
+    minus signs in place of hyphens.
+    """
 
     def decorated(picture: Callable[P, R]) -> Callable[P, R]:
-        """The function, its first argument, if it has one, checked."""
+        """The function with the check of its first argument and the style."""
         first = next(iter(inspect.signature(picture).parameters), "")
 
         @functools.wraps(picture)
         def drawn(*args: P.args, **keywords: P.kwargs) -> R:
-            """The picture."""
+            """The picture of these arguments."""
             check_kind(first, args[0] if args else keywords.get(first), kind)
             with matplotlib.style.context(SHEET):
                 result = picture(*args, **keywords)
@@ -101,10 +105,10 @@ Velocity = tuple[int, str, float]  # index, name, and what it is multiplied by
 
 
 def velocities_by_unit(scene: Scene, names: Sequence[str]) -> dict[str, list[Velocity]]:
-    """The velocities of each unit, by the label of their axis.
+    """Velocities of a scene grouped by unit; keys are the labels of their axes.
 
-    Without names those of a chain are in m/s; others, which may turn or move, are comparable only
-    times the root of their inertia.
+    `names` are those of the n velocities, with units. Without names those of a chain are in m/s;
+    others, in m/s or rad/s, are comparable only times the root of their inertia M_ii, in √J.
     """
     label, n = "velocity after the impact", scene.size
     if names and len(names) != n:
@@ -124,7 +128,11 @@ def velocities_by_unit(scene: Scene, names: Sequence[str]) -> dict[str, list[Vel
 def panels_of_laws(
     laws: Sequence[str], scene: Scene, names: Sequence[str], title: str, lowest: float
 ) -> tuple[Figure, list[tuple[Axes, list[Velocity]]], Axes]:
-    """Laws side by side: a panel for the velocities of each unit, one of `lowest` [in] below."""
+    """Figure with laws side by side: a panel for the velocities of each unit, and one below.
+
+    Returns the figure, the upper panels with their velocities, and the lowest one, `lowest` [in]
+    high.
+    """
     units = velocities_by_unit(scene, names)
     heights = [2.6] * len(units) + [lowest]
     grid: Any = {"sharex": True, "height_ratios": heights}
@@ -143,14 +151,17 @@ def panels_of_laws(
 
 
 def side_by_side(bodies: int) -> np.ndarray:
-    """Offsets (bodies,) of the bodies of one group from its place."""
+    """Offsets (bodies,) on the x axis of the bodies of one group: evenly over `SPREAD`, mean 0."""
     return (np.arange(bodies) - (bodies - 1) / 2) * SPREAD / bodies
 
 
 def legend_below(
     figure: Figure, columns: int, handles: Iterable[Any] | None = None, note: str = ""
 ) -> None:
-    """One legend for all panels, below them: of these handles, else of all labels, each once."""
+    """Draw one legend below all panels, with `note` as its title.
+
+    It has the given `handles`, else those of all panels, each label once.
+    """
     if handles is None:
         pairs = [pair for x in figure.axes for pair in zip(*x.get_legend_handles_labels())]
         first = {label: handle for handle, label in reversed(pairs)}
@@ -162,18 +173,18 @@ def legend_below(
 
 
 class LineEnd(NamedTuple):
-    """Where a line of a panel ends, x and y, its name and its colour."""
+    """End of a line in a panel, for `label_ends`."""
 
     axes: Axes
-    at: tuple[float, float]
+    at: tuple[float, float]  # x, y
     name: str
     colour: str
 
 
 def label_ends(figure: Figure, ends: Iterable[LineEnd]) -> None:
-    """Names of lines beside their ends, moved up where two would overlap.
+    """Write the names of lines beside their ends, moved up where two would overlap.
 
-    The panels have their final limits and scales.
+    Call it when the panels have their final limits and scales.
     """
     place: dict[str, Any] = {"textcoords": "offset points", "va": "center", "fontsize": SMALL}
     lowest_first, texts = sorted(ends, key=lambda end: end.at[1]), []
@@ -192,7 +203,10 @@ def label_ends(figure: Figure, ends: Iterable[LineEnd]) -> None:
 
 
 def mark(axes: Axes, point: Any, name: str, i: int, admissible: bool) -> None:
-    """Outcome number i, hollow unless admissible; later ones smaller, so that equal ones show."""
+    """Draw outcome number i at a point (2,), hollow unless admissible; i < 0: a grey square.
+
+    Later ones are smaller, so that equal ones show.
+    """
     axes.plot(
         *point,
         "s" if i < 0 else MARKERS[i % len(MARKERS)],
@@ -205,13 +219,13 @@ def mark(axes: Axes, point: Any, name: str, i: int, admissible: bool) -> None:
 
 
 def write(axes: Axes, at: Any, text: str, **style: Any) -> None:
-    """A small text, centred at a point (2,)."""
+    """Write a small text, centred at a point (2,)."""
     centred: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": SMALL}
     axes.annotate(text, (at[0], at[1]), **centred | style)
 
 
 def logarithmic(axes: Axes, which: str) -> None:
-    """Axis 'x' or 'y' by powers of ten; labels never stand closer than they are long."""
+    """Make axis 'x' or 'y' logarithmic, with so few labels that they do not overlap."""
     getattr(axes, f"set_{which}scale")("log")
     axis = getattr(axes, f"{which}axis")
     low, high = sorted(axis.get_view_interval())
@@ -225,7 +239,7 @@ def logarithmic(axes: Axes, which: str) -> None:
 
 
 def _tick(x: float, first: float, last: float) -> str:
-    """A number on a logarithmic axis, all of them in the notation that its ends need."""
+    """Label x of a logarithmic axis from `first` to `last`: a power of ten if one of these is."""
     plain = all(_PLAIN[0] <= end < _PLAIN[1] for end in (first, last))
     return in_words(x) if plain else as_power(x)
 

@@ -49,7 +49,7 @@ def system(drawn: Scene | Body | System, state: Any, title: str = "") -> Figure:
         if drawn.walls is None:
             raise TypeError("Argument `drawn` must be a chain, a body or a system; draw the body.")
         figure, axes = new_figure(2.4, title)
-        _row(axes, drawn, np.asarray(as_velocity(drawn, state)))
+        _draw_chain(axes, drawn, np.asarray(as_velocity(drawn, state)))
     else:
         body = drawn.body if isinstance(drawn, System) else drawn
         if body.names:
@@ -97,8 +97,10 @@ def force_chains(pile: Bodies, q: Any, scene: Scene, impulse: Any, title: str = 
     check_shape("impulse", p, (scene.contacts,), "one per contact")
     d = pile.dimension
     centres = np.asarray(q, float).reshape(pile.count, -1)[:, :d]
-    first, second = scene.pairs.neighbours.bodies.T
-    ends = np.where((second < 0)[:, None], _on_walls(pile, scene.pairs, centres), centres[second])
+    first, second = scene.pairs.neighbours.bodies.T  # bodies of each contact; second < 0: a wall
+    ends = np.where(
+        (second < 0)[:, None], _points_on_walls(pile, scene.pairs, centres), centres[second]
+    )
     size = np.abs(p) / (np.abs(p).max() or 1.0)
     drawn = np.flatnonzero(size > _FAINT)
     drawn = drawn[np.argsort(size[drawn])]
@@ -115,8 +117,13 @@ def force_chains(pile: Bodies, q: Any, scene: Scene, impulse: Any, title: str = 
     return figure
 
 
-def _on_walls(pile: Bodies, pairs: PairNormals, centres: np.ndarray) -> np.ndarray:
-    """Where contacts (m, d) of bodies with walls are."""
+def _points_on_walls(pile: Bodies, pairs: PairNormals, centres: np.ndarray) -> np.ndarray:
+    """Points (m, d) [m] at which bodies at `centres` touch walls, if their contact is with a wall.
+
+    Equation: `x = c - (n^T c - offset) n`, the foot of the centre c on the wall that its normal n
+    is nearest to; in the plane moved along the wall by the lever, the part of the normal that turns
+    the body.
+    """
     d, walls = pile.dimension, np.asarray(pile.planes)
     first, normal = pairs.neighbours.bodies[:, 0], np.asarray(pairs.directions)[:, 0]
     n = normal[:, :d]
@@ -125,17 +132,21 @@ def _on_walls(pile: Bodies, pairs: PairNormals, centres: np.ndarray) -> np.ndarr
     offset = walls[np.argmax(n @ walls[:, :d].T, axis=1), d]
     height = np.sum(centres[first] * n, axis=1) - offset
     on_wall = centres[first] - height[:, None] * n
-    if d == 2:  # the lever of a corner is the part of the normal that turns its body
+    if d == 2:
         on_wall += normal[:, 2:] * np.stack([n[:, 1], -n[:, 0]], axis=1)
     return on_wall
 
 
-def _row(axes: Axes, scene: Scene, velocity: np.ndarray) -> None:
-    """A chain as a row of circles with arrows."""
+def _draw_chain(axes: Axes, scene: Scene, velocity: np.ndarray) -> None:
+    """Draw a chain as a row of circles with their masses [kg], and arrows for velocities [m/s].
+
+    Lengths are in radii of the largest body, `radius = sqrt(m / max m)`.
+    """
     mass = np.asarray(scene.mass, float)
     radius = np.maximum((mass / mass.max()) ** 0.5, _LEAST)
     left, right = scene.walls or (False, False)
-    apart = np.where(np.asarray(scene.closed), 0.0, _GAP)
+    apart = np.where(np.asarray(scene.closed), 0.0, _GAP)  # of each contact, walls included
+    # the gap to the left of each body
     before = np.concatenate([apart[:1] if left else [0.0], apart[left : len(mass) - 1 + left]])
     centre = np.cumsum(before + np.concatenate([radius[:1], radius[:-1] + radius[1:]]))
     end = centre[-1] + radius[-1]

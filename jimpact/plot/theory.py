@@ -80,26 +80,31 @@ def admissible_set(
     closed = np.flatnonzero(np.asarray(result.scene.closed))
     plane = result.dimension == 2 and len(closed) == 2
     closed = closed if len(closed) else np.arange(result.scene.contacts)
-    draw = _plane if plane else _projections
+    draw = _draw_plane if plane else _draw_projections
     default = "Admissible: unilateral contact, pushing impulses, no energy gained"
     return draw(result, marked, closed, title or default)
 
 
-def _plane(
+def _draw_plane(
     result: AdmissibleSet, marked: Mapping[str, np.ndarray], closed: np.ndarray, title: str
 ) -> Figure:
-    """The set in the plane of kinetic coordinates."""
-    frame = _Plane(result, closed)
+    """Draw the set of two contacts in the plane of kinetic coordinates, with marked outcomes.
+
+    Sides are `gamma_k+ = 0` and `p_k = 0`, the arc is T+ = T-; `closed` are both contacts.
+    """
+    frame = _TurnedCoordinates(result, closed)
     figure, axes = new_figure(7.6, title)
     circle = np.linspace(0, 2 * np.pi, 400)
     r = frame.radius
     axes.plot(r * np.cos(circle), r * np.sin(circle), color=GREY, lw=0.8, ls=(0, (4, 3)))
     axes.fill(*frame(result.boundary(400)).T, color=_FILL, lw=0)
-    for k in (0, 1):
+    for k in (0, 1):  # gamma_k+ = 0 from u = 0; p_k = 0 from v- along the other contact's push
         number = closed[k] + 1
-        _line(axes, frame, np.zeros(2), frame.walls[k], f"contact {number} remains closed", "-")
+        _draw_side(
+            axes, frame, np.zeros(2), frame.walls[k], f"contact {number} remains closed", "-"
+        )
         away = frame.push[1 - k]
-        _line(axes, frame, frame.before, away, f"no impulse at contact {number}", ":")
+        _draw_side(axes, frame, frame.before, away, f"no impulse at contact {number}", ":")
     arc = frame(result.conserving_arc(200))
     axes.plot(*arc.T, color="black", lw=2.4, solid_capstyle="round")
     write(axes, arc[len(arc) // 2] * 1.13, "$T^+ = T^-$", fontsize="medium")
@@ -117,12 +122,16 @@ def _plane(
     return figure
 
 
-class _Plane:
-    """Kinetic coordinates turned so that the outcomes with gamma+ >= 0 open upwards."""
+class _TurnedCoordinates:
+    """Kinetic coordinates u (2,) [sqrt(J)] turned so that outcomes with gamma+ >= 0 open upwards.
+
+    `push` and `walls` (2, 2): a unit vector for each contact, along the change of u by its impulse,
+    and along the line on which it stays closed and the other contact opens. `before`: u of v-.
+    """
 
     def __init__(self, result: AdmissibleSet, closed: np.ndarray):
-        """Turn the coordinates of a set with two closed contacts."""
-        self._found = result
+        """Turn the coordinates of a set with two closed contacts (indices)."""
+        self._set = result
         self._metric = result.axes.T @ dense_mass(result.scene)
         self.radius = result.coordinates.radius
         normals = np.asarray(result.scene.normals, float)[:, closed].T @ result.axes
@@ -132,47 +141,53 @@ class _Plane:
         if right @ push[0] < 0:
             right = -right
         self._turn = np.stack([right, up])
-        self.push = push @ self._turn.T  # directions of the impulses
-        # along wall k contact k stays closed and the other one opens
+        self.push = push @ self._turn.T
+        # perpendicular to push k, on the side to which the other impulse pushes
         walls = np.stack([[-p[1], p[0]] for p in self.push])
         self.walls = walls * np.sign(np.sum(walls * self.push[::-1], axis=1))[:, None]
         self.before = self(result.velocity)
 
     def __call__(self, velocity: np.ndarray) -> np.ndarray:
-        """(..., n) -> (..., 2)."""
-        return (velocity - self._found.centre) @ self._metric.T @ self._turn.T
+        """Turned coordinates `u = R axes^T M (v - centre)` (..., 2) of velocities v (..., n)."""
+        return (velocity - self._set.centre) @ self._metric.T @ self._turn.T
 
 
-def _line(
+def _draw_side(
     axes: Axes,
-    frame: _Plane,
+    frame: _TurnedCoordinates,
     start: np.ndarray,
     direction: np.ndarray,
     text: str,
     style: str,
 ) -> None:
-    """A side of the set as a ray up to the circle, named along its outer part."""
+    """Draw a side of the set as a ray from `start` (2,) to the circle |u| = r, with its name.
+
+    Equation: `|start + length direction| = r`, direction (2,) of length 1.
+    """
     b = start @ direction
     length = -b + np.sqrt(max(b * b + frame.radius**2 - start @ start, 0.0))
     end = start + length * direction
     if length < _SHORTEST * frame.radius:
         return
     axes.plot(*np.stack([start, end]).T, color=GREY, lw=1.0, ls=style)
-    angle = np.degrees(np.arctan2(direction[1], direction[0]))
+    angle = np.degrees(np.arctan2(direction[1], direction[0]))  # of the name, never upside down
     angle = angle - 180 if angle > 90 else angle + 180 if angle < -90 else angle
     share, side = (0.45, "top") if style == "-" else (0.3, "bottom")
     turned: dict[str, Any] = {"rotation": angle, "rotation_mode": "anchor", "va": side}
     write(axes, start + share * length * direction, text, color=GREY, **turned)
 
 
-def _projections(
+def _draw_projections(
     result: AdmissibleSet, marked: Mapping[str, np.ndarray], closed: np.ndarray, title: str
 ) -> Figure:
-    """Samples of the set in pairs of normalized gap velocities."""
+    """Draw samples of the set over pairs of normalized gap velocities qn+ [sqrt(J)].
+
+    Coloured by T+/T-; for one contact T+/T- over its qn+.
+    """
     contacts = closed[:_MOST_CONTACTS]
     samples = result.sample(0, _SAMPLES)
     norm = np.asarray(kinetic_norm(result.scene), float)
-    unit = (np.asarray(result.scene.normals, float) / norm)[:, contacts]
+    unit = (np.asarray(result.scene.normals, float) / norm)[:, contacts]  # qn = unit^T v
     cloud, energies = samples @ unit, _energy_ratio(result, samples)
     pairs = list(combinations(range(len(contacts)), 2)) or [(0, 0)]
     figure, grid = new_panels(len(pairs), 3.1, 0.8, title)
@@ -303,7 +318,7 @@ def rocking_domains(domains: Sequence[RockingDomain], title: str = "") -> Figure
 
 
 def _panels(result: RockingDispersion, title: str, label: str) -> tuple[Figure, Any]:
-    """A panel for each mu."""
+    """Figure and panels of rocking blocks, one for each mu, over the kinetic angle [degrees]."""
     figure, panels = new_panels(len(result.friction), 2.8, 0.6, title, sharex=True, sharey=True)
     for axes, mu in zip(panels, np.asarray(result.friction)):
         axes.set_title(f"mu = {mu:g}")
@@ -312,13 +327,13 @@ def _panels(result: RockingDispersion, title: str, label: str) -> tuple[Figure, 
 
 
 def _critical_lines(panels: np.ndarray, result: RockingDispersion) -> None:
-    """The critical angle of each mu."""
+    """Draw the critical kinetic angle of each mu as a dotted line in its panel."""
     for axes, angle in zip(panels, np.degrees(critical_kinetic_angle(result.friction))):
         axes.axvline(float(angle), color="black", ls=":", lw=1)
 
 
 def _label_outer(panels: np.ndarray, x: str, y: str) -> None:
-    """Labels on the left, and below the last panel of each column."""
+    """Label y on the left, and x below the last panel of each column."""
     for axes in panels[::COLUMNS]:
         axes.set_ylabel(y)
     for axes in panels[-COLUMNS:]:

@@ -15,7 +15,7 @@ _BEYOND = 5.0  # sigmas that the panel of residuals shows, unless flights leave 
 
 @runtime_checkable
 class Track(Protocol):
-    """What a picture shows of `ji.tracks.Track`."""
+    """Members of `ji.tracks.Track` that its picture shows."""
 
     t: np.ndarray
     coordinates: np.ndarray
@@ -47,7 +47,7 @@ def track(track: Track, title: str = "") -> Figure:
     >>> len(figure.axes)
     2
     """
-    measured = track.coordinates
+    measured = track.coordinates  # (K, n)
     n = measured.shape[1]
     count = len(track.impacts)
     heading = title or counted(count, "impact")

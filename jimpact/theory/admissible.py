@@ -65,13 +65,14 @@ class AdmissibleSet:
         Each is a linear function over the convex set, solved to rounding (about 1e-9 of the
         impact's size).
         """
+        # v_i = centre_i + c . u with row c of the axes: v+ where it is least, and greatest
         ends = [
             [self._velocity(self.coordinates.lowest(s * c)) for s in (1, -1)] for c in self.axes
         ]
         return np.array([[low[i], high[i]] for i, (low, high) in enumerate(ends)])
 
-    def contains(self, velocity: Any, tolerance: float | None = None) -> Any:
-        """Whether a velocity v+ (n,), or each of (k, n), is admissible up to an error.
+    def contains(self, velocity: Any, tolerance: float | None = None) -> bool | np.ndarray:
+        """True for a velocity v+ (n,) [m/s], or each of (k, n), that is admissible up to an error.
 
         Equation: with `v - centre = axes u + w`, `u = axes^T M (v - centre)`, the error is the
         larger of `sqrt(w^T M w)`, which violates the balance of momentum, and of how much u
@@ -90,14 +91,14 @@ class AdmissibleSet:
         offset = v - self.centre
         mass = dense_mass(self.scene)
         u = offset @ mass @ self.axes
-        outside = offset - u @ self.axes.T  # violates the momentum balance
-        square = np.einsum("...i,ij,...j->...", outside, mass, outside)
-        norm_outside = np.sqrt(np.maximum(square, 0.0))
-        inside = np.maximum(self.coordinates.excess(u), norm_outside) <= allowed * self._size
+        w = offset - u @ self.axes.T  # violates the momentum balance
+        square = np.einsum("...i,ij,...j->...", w, mass, w)
+        error = np.maximum(self.coordinates.excess(u), np.sqrt(np.maximum(square, 0.0)))
+        inside = error <= allowed * self._size
         return bool(inside) if v.ndim == 1 else inside
 
     def sample(self, seed: int, count: int) -> np.ndarray:
-        """`count` outcomes (count, n), uniform in kinetic coordinates; fixed by the seed.
+        """`count` outcomes v+ (count, n) [m/s], uniform in kinetic coordinates; fixed by the seed.
 
         Hit-and-run from an interior point, one walk a sample. For independent contacts, uniform
         in impulse space too.
@@ -108,10 +109,11 @@ class AdmissibleSet:
         return self._velocity(self.coordinates.sample(np.random.default_rng(seed), count))
 
     def conserving_arc(self, points: int = 100) -> np.ndarray:
-        """The outcomes T+ = T- of two contacts: an arc (points, n) from A to B.
+        """Outcomes v+ with T+ = T- of two contacts: an arc (points, n) [m/s] from A to B.
 
-        Evenly spaced in the angle. At A the normalized gap velocity of the first closed contact
-        is smallest. Shape (0, n) if redundant contacts leave no such outcome.
+        Evenly spaced in the angle of the circle |u| = sqrt(2 (T- - T(centre))). At A the normalized
+        gap velocity of the first closed contact is smaller. Shape (0, n) if redundant contacts
+        leave no such outcome.
 
         Raises:
             ValueError: the set is not two-dimensional.
@@ -126,9 +128,10 @@ class AdmissibleSet:
         return arc[::-1] if arc[0] @ first > arc[-1] @ first else arc
 
     def boundary(self, points: int = 100) -> np.ndarray:
-        """Boundary (k, n) of a two-dimensional set, in order around it, with exact corners.
+        """Velocities v+ (k, n) [m/s] around the boundary of a plane set, corners included.
 
-        Straight sides are open or impulse-free contacts, `points` lie on the arc T+ = T-.
+        On a straight side one gap velocity gamma+ or one impulse is 0; `points` lie on the arc
+        T+ = T-.
 
         Raises:
             ValueError: the set is not two-dimensional.
@@ -138,14 +141,14 @@ class AdmissibleSet:
         return self._velocity(self.coordinates.boundary(points))
 
     def __str__(self) -> str:
-        """A table of several lines."""
+        """Table of the set: T+ [J] and, for each coordinate, v- and the range of v+ [m/s]."""
         closed = np.asarray(self.scene.closed)
         approaching = np.asarray(gap_velocity(self.scene, self.velocity))[closed] < 0
         head = f"closed contacts: {int(closed.sum())}, approaching: {int(approaching.sum())};"
         smallest = _ZERO * max(1e-300, float(np.abs(self.velocity).max()))
 
         def show(x: float, width: int = 0) -> str:
-            """A velocity; 0 within rounding."""
+            """A velocity [m/s] with six digits; 0 within rounding."""
             return f"{x if abs(x) > smallest else 0.0:{width}.6g}"
 
         if self.dimension == 0:
@@ -165,7 +168,7 @@ class AdmissibleSet:
 
     @property
     def _size(self) -> float:
-        """Of the impact, sqrt(2 energy) [sqrt(J)]; not 0."""
+        """Size of the impact, the largest |u| = sqrt(2 (T- - T(centre))) [sqrt(J)]; never 0."""
         return self.coordinates.radius or float(np.sqrt(2 * self.energy)) or 1.0
 
     def _velocity(self, u: np.ndarray) -> np.ndarray:
@@ -216,7 +219,8 @@ def admissible_set(scene: Scene, velocity: Any) -> AdmissibleSet:
     start, closed = np.asarray(v, float), np.asarray(scene.closed)
     root = np.linalg.cholesky(dense_mass(scene))  # y = root^T v has T = |y|^2 / 2
     y = root.T @ start
-    free = _unconstrained(scene, root, y, tolerance)
+    free = _constraint_projector(scene, root, y, tolerance)
+    # one column for each closed contact: qn = unit^T y, its normal in the coordinates y
     unit = np.linalg.solve(root, np.asarray(scene.normals, float)[:, closed])
     unit = unit / np.linalg.norm(unit, axis=0)
     approach = unit.T @ y < -_APPROACH * np.finfo(scene.mass.dtype).eps * np.linalg.norm(y)
@@ -227,23 +231,30 @@ def admissible_set(scene: Scene, velocity: Any) -> AdmissibleSet:
         return outcomes(centre=start, axes=np.zeros((len(start), 0)), coordinates=alone)
     unit = free @ unit
     floor = _SINGULAR * np.finfo(scene.mass.dtype).eps * unit.shape[1]
-    unit = unit[:, np.sum(unit**2, axis=0) > floor]  # not what the constraints hold anyway
+    unit = unit[:, np.sum(unit**2, axis=0) > floor]  # not contacts that constraints hold
     basis, singular, _ = np.linalg.svd(unit, full_matrices=False)
     basis = basis[:, singular**2 > floor]
     normal = basis.T @ unit  # contacts in the coordinates z = basis^T y
     before = basis.T @ y
+    # gamma+ >= 0: normal^T z >= 0; p >= 0: z - z- in the cone of the normals, facets (z - z-) >= 0
     facets = cone_facets(normal)
     rows = np.vstack([normal.T, facets])
     offset = np.append(np.zeros(normal.shape[1]), facets @ before)
     redundant = basis.shape[1] < unit.shape[1]
     part, centre, axes = capped_polyhedron(rows, offset, float(np.linalg.norm(before)), redundant)
-    rest = y - basis @ before + basis @ centre
+    rest = y - basis @ before + basis @ centre  # impulses leave y - basis z- as it is
     centre, axes = np.linalg.solve(root.T, rest), np.linalg.solve(root.T, basis @ axes)
     return outcomes(centre=centre, axes=axes, coordinates=part)
 
 
-def _unconstrained(scene: Scene, root: np.ndarray, y: np.ndarray, tolerance: float) -> np.ndarray:
-    """Projector onto the directions free of bilateral constraints, in the coordinates y."""
+def _constraint_projector(
+    scene: Scene, root: np.ndarray, y: np.ndarray, tolerance: float
+) -> np.ndarray:
+    """Projector `I - Q Q^T` (n, n) onto directions y that bilateral constraints H leave free.
+
+    y = root^T v are coordinates with T = |y|^2 / 2, `root root^T = M`, and the columns of Q are an
+    orthonormal basis of root^-1 H: `H^T v = 0` is `Q^T y = 0`, to `tolerance` |y|.
+    """
     if scene.constraints is None:
         return np.eye(len(y))
     basis = np.linalg.qr(np.linalg.solve(root, np.asarray(scene.constraints, float)))[0]

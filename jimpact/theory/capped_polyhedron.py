@@ -25,13 +25,21 @@ class CappedPolyhedron(NamedTuple):
     radius: float
 
     def excess(self, w: np.ndarray) -> np.ndarray:
-        """How far the points w (..., d) are outside, 0 or less inside."""
-        beyond = np.linalg.norm(w, axis=-1) - self.radius
-        lacking = (self.offset - w @ self.rows.T).max(axis=-1, initial=-np.inf)
-        return np.maximum(beyond, lacking)
+        """Largest violation of a bound at w (..., d), `max(|w| - radius, offset_i - rows_i w)`.
+
+        0 or less inside the set.
+        """
+        beyond_ball = np.linalg.norm(w, axis=-1) - self.radius
+        beyond_rows = (self.offset - w @ self.rows.T).max(axis=-1, initial=-np.inf)
+        return np.maximum(beyond_ball, beyond_rows)
 
     def project(self, point: np.ndarray) -> np.ndarray:
-        """Nearest point of the polyhedron alone (least distance programming)."""
+        """Point w (d,) nearest to `point` with `rows w >= offset`, whatever the radius.
+
+        Least distance programming (Lawson and Hanson 1974, ch. 23): rows with a positive multiplier
+        x hold with equality, x the nonnegative least squares solution of
+        `[rows, need]^T x = (0, ..., 0, 1)`, `need = offset - rows point`.
+        """
         need = self.offset - self.rows @ point
         if not (need > 0).any():
             return point
@@ -41,7 +49,7 @@ class CappedPolyhedron(NamedTuple):
         return point + np.linalg.lstsq(self.rows[active], need[active], rcond=None)[0]
 
     def lowest(self, direction: np.ndarray) -> np.ndarray:
-        """A point where `direction . w` is least."""
+        """A point w (d,) of the set where `direction . w` is least."""
         from scipy.optimize import brentq  # late: slow to import
 
         length = np.linalg.norm(direction)
@@ -51,15 +59,16 @@ class CappedPolyhedron(NamedTuple):
 
         # minimizes c.w + |w|^2 / (2 s); |w| grows with s until the ball or a least c.w ends it
         def beyond(s: float) -> float:
-            """Distance outside the ball."""
+            """Distance of the minimizer of this s from the ball; negative inside."""
             return float(np.linalg.norm(self.project(-s * c)) - self.radius)
 
         far = self.radius
         while beyond(far) < 0:
             w = self.project(-far * c)
             touching = self.rows[self.rows @ w - self.offset <= _ROUNDING * self.radius]
-            pushed = touching.T @ least_squares(touching.T, c)
-            if np.linalg.norm(pushed - c) <= _ROUNDING or far > _FARTHEST * self.radius:
+            # c in the cone of the rows that hold with equality: c.w is least here without the ball
+            in_cone = touching.T @ least_squares(touching.T, c)
+            if np.linalg.norm(in_cone - c) <= _ROUNDING or far > _FARTHEST * self.radius:
                 return w
             far *= 4
         if beyond(0.0) >= 0:
@@ -68,13 +77,17 @@ class CappedPolyhedron(NamedTuple):
         return self.project(-s * c)
 
     def interior(self) -> np.ndarray:
-        """A point well inside."""
+        """A point (d,) with distance to the bounds, to start walks from.
+
+        It lies between `least`, the point nearest to the origin, and `deep`, which has the largest
+        slack t in `rows w >= offset + t`, `|w_i| <= radius`: half way, or half way to the sphere.
+        """
         from scipy.optimize import linprog  # late: slow to import
 
         dimension = self.rows.shape[1]
         box = [(-self.radius, self.radius)] * dimension + [(0.0, self.radius)]
         slack = np.hstack([-self.rows, np.ones((len(self.rows), 1))])
-        cost = np.append(np.zeros(dimension), -1.0)
+        cost = np.append(np.zeros(dimension), -1.0)  # linprog minimizes -t
         deep = linprog(cost, slack, -self.offset, bounds=box).x[:-1]
         least = self.project(np.zeros(dimension))
         step = deep - least
@@ -89,6 +102,7 @@ class CappedPolyhedron(NamedTuple):
         for _ in range(_MIXING * dimension):
             step = generator.normal(size=points.shape)
             step /= np.linalg.norm(step, axis=1, keepdims=True)
+            # along w = point + t step the slack of row i, slack_i + t rate_i, is 0 at t = reach_i
             slack = np.maximum(points @ self.rows.T - self.offset, 0.0)
             rate = step @ self.rows.T
             with np.errstate(divide="ignore", invalid="ignore"):
@@ -101,9 +115,10 @@ class CappedPolyhedron(NamedTuple):
         return points
 
     def arc(self) -> tuple[float, float] | None:
-        """First and last angle of the part of the circle |w| = r inside; d = 2 only.
+        """First and last angle [rad] of the part of the circle |w| = r in the set; d = 2 only.
 
-        The set is expected to have one such part; of several, one is returned.
+        Row i meets the circle at its own angle +- arccos(offset_i / r). The set is expected to have
+        one such part; of several, one is returned.
         """
         angle = np.arctan2(self.rows[:, 1], self.rows[:, 0])
         cut = np.abs(self.offset) <= self.radius
@@ -112,19 +127,21 @@ class CappedPolyhedron(NamedTuple):
         if len(ends) == 0:
             inside = self.excess(self.on_circle(np.zeros(1)))[0] <= _ROUNDING * self.radius
             return (0.0, 2 * np.pi) if inside else None
+        # pieces of the circle between neighbouring ends; feasible: its midpoint is in the set
         width = np.diff(np.append(ends, ends[0] + 2 * np.pi))
         feasible = self.excess(self.on_circle(ends + 0.5 * width)) <= _ROUNDING * self.radius
         if feasible.all():
             return 0.0, 2 * np.pi
+        # the feasible pieces that follow one that is not: from `first` to the next that is not
         first = int(np.argmax(feasible & ~np.roll(feasible, 1)))
         run, widths = np.roll(feasible, -first), np.roll(width, -first)
         length = widths[: np.argmin(run)].sum()
         return (float(ends[first]), float(ends[first] + length)) if run[0] else None
 
     def boundary(self, arc_points: int) -> np.ndarray:
-        """The boundary, counter-clockwise, with its corners; d = 2 only."""
+        """Points (k, 2) of the boundary, counter-clockwise, with its corners; d = 2 only."""
         corners = [np.zeros((0, 2))]
-        for i, j in combinations(range(len(self.rows)), 2):
+        for i, j in combinations(range(len(self.rows)), 2):  # where two rows hold with equality
             pair = self.rows[[i, j]]
             if abs(np.linalg.det(pair)) > _INDEPENDENT:
                 corners.append(np.linalg.solve(pair, self.offset[[i, j]])[None])
@@ -144,9 +161,11 @@ class CappedPolyhedron(NamedTuple):
 def capped_polyhedron(
     rows: np.ndarray, offset: np.ndarray, radius: float, may_be_flat: bool
 ) -> tuple[CappedPolyhedron, np.ndarray, np.ndarray]:
-    """The set in coordinates u of its own dimension: `w = centre + axes u`, axes orthonormal.
+    """`{w: rows w >= offset, |w| <= radius}` in coordinates u of its own dimension, centre, axes.
 
-    Rows that can only be equalities become part of the affine hull; `|w|^2 = |centre|^2 + |u|^2`.
+    Equation: `w = centre + axes u`, axes (d, d_u) orthonormal, `|w|^2 = |centre|^2 + |u|^2`. Rows
+    that hold with equality all over the set (sought where it `may_be_flat`) fix the centre (d,) and
+    the axes; the others bound u.
     """
     from scipy.optimize import linprog  # late: slow to import
 
@@ -157,7 +176,7 @@ def capped_polyhedron(
         highest = [-linprog(-row, -rows, -offset, bounds=box).fun for row in rows]
         flat = np.array(highest) - offset <= _FLAT * radius
     _, singular, basis = np.linalg.svd(rows[flat])
-    axes = basis[int((singular > _INDEPENDENT).sum()) :].T
+    axes = basis[int((singular > _INDEPENDENT).sum()) :].T  # null space of the equalities
     centre = np.linalg.lstsq(rows[flat], offset[flat], rcond=_INDEPENDENT)[0]
     inner = float(np.sqrt(max(radius**2 - float(centre @ centre), 0.0)))
     offset = offset[~flat] - rows[~flat] @ centre
@@ -179,6 +198,7 @@ def least_squares(matrix: np.ndarray, target: np.ndarray) -> np.ndarray:
     degenerate problems met here: with `nnls`, `test_random_scenes_against_oracles` fails.
     """
     count = matrix.shape[1]
+    # passive: columns with x > 0; barred: columns that rounding keeps from growing
     x, passive, barred = np.zeros(count), np.zeros(count, bool), np.zeros(count, bool)
     for _ in range(_ROUNDS * count):
         gradient = matrix.T @ (target - matrix @ x)
@@ -191,7 +211,7 @@ def least_squares(matrix: np.ndarray, target: np.ndarray) -> np.ndarray:
         if trial[new] <= 0:  # rounding: this column would not grow
             passive[new], barred[new] = False, True
             continue
-        while (trial[passive] <= 0).any():
+        while (trial[passive] <= 0).any():  # go towards the trial until the first x is 0
             low = np.flatnonzero(passive & (trial <= 0))
             steps = x[low] / (x[low] - trial[low])
             x = x + steps.min() * (trial - x)
@@ -202,16 +222,16 @@ def least_squares(matrix: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def _on_support(matrix: np.ndarray, target: np.ndarray, support: np.ndarray) -> np.ndarray:
-    """Least squares x with the columns of the support only."""
+    """Minimizer x of `|matrix x - target|` with x = 0 off the support (a mask of columns)."""
     x = np.zeros(matrix.shape[1])
     x[support] = np.linalg.lstsq(matrix[:, support], target, rcond=None)[0]
     return x
 
 
 def cone_facets(generators: np.ndarray) -> np.ndarray:
-    """Rows F of unit length with `{F w >= 0}` = the cone of the columns (r, m), of rank r.
+    """Rows F (f, r) of unit length with `{w: F w >= 0}` the cone of m generators (r, m) of rank r.
 
-    The facets of the hull of the generators and the origin that pass through the origin.
+    They are the facets through the origin of the convex hull of the origin and the generators.
 
     Raises:
         ValueError: m > r and too many facets are possible.
@@ -238,7 +258,10 @@ def cone_facets(generators: np.ndarray) -> np.ndarray:
 
 
 def _chord(points: np.ndarray, steps: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """Where the lines `points + t steps` enter and leave the ball."""
+    """Parameters t (k,), (k,) at which lines `points + t steps` (k, d) enter and leave the ball.
+
+    Equation: roots of `|s|^2 t^2 + 2 p.s t + |p|^2 = radius^2`.
+    """
     a, b = (steps**2).sum(1), (points * steps).sum(1)
     root = np.sqrt(np.maximum(b**2 + a * (radius**2 - (points**2).sum(1)), 0.0))
     return (-b - root) / a, (-b + root) / a

@@ -54,9 +54,10 @@ def bilateral_motion(
     n = scene.size
 
     def acceleration(x: jax.Array) -> jax.Array:
-        """x'' at displacements x."""
+        """`x'' = -M^-1 N K N^T x` (n,) [m/s^2] at displacements x (n,) [m]."""
         return velocity_change(scene, -k * gap_velocity(scene, x))
 
+    # (x, x')' = flow (x, x')
     pull = jax.vmap(acceleration, out_axes=1)(jnp.eye(n, dtype=v.dtype))
     zero = jnp.zeros((n, n), v.dtype)
     flow = jnp.block([[zero, jnp.eye(n, dtype=v.dtype)], [pull, zero]])
@@ -94,14 +95,14 @@ def newby_ratio(n: int) -> float:
 
 
 class SeparationTimes(NamedTuple):
-    """When the `first` and the `second` spring of three balls lose their load [sqrt(m / k1)]."""
+    """Times [sqrt(m / k1)] at which the `first` and the `second` of two contacts would open."""
 
     first: float
     second: float
 
 
 def separation_times(stiffness_ratio: float) -> SeparationTimes:
-    """When the two linear contacts of three equal balls would first open, the last two at rest.
+    """Times at which the linear contacts of three equal balls would open, the last two at rest.
 
     Equation: first zeros t > 0 of
     `(Delta - 1 + g) sin(w1 t) / w1 + (Delta + 1 - g) sin(w2 t) / w2` (contact 1) and of
@@ -144,14 +145,15 @@ def separation_times(stiffness_ratio: float) -> SeparationTimes:
         """First zero of `slow sin(w1 t) / w1 + fast sin(w2 t) / w2`."""
 
         def squeeze(t: Any) -> Any:
-            """The indentation, but for a factor."""
+            """Indentation of the contact at time t, but for a positive factor."""
             return slow * np.sin(low * t) / low + fast * np.sin(high * t) / high
 
         times = np.arange(1, int(2 * np.pi * high / low / _GRID) + 2) * _GRID / high
         after = int(np.argmax(squeeze(times) <= 0))
         return float(brentq(squeeze, times[after - 1], times[after], xtol=1e-15, rtol=1e-15))
 
-    rising, falling = g + (g * g - g) / (root + 1), 1 + (1 - g) / (root + g)  # nothing cancels
+    # Delta - 1 + g and Delta + 1 - g, written so that nothing cancels; root is Delta
+    rising, falling = g + (g * g - g) / (root + 1), 1 + (1 - g) / (root + g)
     return SeparationTimes(zero(rising, falling), zero(1.0, -1.0))
 
 
@@ -186,7 +188,9 @@ def nesterenko_speed(stiffness: Any, mass: Any, velocity: Any) -> jax.Array:
     return (16 / 25) ** 0.2 * (k / m) ** 0.4 * v**0.2
 
 
-def reinsch_chain(balls: int, mass: float = 1.0, stiffness: float = 1.0) -> tuple[Any, Any]:
+def reinsch_chain(
+    balls: int, mass: float = 1.0, stiffness: float = 1.0
+) -> tuple[jax.Array, jax.Array]:
     """Masses and stiffnesses of a chain with linear contacts that passes the whole blow on.
 
     The first ball strikes, the last one leaves with its velocity, all others rest. The frequencies
@@ -220,11 +224,14 @@ def reinsch_chain(balls: int, mass: float = 1.0, stiffness: float = 1.0) -> tupl
     for name, value in (("mass", mass), ("stiffness", stiffness)):
         as_numbers(name, value, low=0.0, open_low=True)
     j = np.arange(n + 1)
-    share = np.exp(_log_central(j) + _log_central(n - j) - _log_central(n))
-    springs = share[:-1] * (j[:-1] + 0.5) * (n - j[:-1]) / (n / 2)
+    share = np.exp(_log_central(j) + _log_central(n - j) - _log_central(np.asarray(n)))  # m_j / m_0
+    springs = share[:-1] * (j[:-1] + 0.5) * (n - j[:-1]) / (n / 2)  # k_j / k_0
     return jnp.asarray(mass * share), jnp.asarray(stiffness * springs)
 
 
-def _log_central(j: Any) -> np.ndarray:
-    """Logarithm of binom(2 j, j) / 4^j: of long chains the numbers themselves overflow."""
+def _log_central(j: np.ndarray) -> np.ndarray:
+    """`ln(binom(2 j, j) / 4^j)` of whole numbers j; without logarithms long chains overflow.
+
+    Equation: `binom(2 j, j) / 4^j = Gamma(j + 1/2) / (sqrt(pi) Gamma(j + 1))`.
+    """
     return gammaln(j + 0.5) - gammaln(j + 1) - 0.5 * np.log(np.pi)

@@ -59,6 +59,7 @@ def reentrant_corner(scene: Scene, velocity: Any, restitution: Any) -> list[Corn
     if (approach <= 0).any():
         return []
     each = np.broadcast_to(np.asarray(e, float), approach.shape)
+    # row j: contact j acts alone, p_j = (1 + e_j) |gamma_j| / W_jj; approach has |gamma| / sqrt(W)
     impulses = np.diag((1 + each) * approach / np.asarray(kinetic_norm(scene), float))
     least = approach.min() * (1 + EQUAL)
     return [

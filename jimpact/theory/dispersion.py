@@ -1,4 +1,4 @@
-"""How kinetic energy is kept and how evenly it is spread after an impact."""
+"""Kinetic energy after an impact: the part that is kept, and its spread over the coordinates."""
 
 from typing import Any
 
@@ -61,12 +61,13 @@ def energy_dispersion(scene: Scene, velocity: Any) -> jax.Array:
     share = 0.5 * v * momentum(scene, v)
     mean = jnp.mean(share)
     square = jnp.mean((share - mean) ** 2)
+    # the inner `where` keeps the derivative of the root finite where all shares are equal
     deviation = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
     return deviation / mean
 
 
 def dispersion_index(scene: Scene, velocity: Any) -> jax.Array:
-    """How evenly the kinetic energy is spread over the coordinates: 0 all in one, 1 equal shares.
+    """Evenness of the kinetic energy's spread over the coordinates: 0 all in one, 1 equal shares.
 
     Equation: `1 - C_KE / sqrt(n - 1)`: C_KE (`energy_dispersion`) is at most `sqrt(n - 1)`. For
     equal balls with v- = (1, 0, 0) and no loss: 0 at (0, 0, 1), 2/3 at (-1/3, 2/3, 2/3).

@@ -23,13 +23,20 @@ _MOST_DAMPING, _LEAST_ASKED = 100.0, 1e-6
 _CHANGE = 1 / 3  # Exudyn's model 2 changes its formula at this e; both agree there
 
 
-def _pulling(ratio: float) -> float:
-    """e of a damped oscillator from x = 0 to x = 0: it pulls at the end."""
+def _pulling_oscillator(ratio: float) -> float:
+    """e of a linear spring and damper of damping ratio D that ends at x = 0, where it pulls.
+
+    Equation: `e = exp(-pi D / sqrt(1 - D^2))`, 0 from D = 1 on.
+    """
     return math.exp(-math.pi * ratio / math.sqrt(1 - ratio**2)) if ratio < 1 else 0.0
 
 
-def _cut(ratio: float) -> float:
-    """e of a damped oscillator that ends where its force vanishes: Schwager and Poeschel (2007)."""
+def _cut_oscillator(ratio: float) -> float:
+    """e of a linear spring and damper of damping ratio D that ends where its force vanishes.
+
+    Equation: `e = exp(-2 D a / r)` with `r = sqrt(|1 - D^2|)`, `a = atan(r / D)` for D < 1,
+    `a = ln(D + r)` for D > 1; `exp(-2)` between. Schwager and Poeschel (2007).
+    """
     if ratio < 1:
         root = math.sqrt(1 - ratio**2)
         return math.exp(-2 * ratio * math.atan2(root, ratio) / root)
@@ -40,7 +47,11 @@ def _cut(ratio: float) -> float:
 
 
 def _hunt_crossley(damping: float) -> float:
-    """e of `k x^n (1 + d x')` with a = d v: `(1 + e) a = ln((1 + a) / (1 - a e))`, for any n."""
+    """e of the force `k x^n (1 + d x')` at dimensionless damping a = d v, for any n.
+
+    Equation: `(1 + e) a = ln((1 + a) / (1 - a e))`; with Lambert's function W0
+    `e = (1 + W0(-(1 + a) exp(-(1 + a)))) / a`.
+    """
     if damping < _NO_DAMPING:
         return 1.0
     if damping > _STRONG:
@@ -48,36 +59,41 @@ def _hunt_crossley(damping: float) -> float:
         return (1 + float(lambertw(-shifted * math.exp(-shifted)).real)) / damping
 
     def excess(e: float) -> float:
-        """Falls with e."""
+        """`(1 + e) a - ln((1 + a) / (1 - a e))`, which falls with e."""
         return (1 + e) * damping - math.log1p(damping) + math.log1p(-damping * e)
 
     return float(brentq(excess, 0.0, 1.0))
 
 
-def _oscillator(e: float) -> float:
-    """Damping ratio of the oscillator whose e, pulling, is this one."""
+def _damping_ratio(e: float) -> float:
+    """`D = -ln(e) / sqrt(pi^2 + ln(e)^2)`, the inverse of `_pulling_oscillator`."""
     return -math.log(e) / math.hypot(math.pi, math.log(e))
 
 
-def _tsuji(e: float) -> float:
-    """Tsuji's alpha."""
+def _tsuji_alpha(e: float) -> float:
+    """Tsuji's `alpha(e)`, damping over sqrt(m k): the polynomial of the coefficients `_TSUJI`."""
     return sum(factor * e**power for power, factor in enumerate(_TSUJI))
 
 
 def _exudyn_2(e: float) -> float:
-    """Gonthier's damping below an e of 1/3, Carvalho's and Martins' above."""
+    """Dimensionless damping d v that Exudyn's impact model 2 takes for e.
+
+    Equation: `(1 - e^2) / e` below e = 1/3 (Gonthier), above it
+    `1.5 (1 - e) (11 - e) / (1 + 9 e)` (Carvalho and Martins).
+    """
     return (1 - e**2) / e if e < _CHANGE else 1.5 * (1 - e) * (11 - e) / (1 + 9 * e)
 
 
 class _Engine(NamedTuple):
-    """An engine: `result` takes a dimensionless damping, which `damping` takes of the parameter.
+    """Functions of an engine: `restitution(dimensionless damping)`, `damping(parameter)`.
 
-    `scale` gives what a parameter of damping is multiplied by, from the quantities that it `needs`;
-    without, the parameter is a coefficient of restitution.
+    Where the parameter is a coefficient of restitution, `damping` gives the dimensionless damping
+    that the engine takes for it, and `scale` is None. Where it is a damping with a unit, `scale` of
+    the quantities `needs` is the factor that makes it dimensionless.
     """
 
-    result: Callable[[float], float]
-    damping: Callable[[float], float] = lambda asked: asked
+    restitution: Callable[[float], float]
+    damping: Callable[[float], float] = lambda parameter: parameter
     needs: tuple[str, ...] = ()
     scale: Callable[..., float] | None = None
 
@@ -85,14 +101,14 @@ class _Engine(NamedTuple):
 _ENGINES = {
     "drake": _Engine(_hunt_crossley, needs=("speed",), scale=lambda speed: speed),
     "drake_sap": _Engine(
-        _cut, needs=("stiffness", "mass"), scale=lambda k, mass: math.sqrt(k / mass) / 2
+        _cut_oscillator, needs=("stiffness", "mass"), scale=lambda k, m: math.sqrt(k / m) / 2
     ),
     "exudyn_1": _Engine(_hunt_crossley, lambda e: 1.5 * (1 - e)),
     "exudyn_2": _Engine(_hunt_crossley, _exudyn_2),
-    "lammps": _Engine(_pulling, _oscillator),
-    "lammps_limit_damping": _Engine(_cut, _oscillator),
-    "lammps_tsuji_hertz": _Engine(_pulling, lambda e: _tsuji(e) / math.sqrt(5)),
-    "lammps_tsuji_hooke": _Engine(_pulling, lambda e: _tsuji(e) / 2),
+    "lammps": _Engine(_pulling_oscillator, _damping_ratio),
+    "lammps_limit_damping": _Engine(_cut_oscillator, _damping_ratio),
+    "lammps_tsuji_hertz": _Engine(_pulling_oscillator, lambda e: _tsuji_alpha(e) / math.sqrt(5)),
+    "lammps_tsuji_hooke": _Engine(_pulling_oscillator, lambda e: _tsuji_alpha(e) / 2),
 }
 
 
@@ -103,7 +119,7 @@ def engine_restitution(
     stiffness: float | None = None,
     mass: float | None = None,
 ) -> float:
-    """Which coefficient of restitution a pair gets from the damping parameter of an engine.
+    """Coefficient of restitution of two bodies from the damping parameter of a physics engine.
 
     Equation, with F the contact force, x its indentation, v the speed, m the reduced mass:
 
@@ -143,12 +159,12 @@ def engine_restitution(
     >>> round(ji.theory.engine_restitution("drake", 50.0, speed=1.0), 3)  # Drake's default
     0.02
     """
-    row, scale = _row(engine, speed=speed, stiffness=stiffness, mass=mass)
+    row, scale = _engine_and_scale(engine, speed=speed, stiffness=stiffness, mass=mass)
     if scale is None:
         check_values("parameter", parameter, low=0.0, open_low=True, high=1.0)
-        return row.result(row.damping(parameter))
+        return row.restitution(row.damping(parameter))
     check_values("parameter", parameter, low=0.0)
-    return row.result(scale * parameter)
+    return row.restitution(scale * parameter)
 
 
 def engine_parameter(
@@ -184,12 +200,13 @@ def engine_parameter(
     0.716
     """
     check_values("restitution", restitution, low=0.0, open_low=True, high=1.0)
-    row, scale = _row(engine, speed=speed, stiffness=stiffness, mass=mass)
+    row, scale = _engine_and_scale(engine, speed=speed, stiffness=stiffness, mass=mass)
+    # parameters with the least and the largest e; a damping is dimensionless here
     ends = (_LEAST_ASKED, 1.0) if scale is None else (_MOST_DAMPING, 0.0)
 
-    def excess(asked: float) -> float:
-        """The coefficient of this parameter (of a damping: dimensionless) over the wanted one."""
-        return row.result(row.damping(asked)) - restitution
+    def excess(parameter: float) -> float:
+        """The coefficient of restitution of this parameter minus the wanted one."""
+        return row.restitution(row.damping(parameter)) - restitution
 
     low, high = excess(ends[0]), excess(ends[1])
     if low > 0 or high < 0:
@@ -200,8 +217,12 @@ def engine_parameter(
     return float(brentq(excess, *ends)) / (scale or 1.0)
 
 
-def _row(engine: str, **given: float | None) -> tuple[_Engine, float | None]:
-    """The row of an engine, and what its parameter is multiplied by; None: nothing."""
+def _engine_and_scale(engine: str, **given: float | None) -> tuple[_Engine, float | None]:
+    """Functions of an engine, and the factor that makes its damping dimensionless, checked.
+
+    `given` are speed [m/s], stiffness [N/m] and mass [kg]. The factor is None where the parameter
+    is a coefficient of restitution.
+    """
     check_choice("engine", engine, _ENGINES)
     row = _ENGINES[engine]
     values = []

@@ -30,7 +30,9 @@ class InclusionOutcome(NamedTuple):
 
 @full_precision
 def contact_coupling(scene: Scene) -> jax.Array:
-    """`Gbar = [[G, n_q^T H], [0, t_q^T H]]` (n, m + t): what (pbar, p_t) do to (qn, qt).
+    """Matrix Gbar (n, m + t) from impulses (pbar, p_t) to changes of quasi-velocities (qn, qt).
+
+    Equation: `Gbar = [[G, n_q^T H], [0, t_q^T H]]`, H the tangents (n, t), `pbar = |grad f| p`.
 
     Args:
         scene: n coordinates, m contacts, t tangents.
@@ -50,11 +52,11 @@ def contact_coupling(scene: Scene) -> jax.Array:
     """
     n_q, t_q = quasi_basis(scene)
     g = as_matrix(normalized_delassus(scene))
-    left = jnp.concatenate([g, jnp.zeros((t_q.shape[1], g.shape[1]), g.dtype)])
+    of_normal = jnp.concatenate([g, jnp.zeros((t_q.shape[1], g.shape[1]), g.dtype)])
     if scene.tangents is None:
-        return left
-    right = jnp.concatenate([n_q.T @ scene.tangents, t_q.T @ scene.tangents])
-    return jnp.concatenate([left, right], axis=1)
+        return of_normal
+    of_tangential = jnp.concatenate([n_q.T @ scene.tangents, t_q.T @ scene.tangents])
+    return jnp.concatenate([of_normal, of_tangential], axis=1)
 
 
 @full_precision
@@ -62,6 +64,8 @@ def restitution_inclusion(
     coupling: Any, metric: Any, restitution: Any, velocity: Any, low: Any = 0.0, high: Any = jnp.inf
 ) -> InclusionOutcome:
     """Solve `v+ - v- in -Gbar N_V(Gamma (v+ + Lambda v-))` with `Gamma = Gbar^T P`, V a box.
+
+    N_V is the normal cone of V, the box of all y with `low <= y <= high`.
 
     Equation: `v+ = -Lambda v- + R^-1 proj[{x: Gbar^T R x in V}; R (Lambda + I) v-]`, `R^2 = P`.
     With the multipliers of the projection, y = Gamma (v+ + Lambda v-), it reads `v+ = v- + Gbar p`,
@@ -95,23 +99,28 @@ def restitution_inclusion(
         raise ValueError(f"Argument `coupling` must be a matrix, but has shape {gbar.shape}.")
     n, c = gbar.shape
     v = as_numbers("velocity", velocity, (n,), "one per row of `coupling`")
-    p = as_numbers("metric", metric, (n, n), "square, one row per row of `coupling`")
+    metric_p = as_numbers("metric", metric, (n, n), "square, one row per row of `coupling`")
     lam = lam * jnp.eye(n, dtype=lam.dtype) if lam.ndim == 0 else lam
     check_shape("restitution", lam, (n, n), "or a scalar")
     low, high = (
         jnp.broadcast_to(as_float_array(name, x), (c,))
         for name, x in (("low", low), ("high", high))
     )
-    gamma = gbar.T @ p
-    y = gamma @ (v + lam @ v)
-    percussion, code = _in_box(gamma @ gbar, y, low, high)
+    gamma = gbar.T @ metric_p
+    y = gamma @ (v + lam @ v)  # Gamma (v+ + Lambda v-) without percussion, v+ = v-
+    percussion, code = _box_multipliers(gamma @ gbar, y, low, high)
     return InclusionOutcome(v + gbar @ percussion, percussion, code.astype(jnp.int32))
 
 
-def _in_box(
+def _box_multipliers(
     s: jax.Array, y: jax.Array, low: jax.Array, high: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Multipliers that bring `y + S p` into the box; S symmetric positive semidefinite."""
+    """Multipliers p (c,) with `low <= y + S p <= high`, and the code of the status.
+
+    Equation: `p = p_low - p_high`, `0 <= p_low _|_ y + S p - low >= 0`,
+    `0 <= p_high _|_ high - y - S p >= 0`: one LCP in (p_low, p_high) (2 c,). S (c, c) is symmetric
+    positive semidefinite.
+    """
     bounded = jnp.isfinite(jnp.concatenate([low, high]))
     slack = jnp.concatenate([y - low, high - y])
     slack = jnp.where(bounded, slack, 1.0)  # a bound at infinity never binds
@@ -148,15 +157,14 @@ class FrictionBounds(NamedTuple):
         return self.m_bar_least > self.k_largest
 
     def dissipates(self, scene: Scene, velocity: Any) -> bool:
-        """Whether Theorem 6.2 (sufficient) promises T+ <= T- in a scene, at a velocity v- (n,)."""
+        """True where Theorem 6.2 (sufficient) promises T+ <= T- of a scene at velocity v- (n,)."""
         qn, qt = to_quasi_velocities(scene, velocity)
         return self.condition_i and bool(
             jnp.linalg.norm(qn) >= self.least_ratio * jnp.linalg.norm(qt)
         )
 
     def __str__(self) -> str:
-        """The four conditions, a line each."""
-
+        """Report: the four conditions with their numbers, a line each."""
         words = {True: "holds", False: "does not hold, which decides nothing"}
         first, third = words[self.g_mu_bound < 1], words[self.restitution_bound < 1]
         ratio = f"|qn-| / |qt-| >= {self.least_ratio:.6g}" if self.condition_i else "no bound"
@@ -170,16 +178,16 @@ class FrictionBounds(NamedTuple):
 
 
 class _Coupling(NamedTuple):
-    """The matrices of friction of a scene: G, n_q^T H_t, t_q^T H_t, mubar xi, with m columns."""
+    """Matrices of a planar scene with m closed contacts and as many tangents H_t."""
 
-    delassus: jax.Array
-    normal: jax.Array
-    tangential: jax.Array
+    delassus: jax.Array  # G (m, m)
+    normal: jax.Array  # n_q^T H_t (m, m)
+    tangential: jax.Array  # t_q^T H_t (n - m - b, m)
     friction: jax.Array  # mu_j xi_j / |grad f_j| (m,)
 
     @property
     def g_mu(self) -> jax.Array:
-        """G^mu (m, m)."""
+        """G^mu = G - n_q^T H_t [mubar][xi] (m, m)."""
         return self.delassus - self.normal * self.friction[None, :]
 
 
@@ -192,7 +200,8 @@ def friction_bounds(scene: Scene, matrix: Any, friction: Any, slip: Any = 1.0) -
     `lambda_min(Mbar) > lambda_max(K)`,
     `|qn-| / |qt-| >= 2 |t_q^T H_t| |mubar| |(G^mu)^-1| |I + E| / (lambda_min - lambda_max)`,
     where `Mbar = (I - E)^T G^-1 (I + E)` and `K = B^T B`, `B = t_q^T H_t [mubar][xi] (G^mu)^-1
-    (I + E)`. Spectral norms; eigenvalues of symmetric parts.
+    (I + E)`. Spectral norms; eigenvalues of symmetric parts; [x] is the diagonal matrix of x, G the
+    normalized Delassus matrix, n_q and t_q the basis of `quasi_basis`, `pbar = |grad f| p`.
 
     Args:
         scene: n coordinates, m closed contacts, planar tangents H_t (n, m).
@@ -218,8 +227,8 @@ def friction_bounds(scene: Scene, matrix: Any, friction: Any, slip: Any = 1.0) -
     """
     e = _restitution(scene, matrix)
     coupling = _coupling(scene, friction, slip)
-    mu = as_float_array("friction", friction) * jnp.ones(scene.contacts) / kinetic_norm(scene)
-    one_plus = np.eye(len(e)) + e
+    mubar = as_float_array("friction", friction) * jnp.ones(scene.contacts) / kinetic_norm(scene)
+    one_plus = np.eye(len(e)) + e  # I + E
     g, g_mu = np.asarray(coupling.delassus, float), np.asarray(coupling.g_mu, float)
     if np.linalg.cond(g_mu) > 1 / (len(g) * np.finfo(scene.mass.dtype).eps):
         raise ValueError(
@@ -228,14 +237,16 @@ def friction_bounds(scene: Scene, matrix: Any, friction: Any, slip: Any = 1.0) -
         )
     inverse = np.linalg.inv(g)
     m_bar = (np.eye(len(e)) - e).T @ inverse @ one_plus
+    # t_q^T H_t [mubar][xi]
     slide = np.asarray(coupling.tangential, float) * np.asarray(coupling.friction)[None, :]
     b = slide @ np.linalg.solve(g_mu, one_plus)
     k = b.T @ b
     least = float(np.linalg.eigvalsh(0.5 * (m_bar + m_bar.T))[0])
     largest = float(np.linalg.eigvalsh(k)[-1])
-    largest_mu = float(jnp.abs(mu).max())
-    reach = 2 * _norm(coupling.tangential) * largest_mu
-    reach *= _norm(np.linalg.inv(g_mu)) * _norm(one_plus)
+    largest_mu = float(jnp.abs(mubar).max())
+    # numerator of Theorem 6.2 (ii)
+    numerator = 2 * _norm(coupling.tangential) * largest_mu
+    numerator *= _norm(np.linalg.inv(g_mu)) * _norm(one_plus)
     return FrictionBounds(
         g_mu=g_mu,
         k=k,
@@ -244,7 +255,7 @@ def friction_bounds(scene: Scene, matrix: Any, friction: Any, slip: Any = 1.0) -
         restitution_bound=_norm(e) ** 2 * float(np.linalg.cond(g)),
         m_bar_least=least,
         k_largest=largest,
-        least_ratio=reach / (least - largest) if least > largest else float("inf"),
+        least_ratio=numerator / (least - largest) if least > largest else float("inf"),
     )
 
 
@@ -254,8 +265,9 @@ def friction_impulses(
 ) -> tuple[jax.Array, jax.Array]:
     """Normal impulses p (m,) and tangential p_t (m,) [N s] of the law for a given slip xi.
 
-    Equation: `pbar = -(G^mu)^-1 (I + E) qn-`, `p_t = -[mubar][xi] pbar`, `p = pbar / |grad f|`.
-    The slip is taken as given: whether it agrees with the sliding after it is the caller's.
+    Equation: `pbar = -(G^mu)^-1 (I + E) qn-`, `p_t = -[mubar][xi] pbar`, `p = pbar / |grad f|`,
+    with G^mu and mubar of `friction_bounds`. The slip is taken as given: whether it agrees with
+    the sliding after it is the caller's.
 
     Args:
         scene: n coordinates, m closed contacts, planar tangents.
@@ -291,7 +303,8 @@ def friction_energy_change(
 ) -> jax.Array:
     """`T+ - T-` [J] of normal and tangential impulses, in kinetic quasi-velocities.
 
-    Equation: `(qn+ + qn-)^T (pbar + G^-1 n_q^T H_t p_t) / 2 + (qt+ + qt-)^T t_q^T H_t p_t / 2`.
+    Equation: `(qn+ + qn-)^T (pbar + G^-1 n_q^T H_t p_t) / 2 + (qt+ + qt-)^T t_q^T H_t p_t / 2`,
+    with `pbar = |grad f| p`, H_t the tangents, and G, n_q, t_q as in `friction_bounds`.
 
     Args:
         scene: m contacts, planar tangents.
@@ -320,24 +333,24 @@ def friction_energy_change(
     qn, qt = to_quasi_velocities(scene, velocity)
     pbar = kinetic_norm(scene) * p
     qn_plus = qn + coupling.delassus @ pbar + coupling.normal @ p_t
-    pushed = coupling.tangential @ p_t  # = qt+ - qt-
+    qt_change = coupling.tangential @ p_t
     normal = pbar + jnp.linalg.solve(coupling.delassus, coupling.normal @ p_t)
-    return 0.5 * (qn_plus + qn) @ normal + 0.5 * (2 * qt + pushed) @ pushed
+    return 0.5 * (qn_plus + qn) @ normal + 0.5 * (2 * qt + qt_change) @ qt_change
 
 
-def _norm(matrix: Any) -> float:
+def _norm(matrix: jax.Array | np.ndarray) -> float:
     """Largest singular value; 0 of an empty matrix."""
     return float(np.linalg.norm(np.asarray(matrix, float), 2)) if np.size(matrix) else 0.0
 
 
 def _restitution(scene: Scene, matrix: Any) -> np.ndarray:
-    """E (m, m) on the host, checked."""
+    """Restitution matrix E (m, m) as a NumPy array, checked."""
     e = as_numbers("matrix", matrix, (scene.contacts,) * 2, "one row and one column per contact")
     return np.asarray(e, float)
 
 
 def _coupling(scene: Scene, friction: Any, slip: Any) -> _Coupling:
-    """The matrices of a planar scene of closed contacts, checked."""
+    """Matrices of a planar scene of closed contacts with friction mu at slip xi, checked."""
     m = scene.contacts
     if scene.tangents is None or scene.tangents.shape[1] != m:
         raise ValueError(
@@ -350,10 +363,11 @@ def _coupling(scene: Scene, friction: Any, slip: Any) -> _Coupling:
     _, tangent = quasi_basis(scene)
     unit = jnp.eye(m, dtype=scene.mass.dtype)
     none = jnp.zeros(m, scene.mass.dtype)
-    pushed = jax.vmap(lambda p_t: velocity_change(scene, none, p_t), 1, 1)(unit)
+    # M^-1 H_t (n, m): column j is v+ - v- of a unit tangential impulse at contact j
+    changes = jax.vmap(lambda p_t: velocity_change(scene, none, p_t), 1, 1)(unit)
     return _Coupling(
         delassus=as_matrix(normalized_delassus(scene)),
-        normal=jax.vmap(partial(normalized_gap_velocity, scene), 1, 1)(pushed),
+        normal=jax.vmap(partial(normalized_gap_velocity, scene), 1, 1)(changes),
         tangential=tangent.T @ scene.tangents,
         friction=(mu * xi * jnp.ones(m, mu.dtype)) / kinetic_norm(scene),
     )

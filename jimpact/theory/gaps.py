@@ -66,6 +66,7 @@ def crossover(scene: Scene, law: Law, velocity: Any, offset: Any) -> Crossover:
         raise ValueError(f"Argument `offset` must have shape (s,), but has shape {s.shape}.")
     scale = gap_scale(scene, law, velocity)
     delta = jnp.max(scale.delta)
+    # gaps (s, 2) = mean +- delta s / 2, the mean large enough for gaps >= 0
     mean = jnp.maximum(jnp.mean(scale.gaps), 0.5 * delta * jnp.max(jnp.abs(s)))
     gaps = mean + 0.5 * delta * s[:, None] * jnp.array([1.0, -1.0], s.dtype)[None, :]
     v, gaps = as_float_array("velocity", velocity), jnp.maximum(gaps, 0.0)
@@ -126,7 +127,7 @@ class GapSensitivity:
             return linear / self.sampled.std
 
     def __str__(self) -> str:
-        """The linearized outcome and, if sampled, the spread."""
+        """Report: v+ and its Jacobian in the gaps and, if sampled, the standard deviations."""
         at = ", ".join(f"{gap:g}" for gap in self.gaps)
         lines = [f"Linearized at gaps ({at}) m, status {self.status}; d v+ / d gap [1/s]:"]
         for i, (v, row) in enumerate(zip(self.velocity, self.jacobian)):
@@ -135,7 +136,7 @@ class GapSensitivity:
         return "\n".join(lines + ([] if self.sampled is None else self._comparison()))
 
     def _comparison(self) -> list[str]:
-        """Lines on whether the linearization explains the sampled spread."""
+        """Report lines: linearized against sampled standard deviations [m/s], and a verdict."""
         assert self.sampled is not None
         ratio = self.explained
         largest = np.max(np.abs([self.sampled.minimum, self.sampled.maximum]), initial=0.0)
@@ -194,7 +195,7 @@ def gap_sensitivity(
     v = as_float_array("velocity", velocity)
 
     def outcome(gaps: jax.Array) -> tuple[jax.Array, Any]:
-        """v+, and v+ and status again as auxiliary data."""
+        """v+ (n,) [m/s] at gaps (m,) [m], to be differentiated; v+ and status as they are."""
         out = impact(law, with_gaps(scene, gaps), v)
         return out.velocity, (out.velocity, out.status)
 

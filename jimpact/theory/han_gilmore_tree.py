@@ -36,57 +36,57 @@ class HanGilmoreOutcome:
 
 @dataclasses.dataclass
 class _Node:
-    """Normalized gap and slip velocities (m + t,), impulses (m + t,) so far, and the rules."""
+    """A velocity that the tree has reached, in normalized components along normals and tangents."""
 
-    state: np.ndarray
-    p: np.ndarray
-    rules: tuple[str, ...] = ()
-    endless: bool = False
+    state: np.ndarray  # gap and slip velocities (m + t,) over sqrt(W_jj)
+    p: np.ndarray  # sum of the impulses (m + t,) from the start, times sqrt(W_jj)
+    rules: tuple[str, ...] = ()  # rule (iii) at each impact of the branch
+    endless: bool = False  # a sequence of impacts without end leads here
 
 
 @dataclasses.dataclass(frozen=True)
 class _Problem:
-    """Normalized W of normals and tangents (m + t, m + t), e, mu and whether closed (m,).
+    """Contact matrices of a scene with m contacts and t tangents (0, or m with friction)."""
 
-    `rows` (n, m + t) are normals and tangents, `mobility` M^-1 times these, `root` (m + t,) what
-    velocities and impulses are normalized by, sqrt(W_jj).
-    """
-
-    matrix: np.ndarray
-    restitution: np.ndarray
-    friction: np.ndarray | None
-    closed: np.ndarray
-    rows: np.ndarray
-    mobility: np.ndarray
-    root: np.ndarray
+    matrix: np.ndarray  # W_ij / sqrt(W_ii W_jj) of normals and tangents (m + t, m + t)
+    restitution: np.ndarray  # e (m,)
+    friction: np.ndarray | None  # mu (m,)
+    closed: np.ndarray  # mask (m,)
+    rows: np.ndarray  # normals and tangents (n, m + t)
+    mobility: np.ndarray  # M^-1 rows (n, m + t), with bilateral constraints kept
+    root: np.ndarray  # sqrt(W_jj) of the normals (m + t,), for the tangents once more
 
     @property
     def contacts(self) -> int:
-        """m."""
+        """Number m of contacts."""
         return len(self.closed)
 
     @property
     def coupled(self) -> np.ndarray:
-        """Whether (m, m) contacts act on each other."""
+        """Mask (m, m): an impulse at contact j changes a gap or slip velocity at contact i."""
         m, each = self.contacts, len(self.matrix) // self.contacts
+        # axes: normal or tangent, contact; once for rows and once for columns
         blocks = np.abs(self.matrix).reshape(each, m, each, m)
         coupled: np.ndarray = blocks.max(axis=(0, 2)) > SINGULAR
         return coupled
 
     def approach(self, node: _Node) -> float:
-        """The largest of a closed contact, 0 where none approaches."""
+        """Largest normalized approach velocity -qn of a closed contact, 0 where none approaches."""
         return float(np.max(-node.state[: self.contacts][self.closed], initial=0.0))
 
 
+# States of the tree (m + t,) by the whole number that `_is_new` gives them.
 Cells = dict[int, list[np.ndarray]]
 
 
 def _is_new(state: np.ndarray, visited: Cells) -> bool:
-    """Whether a state was not visited; it is now. Cells are those of a generic weighted sum."""
+    """True for a state that differs by more than `ZERO` from all visited ones; it becomes visited.
+
+    States are kept in cells of their weighted sum `sum_i w_i s_i`, `2 ZERO sum_i w_i` wide: equal
+    states lie in the same cell or in neighbours, so that few have to be compared.
+    """
     weights = np.sqrt(np.arange(2.0, len(state) + 2))
-    cell = int(
-        np.floor(state @ weights / (2 * ZERO * weights.sum()))
-    )  # that of equal ones, or next to it
+    cell = int(np.floor(state @ weights / (2 * ZERO * weights.sum())))
     near = [old for k in (cell - 1, cell, cell + 1) for old in visited.get(k, [])]
     if any(np.abs(old - state).max() <= ZERO for old in near):
         return False
@@ -151,8 +151,8 @@ def han_gilmore(
     if size == 0.0:
         return [HanGilmoreOutcome(v, start.p[:m], (), start.p[m:])]
     start.state = state / size
-    found: list[_Node] = []
-    frontier, visited = [start], Cells()
+    found: list[_Node] = []  # ends of branches: nothing approaches
+    frontier, visited = [start], Cells()  # nodes after equally many impacts, and all so far
     _is_new(start.state, visited)
     while frontier:
         following: list[_Node] = []
@@ -161,6 +161,7 @@ def han_gilmore(
                 approach = problem.approach(child)
                 if _is_new(child.state, visited):
                     (found if approach <= ZERO else following).append(child)
+                # such an approach decays through a sequence of impacts without end, cut off here
                 if ROUNDING < approach <= ZERO:
                     for other in found:
                         near = np.abs(other.state - child.state).max() <= 2 * ZERO
@@ -180,7 +181,11 @@ def han_gilmore(
 
 
 def _problem(scene: Scene, restitution: Any, friction: Any) -> _Problem:
-    """The problem, in double precision always: whether a contact is at rest decides the tree."""
+    """Contact matrices of a scene, in double precision always, with e and mu checked.
+
+    `W = J M^-1 J^T`, J^T (n, m + t) the normals and, with friction, the tangents. Single precision
+    could not tell contacts at rest from slow ones, which decides the tree.
+    """
     m = scene.contacts
     check_per_contact("restitution", restitution, m)
     check_values("restitution", restitution, low=0.0, high=1.0)
@@ -195,7 +200,7 @@ def _problem(scene: Scene, restitution: Any, friction: Any) -> _Problem:
         rows = np.concatenate([rows, np.asarray(scene.tangents, float)], axis=1)
         mu = np.broadcast_to(np.asarray(friction, float), (m,))
     inverse = np.linalg.inv(dense_mass(scene))
-    if scene.constraints is not None:
+    if scene.constraints is not None:  # M^-1 - M^-1 H (H^T M^-1 H)^-1 H^T M^-1
         h = np.asarray(scene.constraints, float)
         inverse_h = inverse @ h
         inverse = inverse - inverse_h @ np.linalg.solve(h.T @ inverse_h, inverse_h.T)
@@ -208,29 +213,37 @@ def _problem(scene: Scene, restitution: Any, friction: Any) -> _Problem:
 
 
 def _impacts(problem: _Problem, node: _Node) -> Iterator[_Node]:
-    """Nodes that one impact leads to: one for every allowed set of contacts with p > 0."""
+    """Nodes after one more impact: one for each set of contacts with p > 0 that rule (iii) allows.
+
+    With friction one for each way in which these contacts stick or slide, too.
+    """
     qn, closed = node.state[: problem.contacts], problem.closed
     approaching = closed & (qn < -ZERO)
     resting = closed & (np.abs(qn) <= ZERO)
     for active in _active_sets(problem.coupled, approaching, resting):
         at = np.flatnonzero(active)
-        # to which side each contact slides; 0: it sticks
-        sides = (0, 1, -1) if problem.friction is not None else (0,)
-        for slides in itertools.product(sides, repeat=len(at)):
+        signs = (0, 1, -1) if problem.friction is not None else (0,)  # of u+; 0: it sticks
+        for slides in itertools.product(signs, repeat=len(at)):
             child = _impact(problem, node, at, np.array(slides))
             if child is None:
                 continue
             rule = _rule(closed, active, approaching, resting)
             if problem.friction is not None:
                 ways = {0: "sticks", 1: "slides forward", -1: "slides backward"}
-                rule += "".join(f"; {j} {ways[side]}" for j, side in zip(at, slides))
+                rule += "".join(f"; {j} {ways[sign]}" for j, sign in zip(at, slides))
             yield dataclasses.replace(child, rules=(*node.rules, rule))
 
 
 def _impact(problem: _Problem, node: _Node, at: np.ndarray, slides: np.ndarray) -> _Node | None:
-    """The node after an impact of contacts `at` that slide so; None where it contradicts itself."""
+    """The node after an impact with p > 0 at contacts `at` (s,); None if it contradicts itself.
+
+    Equation: `gamma+ = -e gamma-`; with friction `u+ = 0` where `slides` (s,) is 0, else
+    `p_t = -mu p slides`. It contradicts itself unless p > 0, |p_t| <= mu p where a contact sticks,
+    and u+ has the sign `slides`.
+    """
     m, count, mu = problem.contacts, len(at), problem.friction
     rows = at if mu is None else np.concatenate([at, m + at])
+    # block (p, p_t) = target: changes of gap and slip velocity
     block = problem.matrix[np.ix_(rows, rows)].copy()
     target = -node.state[rows]
     target[:count] *= 1 + problem.restitution[at]
@@ -239,7 +252,7 @@ def _impact(problem: _Problem, node: _Node, at: np.ndarray, slides: np.ndarray) 
             block[count + k], target[count + k] = 0.0, 0.0
             block[count + k, [k, count + k]] = mu[at[k]] * slides[k], 1.0
     solved = np.linalg.lstsq(block, target, rcond=SINGULAR)[0]
-    pushes, sides = solved[:count], solved[count:]
+    pushes, p_t = solved[:count], solved[count:]
     if np.abs(block @ solved - target).max() > ZERO or np.any(pushes <= ZERO):
         return None
     p = np.zeros_like(node.p)
@@ -247,7 +260,7 @@ def _impact(problem: _Problem, node: _Node, at: np.ndarray, slides: np.ndarray) 
     state = node.state + problem.matrix @ p
     state[at] = -problem.restitution[at] * node.state[at]
     if mu is not None:
-        if np.any((slides == 0) & (np.abs(sides) > mu[at] * pushes + ZERO)):
+        if np.any((slides == 0) & (np.abs(p_t) > mu[at] * pushes + ZERO)):
             return None
         if np.any(slides * state[m + at] < -ZERO):
             return None
@@ -257,9 +270,10 @@ def _impact(problem: _Problem, node: _Node, at: np.ndarray, slides: np.ndarray) 
 def _active_sets(
     coupled: np.ndarray, approaching: np.ndarray, resting: np.ndarray
 ) -> Iterator[np.ndarray]:
-    """The approaching contacts with all sets of resting ones that they reach.
+    """Masks (m,) of contacts with p > 0: the approaching ones, alone and with resting ones.
 
-    A resting contact that no approaching one pushes through others has p_j = 0: no new set.
+    `coupled` (m, m), `approaching` and `resting` (m,) are masks. A resting contact joins a set only
+    where it is coupled to a contact of the set; else p_j = 0.
     """
     sets, known = [approaching], {approaching.tobytes()}
     for active in sets:
@@ -275,7 +289,10 @@ def _active_sets(
 def _rule(
     closed: np.ndarray, active: np.ndarray, approaching: np.ndarray, resting: np.ndarray
 ) -> str:
-    """What rule (iii) said of every closed contact."""
+    """Text of rule (iii) at one impact: closed contacts with p > 0 and with p = 0, and why.
+
+    All arguments are masks (m,).
+    """
     why = np.where(approaching, "approaching", np.where(resting, "at rest", "separating"))
     cases = (("p > 0", active), ("p = 0", closed & ~active))
     texts = [

@@ -44,8 +44,8 @@ def distributing_rule(energy: Any, stiffness: Any, exponent: Any) -> jax.Array:
 def correlation_interval(scene: Scene, restitution: Any) -> tuple[np.ndarray, np.ndarray]:
     """Ratios `r_j = dp_j / dp_i` that mechanics allows a contact j at rest beside contact i.
 
-    Equation: `r_j >= -W_ij / W_jj`, or contact j would approach; and contact i ends apart only
-    where `W_ii + 2 W_ij r + W_jj r^2 <= (1 + e_i^2) (W_ii + W_ij r)`, with
+    Equation, with the Delassus matrix W: `r_j >= -W_ij / W_jj`, or contact j would approach; and
+    contact i separates only where `W_ii + 2 W_ij r + W_jj r^2 <= (1 + e_i^2) (W_ii + W_ij r)`, with
     `W_ii + W_ij r > 0`. For three equal balls that hit at e = 1: 1/2 to 1, the whole arc of
     outcomes that conserve energy.
 

@@ -31,6 +31,9 @@ class ContactPower(eqx.Module):
 def to_quasi_velocities(scene: Scene, velocity: Any) -> tuple[jax.Array, jax.Array]:
     """Quasi-velocities of a velocity: `qn = n_q^T M v` (m,) and `qt = t_q^T M v` (n - m - b,).
 
+    The columns of n_q (n, m) and t_q (n, n - m - b) are the unit normals of the contacts and an
+    orthonormal basis of all tangents, in the kinetic metric M (`quasi_basis`).
+
     Args:
         scene: n coordinates, m contacts, b bilateral constraints.
         velocity: (n,) [m/s]; it satisfies the bilateral constraints.
@@ -58,7 +61,8 @@ def to_quasi_velocities(scene: Scene, velocity: Any) -> tuple[jax.Array, jax.Arr
 def from_quasi_velocities(scene: Scene, normal: Any, tangential: Any) -> jax.Array:
     """The velocity (n,) with these quasi-velocities; inverse of `to_quasi_velocities`.
 
-    Equation: `v = n_q G^-1 qn + t_q qt`; n_q without its part along bilateral constraints.
+    Equation: `v = n_q G^-1 qn + t_q qt`, with the normalized Delassus matrix G and the basis n_q,
+    t_q of `quasi_basis`; n_q without its part along bilateral constraints.
 
     Args:
         scene: n coordinates, m contacts, b bilateral constraints.
@@ -81,6 +85,7 @@ def from_quasi_velocities(scene: Scene, normal: Any, tangential: Any) -> jax.Arr
     qn = as_numbers("normal", normal, (scene.contacts,), "one per contact")
     _, tangent = quasi_basis(scene)
     qt = as_numbers("tangential", tangential, tangent.shape[1:], "one per tangent of `quasi_basis`")
+    # n_q G^-1 qn = M^-1 N p with p = G^-1 qn / |grad f|
     impulse = jnp.linalg.solve(as_matrix(normalized_delassus(scene)), qn) / kinetic_norm(scene)
     return velocity_change(scene, impulse) + tangent @ qt
 
@@ -89,7 +94,8 @@ def from_quasi_velocities(scene: Scene, normal: Any, tangential: Any) -> jax.Arr
 def kinetic_energy_split(scene: Scene, velocity: Any) -> tuple[jax.Array, jax.Array]:
     """Normal and tangential kinetic energy [J]; their sum is the kinetic energy.
 
-    Equation: `T_n = qn^T G^-1 qn / 2`, `T_t = qt^T qt / 2`. Frictionless impacts change T_n only.
+    Equation: `T_n = qn^T G^-1 qn / 2`, `T_t = qt^T qt / 2`, G the normalized Delassus matrix.
+    Frictionless impacts change T_n only.
 
     Args:
         scene: n coordinates, m contacts, b bilateral constraints.
@@ -121,8 +127,10 @@ def contact_power(
 
     Equation: with `F_norm^n = G lambda_bar`, `F_norm^t = n_q^T H lambda_t` and
     `F_tan^t = t_q^T H lambda_t`: `normal = <F_norm^n, qn>_Dn = gamma^T lambda` (6.36)-(6.37),
-    `coupling = <qn, F_norm^t>_Dn`, `tangential = <qt, F_tan^t>_Dt` (6.39), where `D_n = G^-1` and
-    `D_t = I`. Coupling and tangential together are the local power `v_t^T lambda_t` of (6.41).
+    `coupling = <qn, F_norm^t>_Dn`, `tangential = <qt, F_tan^t>_Dt` (6.39), where
+    `<a, b>_D = a^T D b`, `D_n = G^-1`, `D_t = I`, `lambda_bar = |grad f| lambda`; G, n_q, t_q as in
+    `from_quasi_velocities`, H the tangents. Coupling and tangential together are the local power
+    `v_t^T lambda_t` of (6.41).
 
     Args:
         scene: n coordinates, m contacts; with tangents where tangential forces act.
@@ -142,21 +150,21 @@ def contact_power(
     >>> float(ji.theory.contact_power(ji.chain([2.0, 2.0]), [1.5, 0.5], [3.0]).total)
     -3.0
     """
-    normal_force = as_numbers("force", force, (scene.contacts,), "one per contact")
+    lambda_n = as_numbers("force", force, (scene.contacts,), "one per contact")
     v = as_velocity(scene, velocity)
     qn, qt = to_quasi_velocities(scene, v)
-    normal = normal_force @ gap_velocity(scene, v)
+    normal = lambda_n @ gap_velocity(scene, v)
     if tangential_force is None:
         zero = jnp.zeros_like(normal)
         return ContactPower(normal, zero, zero, normal)
     if scene.tangents is None:
         raise ValueError("Argument `scene` must have tangents where tangential forces act.")
-    side = as_numbers(
+    lambda_t = as_numbers(
         "tangential_force", tangential_force, scene.tangents.shape[1:], "one per tangent"
     )
-    _, tangent = quasi_basis(scene)
-    pushed = velocity_change(scene, jnp.zeros_like(normal_force), side)
-    pushed_normal = normalized_gap_velocity(scene, pushed)
-    coupling = qn @ jnp.linalg.solve(as_matrix(normalized_delassus(scene)), pushed_normal)
-    tangential = qt @ (tangent.T @ (scene.tangents @ side))
+    _, t_q = quasi_basis(scene)
+    accelerated = velocity_change(scene, jnp.zeros_like(lambda_n), lambda_t)  # M^-1 H lambda_t
+    f_norm = normalized_gap_velocity(scene, accelerated)  # n_q^T H lambda_t
+    coupling = qn @ jnp.linalg.solve(as_matrix(normalized_delassus(scene)), f_norm)
+    tangential = qt @ (t_q.T @ (scene.tangents @ lambda_t))
     return ContactPower(normal, coupling, tangential, normal + coupling + tangential)

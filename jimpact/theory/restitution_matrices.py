@@ -63,7 +63,7 @@ def margin(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
     >>> round(float(value), 6), x.round(3).tolist()
     (-1.0, [0.707..., 0.707...])
     """
-    m = _size(matrix)
+    m = _checked_size(matrix)
     q = 0.5 * (matrix + matrix.T)
     fixed = jax.lax.stop_gradient(q)
     largest = jnp.abs(fixed).max()
@@ -84,7 +84,9 @@ def margin(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
 def copositivity(
     matrix: Any, tolerance: float | None = None, scale: float | None = None
 ) -> Copositivity:
-    """Whether Q is copositive: "yes", "no" with a violating x >= 0, or "boundary".
+    """Decide if Q is copositive: "yes", "no" with a violating x >= 0, or "boundary".
+
+    Equation: copositive is `x^T Q x >= 0` for all x >= 0: `margin(Q) >= 0`.
 
     Args:
         matrix: Q (m, m), m <= 12.
@@ -103,7 +105,7 @@ def copositivity(
     'boundary'
     """
     q = as_numbers("matrix", matrix)
-    _size(q)
+    _checked_size(q)
     check_values("tolerance", tolerance, low=0.0)
     check_values("scale", scale, low=0.0)
     value, witness = (np.asarray(part) for part in _compiled_margin(q))
@@ -116,8 +118,8 @@ def copositivity(
     return Copositivity("yes" if value > 0 else "no", float(value), witness)
 
 
-def _size(matrix: jax.Array) -> int:
-    """m, checked."""
+def _checked_size(matrix: jax.Array) -> int:
+    """Number m of rows of a square matrix, checked: 1 to `LARGEST`."""
     shape = np.shape(matrix)
     if len(shape) != 2 or shape[0] != shape[1] or shape[0] == 0:
         raise ValueError(f"Argument `matrix` must have shape (m, m), but has shape {shape}.")
@@ -133,12 +135,12 @@ _compiled_margin = jax.jit(margin)
 
 
 class Sign(NamedTuple):
-    """Whether a matrix is nonnegative; its least entry and where; the qn- that shows it."""
+    """Verdict on a condition `A >= 0`, entry by entry, on a matrix A (m, m)."""
 
     holds: bool
-    worst: float
-    where: tuple[int, int]
-    velocity: np.ndarray
+    worst: float  # least entry of A
+    where: tuple[int, int]  # its contacts: row and column, from 0
+    velocity: np.ndarray  # qn- (m,): of the approaches of one contact alone, the worst
 
 
 class MatrixAudit(NamedTuple):
@@ -164,7 +166,7 @@ class MatrixAudit(NamedTuple):
 
     @property
     def singular_values(self) -> bool:
-        """Whether the sufficient bound of Prop. 6.5 holds."""
+        """True where the sufficient bound of Prop. 6.5 holds."""
         return self.singular_value <= self.singular_value_bound
 
     @property
@@ -173,7 +175,7 @@ class MatrixAudit(NamedTuple):
         return self.kinematic.holds and self.kinetic.holds and bool(self.energetic)
 
     def __str__(self) -> str:
-        """The verdict and each proposition, a line each."""
+        """Report: the verdict, and each proposition with its numbers, a line each."""
         kinematic, kinetic, energetic = self.kinematic, self.kinetic, self.energetic
         verdict = "admissible" if self.admissible else "NOT admissible"
         lines = [f"restitution matrix: {verdict} for all pre-impact velocities qn- <= 0"]
@@ -193,9 +195,8 @@ class MatrixAudit(NamedTuple):
             "boundary": "boundary, energy never grows but is conserved",
         }[energetic.answer]
         if energetic.answer != "yes":
-            text += (
-                f" for qn- = {_row(self.worst_normal_velocity)}, v- = {_row(self.worst_velocity)}"
-            )
+            qn, v = _as_text(self.worst_normal_velocity), _as_text(self.worst_velocity)
+            text += f" for qn- = {qn}, v- = {v}"
         lines.append(f"energetic  (6.3)    G^-1 - E^T G^-1 E copositive: {text}")
         if self.spectral is None:
             text = "not applicable, E is not self-adjoint (G^-1 E not symmetric)"
@@ -235,10 +236,11 @@ def dissipation_matrix(delassus: jax.Array, matrix: jax.Array) -> jax.Array:
 def audit_matrix(scene: Scene, matrix: Any, tolerance: float | None = None) -> MatrixAudit:
     """Check the law `qn+ = -E qn-` for all pre-impact velocities `qn- <= 0` at once.
 
-    Equation: `E >= 0` (kinematic) and `G^-1 (I + E) >= 0` (kinetic), elementwise, necessary and
-    sufficient (Prop. 6.2); `Q = G^-1 - E^T G^-1 E` copositive (energetic, necessary and
-    sufficient, Prop. 6.3); where `G^-1 E` is symmetric, spectral radius `rho(E) <= 1`
-    (Prop. 6.4, for qn- of any sign); `sigma_max(E) <= 1 / sqrt(cond G)` (Prop. 6.5, sufficient).
+    Equation, with the normalized Delassus matrix G: `E >= 0` (kinematic) and `G^-1 (I + E) >= 0`
+    (kinetic), elementwise, necessary and sufficient (Prop. 6.2); `Q = G^-1 - E^T G^-1 E`
+    copositive (energetic, necessary and sufficient, Prop. 6.3); where `G^-1 E` is symmetric,
+    spectral radius `rho(E) <= 1` (Prop. 6.4, for qn- of any sign);
+    `sigma_max(E) <= 1 / sqrt(cond G)` (Prop. 6.5, sufficient).
 
     Args:
         scene: m contacts; open ones are left out, with their rows and columns of E.
@@ -278,12 +280,12 @@ def audit_matrix(scene: Scene, matrix: Any, tolerance: float | None = None) -> M
     worst = velocity_change(scene, jnp.asarray(impulse, scene.mass.dtype)) + 0.0
     worst_normal = np.array(normalized_gap_velocity(scene, worst), float)
     worst_normal[closed] = 0.0 - energetic.witness
-    skew = inverse @ e - (inverse @ e).T
+    skew = inverse @ e - (inverse @ e).T  # 0: E is self-adjoint
     self_adjoint = np.abs(skew).max() <= tolerance * max(np.abs(inverse @ e).max(), 1e-300)
     radius = float(np.abs(np.linalg.eigvals(e)).max()) if self_adjoint else None
     return MatrixAudit(
-        kinematic=_sign(e, tolerance * max(1.0, np.abs(e).max()), closed),
-        kinetic=_sign(inverse + inverse @ e, tolerance * scale, closed),
+        kinematic=_nonnegativity(e, tolerance * max(1.0, np.abs(e).max()), closed),
+        kinetic=_nonnegativity(inverse + inverse @ e, tolerance * scale, closed),
         energetic=energetic,
         worst_normal_velocity=worst_normal,
         worst_velocity=np.asarray(worst),
@@ -324,7 +326,7 @@ def carnot_energy_loss(scene: Scene, jump: Any, restitution: Any = 0.0) -> jax.A
 
 
 def _closed_delassus(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """G of the closed contacts, and which those are (m,)."""
+    """Normalized Delassus matrix G of the closed contacts, and their mask (m,)."""
     closed = np.asarray(scene.closed)
     if not closed.any():
         raise ValueError("Argument `scene` must have a closed contact, but all gaps are open.")
@@ -332,7 +334,7 @@ def _closed_delassus(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _check_independent(scene: Scene, g: np.ndarray) -> None:
-    """Raise a ValueError where the contacts of G are redundant."""
+    """Raise a ValueError if contacts are redundant: G, of the closed ones, is singular."""
     eigenvalues = np.linalg.eigvalsh(g)
     floor = _SINGULAR * np.finfo(scene.mass.dtype).eps * len(g) * eigenvalues[-1]
     if eigenvalues[0] <= floor:
@@ -343,8 +345,12 @@ def _check_independent(scene: Scene, g: np.ndarray) -> None:
         )
 
 
-def _sign(a: np.ndarray, tolerance: float, closed: np.ndarray) -> Sign:
-    """Column j of `a` is what the approach qn- = -(unit vector j) leads to."""
+def _nonnegativity(a: np.ndarray, tolerance: float, closed: np.ndarray) -> Sign:
+    """Verdict on `a >= 0`, entry by entry, of a matrix between the closed contacts.
+
+    Column j of `a` is the result (qn+ or pbar) of an approach of contact j alone, qn-_j = -1.
+    `closed` (m,) is the mask of these contacts; entries down to -`tolerance` pass.
+    """
     at = np.unravel_index(np.argmin(a), a.shape)
     contact = np.flatnonzero(closed)
     velocity = np.zeros(len(closed))
@@ -353,16 +359,16 @@ def _sign(a: np.ndarray, tolerance: float, closed: np.ndarray) -> Sign:
     return Sign(worst >= -tolerance, worst, (int(contact[at[0]]), int(contact[at[1]])), velocity)
 
 
-def _row(vector: np.ndarray) -> str:
+def _as_text(vector: np.ndarray) -> str:
     """A vector with four digits."""
     return "(" + ", ".join(f"{x:.4g}" for x in vector) + ")"
 
 
 class CoefficientAudit(NamedTuple):
-    """Result of `audit_coefficients`: whether no impact by Moreau's law can gain energy.
+    """Result of `audit_coefficients`: can an impact by Moreau's law gain energy?
 
-    `energetic` is true where none gains, else with a witness pbar >= 0, normalized impulses of an
-    impact that does. `spread` <= `spread_allowed` suffices for that.
+    `energetic` is true where none gains; else its `witness` pbar >= 0 are the normalized impulses
+    of an impact that does. `spread` <= `spread_allowed` is sufficient that none gains.
     """
 
     energetic: Copositivity
@@ -370,7 +376,7 @@ class CoefficientAudit(NamedTuple):
     spread_allowed: float
 
     def __str__(self) -> str:
-        """The verdict, and the sufficient condition."""
+        """Report: the verdict, and the sufficient condition with its numbers."""
         verdict = "no impact gains energy" if self.energetic else "some impacts GAIN energy"
         holds = "holds" if self.spread <= self.spread_allowed else "does not, which decides nothing"
         return (
@@ -380,11 +386,12 @@ class CoefficientAudit(NamedTuple):
 
 
 def audit_coefficients(scene: Scene, restitution: Any) -> CoefficientAudit:
-    """Whether Moreau's law with these e_j can gain energy in any frictionless impact.
+    """Decide if Moreau's law with coefficients e_j can gain energy in a frictionless impact.
 
     Equation: it changes the energy by `-pbar^T D G pbar / 2`, `D = diag(d_j)`,
-    `d_j = (1 - e_j) / (1 + e_j)`, and every pbar >= 0 occurs in some impact: none gains exactly
-    where the symmetric part of D G is copositive. It suffices that
+    `d_j = (1 - e_j) / (1 + e_j)`, G the normalized Delassus matrix, and every `pbar = |grad f| p`
+    >= 0 occurs in some impact: none gains exactly where the symmetric part of D G is copositive.
+    It suffices that
     `(d_max - d_min) / (d_max + d_min) <= 1 / cond(G)`. One e for all contacts never gains.
     (Poisson's law never does up to e = 1: see `Poisson`.)
 
@@ -412,10 +419,10 @@ def audit_coefficients(scene: Scene, restitution: Any) -> CoefficientAudit:
     g, closed = _closed_delassus(scene)
     each = np.broadcast_to(np.asarray(e, float), closed.shape)[closed]
     d = (1 - each) / (1 + each)
-    whole = d[:, None] * g
+    weighted = d[:, None] * g  # D G
     low, high = float(d.min()), float(d.max())
     return CoefficientAudit(
-        energetic=copositivity((whole + whole.T) / 2, scale=float(np.abs(g).max())),
+        energetic=copositivity((weighted + weighted.T) / 2, scale=float(np.abs(g).max())),
         spread=(high - low) / (high + low) if high > 0 else 0.0,
         spread_allowed=1 / float(np.linalg.cond(g)),
     )

@@ -160,19 +160,20 @@ class RockingDispersion(eqx.Module):
         return self.angular_ratio / housner_restitution(self.aspect)[:, None, None]
 
     def outcomes(self, separation_threshold: float = STAYS) -> np.ndarray:
-        """Rows of `OUTCOMES` (A, B, C): which corners leave.
+        """Classes of the impacts (A, B, C), as indices of `OUTCOMES`: which corners leave.
 
-        A corner leaves if it is faster than `separation_threshold` |gamma_B-|.
+        A corner leaves if its gamma+ > `separation_threshold` |gamma_B-|.
 
         rest: none; rocking: A only, the block goes on about B; half-rocking: B only, it turns
         back about A; free: both; unresolved: the law failed.
         """
-        leaves = np.asarray(self.gap_velocity) > separation_threshold
-        codes = leaves[..., 1] + 2 * leaves[..., 0]
-        return np.where(np.isnan(np.asarray(self.gap_velocity[..., 0])), 4, codes)
+        leaves = np.asarray(self.gap_velocity) > separation_threshold  # last axis: B, A
+        codes = leaves[..., 1] + 2 * leaves[..., 0]  # 0 none, 1 A only, 2 B only, 3 both
+        unresolved = OUTCOMES.index("unresolved")
+        return np.where(np.isnan(np.asarray(self.gap_velocity[..., 0])), unresolved, codes)
 
     def __str__(self) -> str:
-        """Numbers of outcomes for each coefficient of friction."""
+        """Report: for each mu the critical angle and the numbers of impacts of each class."""
         theta, outcomes = np.degrees(self.kinetic_angle), self.outcomes()
         lines = [
             f"rocking block, kinetic angle {theta.min():.1f} to {theta.max():.1f} degrees "
@@ -239,26 +240,46 @@ def critical_kinetic_angle(friction: Any) -> jax.Array:
     return rocking_kinetic_angle((jnp.sqrt(9 * slips**2 + 8) - 3 * slips) / 2)
 
 
-@precise_jit
-def _impacts(a: jax.Array, mu: jax.Array, e: jax.Array, law: LZB) -> tuple[jax.Array, ...]:
-    """gamma+ (n, 2), theta'+, slip+, T+ / T-, status, of all (a, mu, e), at unit width and hit."""
+class _BlockImpacts(NamedTuple):
+    """Outcomes of blocks of width 1 that turn with theta'- = -1 about A, gamma_B- = -1."""
 
-    def one(a: jax.Array, mu: jax.Array, e: jax.Array) -> tuple[jax.Array, ...]:
-        """One block of aspect a."""
+    gap_velocity: jax.Array  # gamma+ (n, 2) of B and A
+    angular_ratio: jax.Array  # theta'+ / theta'- (n,)
+    slip_velocity: jax.Array  # u+ (n,) of both corners
+    energy_ratio: jax.Array  # T+ / T- (n,)
+    status: jax.Array  # codes (n,)
+
+
+@precise_jit
+def _impacts(a: jax.Array, mu: jax.Array, e: jax.Array, law: LZB) -> _BlockImpacts:
+    """Outcomes of blocks (n,) of width 1, height a, friction mu and restitution e by a law.
+
+    The block turns about its corner A with theta'- = -1 and hits with B: v- = (a/2, -1/2, -1).
+    Values are NaN where the law fails.
+    """
+
+    def one(a: jax.Array, mu: jax.Array, e: jax.Array) -> _BlockImpacts:
+        """Outcome of one block, failures included."""
         scene = Block(jnp.ones_like(a), a, jnp.ones_like(a), corners="base").scene()
         before = jnp.stack([a / 2, jnp.full_like(a, -0.5), jnp.full_like(a, -1.0)])
         out = impact(
             eqx.tree_at(lambda x: (x.friction, x.restitution), law, (mu, e)), scene, before
         )
         after, energy = out.velocity, (before**2 * scene.mass).sum() / 2
-        slip = after[0] + a / 2 * after[2]
-        remaining = 1 + out.energy_change / energy
-        return scene.normals.T @ after, -after[2], slip, remaining, out.status
+        return _BlockImpacts(
+            gap_velocity=scene.normals.T @ after,
+            angular_ratio=-after[2],
+            slip_velocity=after[0] + a / 2 * after[2],
+            energy_ratio=1 + out.energy_change / energy,
+            status=out.status,
+        )
 
-    gamma, turns, slip, remaining, status = jax.vmap(one)(a, mu, e)
-    bad = jnp.asarray(_FAILS)[status]
-    parts = [jnp.where(bad, jnp.nan, x) for x in (turns, slip, remaining)]
-    return jnp.where(bad[:, None], jnp.nan, gamma), *parts, status
+    out = jax.vmap(one)(a, mu, e)
+    failed = jnp.asarray(_FAILS)[out.status]
+    gamma = jnp.where(failed[:, None], jnp.nan, out.gap_velocity)
+    numbers = out.angular_ratio, out.slip_velocity, out.energy_ratio
+    turn, slip, energy = (jnp.where(failed, jnp.nan, x) for x in numbers)
+    return _BlockImpacts(gamma, turn, slip, energy, out.status)
 
 
 def rocking_dispersion(
@@ -308,8 +329,8 @@ def rocking_dispersion(
     cases = jnp.meshgrid(a, mu, e, indexing="ij")
     each_a, each_mu, each_e = (x.ravel() for x in cases)
     results = _impacts(each_a, each_mu, each_e, law)
-    parts = [x.reshape(cases[0].shape + x.shape[1:]) for x in results]
-    return RockingDispersion(a, mu, e, *parts)
+    on_grid = jax.tree.map(lambda x: x.reshape(cases[0].shape + x.shape[1:]), results)
+    return RockingDispersion(a, mu, e, **on_grid._asdict())
 
 
 def search_critical_angle(
@@ -349,8 +370,8 @@ def search_critical_angle(
     for _ in range(_ZOOMS):
         a = jnp.linspace(low, high, _POINTS, axis=1)
         each_mu, each_e = (jnp.repeat(x, _POINTS) for x in (mus, es))
-        gamma = _impacts(a.reshape(-1), each_mu, each_e, law)[0]
-        size = jnp.abs(gamma[:, 1]).reshape(a.shape)
+        gamma = _impacts(a.reshape(-1), each_mu, each_e, law).gap_velocity
+        size = jnp.abs(gamma[:, 1]).reshape(a.shape)  # |d| = |gamma_A+|
         best = jnp.take_along_axis(a, jnp.nanargmin(size, axis=1)[:, None], 1)[:, 0]
         step = (high - low) / (_POINTS - 1)
         low, high = best - step, best + step
@@ -370,7 +391,10 @@ class RockingDomain(NamedTuple):
     corners: np.ndarray
 
     def contains(self, own: Any, cross: Any) -> np.ndarray:
-        """Whether entries `own` and `cross` are admissible, ends included; arrays broadcast."""
+        """True for admissible entries `own` and `cross`, ends included; arrays broadcast.
+
+        Equation: `own >= 0`, `cross >= 0`, `own + cross <= 1`, `cross >= g (1 + own)`.
+        """
         a, b = np.asarray(own, float), np.asarray(cross, float)
         inside: np.ndarray = (a >= 0) & (b >= 0) & (a + b <= 1) & (b >= self.coupling * (1 + a))
         return inside
@@ -420,6 +444,6 @@ def rocking_domain(aspect: Any, sliding: bool = True) -> RockingDomain:
     """
     a = float(as_numbers("aspect", aspect, (), "one block", low=0.0, open_low=True))
     g = (a**2 - 2) / (a**2 + 4) if sliding else float(housner_restitution(a))
-    wide = [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]
+    wide = [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]  # a, b >= 0, a + b <= 1, cut by b = g (1 + a)
     slender = [[0.0, g], [(1 - g) / (1 + g), 2 * g / (1 + g)], [0.0, 1.0]]
     return RockingDomain(a, sliding, g, np.array(wide if g <= 0 else slender))
