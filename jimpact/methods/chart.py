@@ -228,11 +228,7 @@ def work_precision(
 
     # of one name one program, which the reference shares with its own row
     different = {m.name: m for m in (exact, second, *chosen)}
-    for name in laws:
-        if name in different:
-            raise ValueError(
-                f"Argument `laws` must have names that no method has, but has {name!r}."
-            )
+    _check_names(laws, different)
     programs = {n: _method_programs(m, case, gradients, durations) for n, m in different.items()}
     programs |= {name: _law_programs(other, case) for name, other in laws.items()}
     ladders: dict[str, Any] = {m.name: m.ladder for m in chosen} | dict.fromkeys(laws, (None,))
@@ -267,6 +263,15 @@ def work_precision(
         spread=SPREAD,
         repeats=repeats,
     )
+
+
+def _check_names(laws: Mapping[str, Law], methods: Mapping[str, Contender]) -> None:
+    """Raise a ValueError where a law has the name of a method: both have a row in the chart."""
+    for name in laws:
+        if name in methods:
+            raise ValueError(
+                f"Argument `laws` must have names that no method has, but has {name!r}."
+            )
 
 
 def shared_parameters(law: LZB) -> dict[str, Any]:
