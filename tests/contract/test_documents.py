@@ -121,6 +121,20 @@ def test_docs_run(path):
         assert done.failed == 0
 
 
+def test_code_of_pages_fits_the_column():
+    """Lines of code have at most 88 characters, as many as a column of the site shows at 1280 px.
+
+    What an example prints is excepted: the program decides where its lines end.
+    """
+    for path in [ROOT / "README.md", *DOCS]:
+        for block in re.findall(r"^```.*?^```", path.read_text(encoding="utf-8"), re.M | re.S):
+            lines = block.splitlines()
+            if ">>>" in block:
+                lines = [line for line in lines if line.startswith((">>>", "..."))]
+            long = [line for line in lines if len(line) > 88]
+            assert not long, (path.name, long)
+
+
 def test_docs_name_what_exists():
     """Every `ji.name` of the texts is a public name; every path a file."""
     for path in [ROOT / "README.md", *DOCS]:
