@@ -48,6 +48,7 @@ def as_a_user_runs_them(tmp_path, monkeypatch):
     jax.config.update("jax_numpy_rank_promotion", "allow")
     jax.config.update("jax_numpy_dtype_promotion", "standard")
     yield
+    jax.config.update("jax_enable_x64", True)
     plt.close("all")
     ji.REGISTRY.clear()
     ji.REGISTRY.update(laws)
@@ -109,6 +110,8 @@ LONGEST += ("10", "11", "12", "13", "14", "15", "16", "17", "18")
 
 @pytest.mark.parametrize("path", documents(p for p in DOCS if any(code_of(p))))
 def test_docs_run(path):
+    """In single precision, JAX's default: a page whose digits need double precision sets it."""
+    jax.config.update("jax_enable_x64", False)
     blocks, prompts = code_of(path)
     space = {}
     for block in blocks:
