@@ -4,6 +4,7 @@
 # Guess: `model.jnt_type[0] == mjJNT_HINGE`, `mjJNT_HINGE == model.jnt_type[0]` and
 # `model.jnt_type[0] in (mjJNT_HINGE,)` are all True for a hinge.
 # Seen (mujoco 4.0.0, numpy 2.4): True, False, False. The array's own comparison and int() are right.
+# It costs: code that asks whether a joint is a hinge takes the other branch.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

@@ -4,7 +4,7 @@
 # Guess: with elasticity 1 a row of five balls does what a row of three does: the last ball flies off
 # with the speed of the first (Newton's cradle), as the solver takes contacts one after another.
 # Seen (pymunk 7.3.1): three balls (0, 0, 1); five balls (-1/3, 0, 0, 2/3, 2/3), with the energy kept.
-# So a law that fits three balls says nothing about five.
+# It costs: a law that was fitted to three balls of this engine is wrong for five.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

@@ -25,7 +25,8 @@ jax.config.update("jax_enable_x64", True)
 import numpy as np
 import jimpact as ji
 
-two, three, wall = ji.chain([1.0, 1.0]), ji.chain([1.0, 1.0, 1.0]), ji.chain([1.0, 1.0], wall=True)
+two, three = ji.chain([1.0, 1.0]), ji.chain([1.0, 1.0, 1.0])
+wall = ji.chain([1.0, 1.0], wall=True)
 uneven, hit = ji.chain([1.0, 2.0, 3.0]), [1.0, 0.0, 0.0]
 """
 

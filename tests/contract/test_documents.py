@@ -48,6 +48,7 @@ def as_a_user_runs_them(tmp_path, monkeypatch):
     jax.config.update("jax_numpy_rank_promotion", "allow")
     jax.config.update("jax_numpy_dtype_promotion", "standard")
     yield
+    jax.config.update("jax_enable_x64", True)
     plt.close("all")
     ji.REGISTRY.clear()
     ji.REGISTRY.update(laws)
@@ -109,6 +110,8 @@ LONGEST += ("10", "11", "12", "13", "14", "15", "16", "17", "18")
 
 @pytest.mark.parametrize("path", documents(p for p in DOCS if any(code_of(p))))
 def test_docs_run(path):
+    """In single precision, JAX's default: a page whose digits need double precision sets it."""
+    jax.config.update("jax_enable_x64", False)
     blocks, prompts = code_of(path)
     space = {}
     for block in blocks:
@@ -119,6 +122,20 @@ def test_docs_run(path):
         done = runner.summarize(verbose=False)
         assert done.attempted > 0
         assert done.failed == 0
+
+
+def test_code_of_pages_fits_the_column():
+    """Lines of code have at most 88 characters, as many as a column of the site shows at 1280 px.
+
+    What an example prints is excepted: the program decides where its lines end.
+    """
+    for path in [ROOT / "README.md", *DOCS]:
+        for block in re.findall(r"^```.*?^```", path.read_text(encoding="utf-8"), re.M | re.S):
+            lines = block.splitlines()
+            if ">>>" in block:
+                lines = [line for line in lines if line.startswith((">>>", "..."))]
+            long = [line for line in lines if len(line) > 88]
+            assert not long, (path.name, long)
 
 
 def test_docs_name_what_exists():

@@ -4,6 +4,7 @@ import re
 
 import cube
 import drops
+import figures
 import numpy as np
 import page
 import pytest
@@ -98,6 +99,24 @@ def test_scatter_of_the_cube_is_found_with_its_tails(nu):
     assert 2.5 < sizes[3] < 6 if nu == 4 else sizes[3] > 30
     for chance, share in inside.items():
         assert abs(share / 100 - chance) < 4 * np.sqrt(chance * (1 - chance) / many)
+
+
+def test_pages_name_the_command_of_their_figures():
+    """Each function of `figures.py` has its page, which names it; no page names another one."""
+    for name, made in figures.FIGURES.items():
+        text = (page.PAGE.parent / made.__doc__.split(":")[0]).read_text(encoding="utf-8")
+        assert f"`python tests/validation/figures.py {name}`" in text, name
+    pages = "".join(path.read_text(encoding="utf-8") for path in page.PAGE.parent.glob("*.md"))
+    assert {*re.findall(r"figures\.py (\w+)", pages)} <= {*figures.FIGURES}
+
+
+@pytest.mark.slow
+def test_a_figure_is_what_its_page_says(capsys):
+    """One of them, that costs least: laws fitted to the measured shot, on other strikes."""
+    figures.correlated()
+    said = capsys.readouterr().out
+    assert "[1.0, 1.0, 0.0] differ by 0.020 of the speed" in said
+    assert "[1.0, 0.0, -0.5] differ by 0.091 of the speed" in said
 
 
 def test_the_page_of_the_cube_has_its_rows():

@@ -20,6 +20,7 @@ from scipy.optimize import least_squares, minimize
 from scipy.spatial.transform import Rotation
 from scipy.special import gammaln
 from scipy.stats import f as f_distribution
+from when_written import written
 
 import jimpact as ji
 
@@ -381,7 +382,7 @@ def main(names: list[str]) -> None:
     if names:
         print(text)
     else:
-        PAGE.write_text(text, encoding="utf-8")
+        PAGE.write_text(f"{text}\n{written()}", encoding="utf-8")
         print(f"written: {PAGE}")
 
 

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import least_squares
+from when_written import written
 
 import jimpact as ji
 
@@ -427,7 +428,8 @@ def main() -> None:
     }
     counts = {"drops": len(poses), "impacts": len(rocking(poses).drop)}
     counts |= {"folds": FOLDS, "members": MEMBERS}
-    PAGE.write_text(TEXT.format(**counts, **theory, **text), encoding="utf-8")
+    page = TEXT.format(**counts, **theory, **text)
+    PAGE.write_text(f"{page}\n{written()}", encoding="utf-8")
     np.savez_compressed(NUMBERS, **curves)
     print(f"written: {PAGE}")
 

@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from when_written import written
 
 import jimpact as ji
 from jimpact.fits.solve import Solver, minimize
@@ -314,5 +315,5 @@ The data come from the fitted law, so each warning is a false alarm:
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
-    PAGE.write_text(page(int(sys.argv[1])), encoding="utf-8")
+    PAGE.write_text(f"{page(int(sys.argv[1]))}\n{written()}", encoding="utf-8")
     print(f"written: {PAGE}")

@@ -1,6 +1,6 @@
 """False alarms and power of what says that a law is not enough: `python tests/validation/which_law.py`.
 
-500 simulated sets of 12 shots of a pair of balls, 0.5 to 4 m/s, 1 cm/s noise; a minute. The table
+500 simulated sets of 12 shots of a pair of balls, 0.5 to 4 m/s, 1 cm/s noise; some ten minutes. The table
 stands in `docs/fitting_reference.md`.
 """
 
