@@ -260,7 +260,10 @@ class Lines(Deviances):
         below = np.flatnonzero(deviance <= self.limit)
         low, high = self.problem.domains[i].tolist()
         intervals = tuple(
-            (self._end(i, y, deviance, piece[0], -1), self._end(i, y, deviance, piece[-1], 1))
+            (
+                self._end(i, y, deviance, int(piece[0]), -1),
+                self._end(i, y, deviance, int(piece[-1]), 1),
+            )
             for piece in np.split(below, np.flatnonzero(np.diff(below) > 1) + 1)
         )
         is_own = np.array_equal(self.best.y, self.problem.variables.point(self.fit.value))

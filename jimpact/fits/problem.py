@@ -157,7 +157,9 @@ class FitProblem:
         problem = of_shots(law, scene, experiments, free, bounds, priors, ties)
         if problem.measurement.mixing is None:
             return problem
-        return problem.with_errors_before(outcome_at(problem, problem.start).slopes[0])
+        slopes = outcome_at(problem, problem.start).slopes
+        assert slopes is not None  # as errors are correlated by `mixing`
+        return problem.with_errors_before(slopes[0])
 
     @classmethod
     def from_observable(
