@@ -98,7 +98,7 @@ MUTATIONS = [
     Mutation("standard errors without noise", "uncertainty", "noise ** 2", "noise", ("test_fit.py::test_errors_from_the_residual_are_those_of_linear_regression",)),
     Mutation("rounding taken for the noise", "uncertainty", "minimum.sum_of_squares > problem.exact_squares", "True", ("test_fit.py::test_copies_of_a_shot_are_reported",)),
     Mutation("scaled copies are not seen", "_copies", "rows / np.where(size > 0, size, 1.0)", "rows", ("test_fit.py::test_copies_of_a_shot_are_reported",)),
-    Mutation("repeated readings taken for noise of 0", "_noise", "(whole == whole[0]).all()", "False", ("test_fit.py::test_readings_that_repeat_hide_the_noise",)),
+    Mutation("repeated readings taken for noise of 0", "_noise", "(complete == complete[0]).all()", "False", ("test_fit.py::test_readings_that_repeat_hide_the_noise",)),
     Mutation("kilometres an hour", "", "1 / 3.6", "1 / 36", ("test_experiments.py",)),
     Mutation("micrometres", "", "{'m': 1.0, 'cm': 0.01, 'mm': 0.001, 'um': 1e-06}", "{'m': 1.0, 'cm': 0.01, 'mm': 0.001, 'um': 0.001}", ("test_experiments.py::test_units_of_gaps",)),
     Mutation("the seed of a chunk", "Run._drawn", "jax.random.fold_in(key, np.uint32(task.number))", "key", ("test_montecarlo.py::test_random_parameters_velocities_and_their_analytic_moments", "test_montecarlo.py::test_each_sample_is_the_impact_of_its_gaps",)),

@@ -18,22 +18,29 @@ ROUNDING = 1e-10
 
 
 def as_covariance(value: Any, shape: tuple[int, int]) -> np.ndarray:
-    """A checked covariance of K shots of n velocities (`shape`); of all shots only if they share.
+    """The checked covariance of the errors of (v-, v+) of K shots of n velocities.
 
-    That of a shot must be positive definite, but for v- of variance 0, which are exact. That of all
-    shots may be singular: without a force v+ of an impact is v- of the next.
+    It must be positive definite for each shot, but for v- of variance 0, which are exact. That of
+    all shots may be singular: without a force v+ of an impact is v- of the next.
+
+    Args:
+        value: of each shot, or of all shots.
+        shape: (K, n).
+
+    Returns:
+        (2nK, 2nK) where errors of different shots are correlated, else (K, 2n, 2n).
     """
     check_concrete("covariance", value)
     as_float_array("covariance", value)  # raises for what are no numbers
-    # all digits, as those of an impact may be nearly those of another
+    # in double precision, as errors of one impact may be nearly those of another
     (count, n), array = shape, np.asarray(value, float)
-    each, whole = (count, 2 * n, 2 * n), (2 * n * count, 2 * n * count)
-    if array.shape == each[1:] and count == 1:
+    of_each, of_all = (count, 2 * n, 2 * n), (2 * n * count, 2 * n * count)
+    if array.shape == of_each[1:] and count == 1:
         array = array[None]
-    if array.shape not in (each, whole):
+    if array.shape not in (of_each, of_all):
         raise ValueError(
-            f"Argument `covariance` must have shape {each}, (v-, v+) of each shot, or {whole}, of "
-            f"all shots, but has shape {array.shape}."
+            f"Argument `covariance` must have shape {of_each}, (v-, v+) of each shot, or {of_all}, "
+            f"of all shots, but has shape {array.shape}."
         )
     check_values("covariance", array)
     blocks = diagonal_blocks(array, 2 * n)
@@ -48,7 +55,14 @@ def as_covariance(value: Any, shape: tuple[int, int]) -> np.ndarray:
 
 
 def _check_positive(matrix: np.ndarray, where: str, exact: np.ndarray, least: float) -> None:
-    """Raise unless symmetric and positive; `exact`: entries that may have no error."""
+    """Raise a ValueError unless a covariance is symmetric and its correlation positive definite.
+
+    Args:
+        matrix: covariance (N, N).
+        where: end of the message.
+        exact: (N,) True for entries that may have variance 0.
+        least: lowest eigenvalue of the correlation that is allowed.
+    """
     must = "Argument `covariance` must be"
     variance = np.diagonal(matrix)
     sizes = np.sqrt(np.abs(np.outer(variance, variance)))
@@ -66,7 +80,7 @@ def _check_positive(matrix: np.ndarray, where: str, exact: np.ndarray, least: fl
 
 
 def diagonal_blocks(covariance: Any, size: int) -> np.ndarray:
-    """(K, size, size): of each shot, also where the covariance is that of all."""
+    """Covariance (K, size, size) of each shot: as it is, or the blocks of (K size, K size)."""
     array = np.asarray(covariance, float)
     if array.ndim == 3:
         return array
@@ -75,7 +89,7 @@ def diagonal_blocks(covariance: Any, size: int) -> np.ndarray:
 
 
 def covariance_of(covariance: Any, shots: np.ndarray, n: int) -> np.ndarray:
-    """That of some shots (indices from 0) of n velocities."""
+    """Covariance of (v-, v+) of some shots (indices from 0) of n velocities, in the same form."""
     array = np.asarray(covariance, float)
     if array.ndim == 3:
         return array[shots]
@@ -84,7 +98,7 @@ def covariance_of(covariance: Any, shots: np.ndarray, n: int) -> np.ndarray:
 
 
 def joined_covariance(many: Sequence[Any]) -> np.ndarray:
-    """That of the shots of several sets whose errors are independent."""
+    """Covariance of the shots of several sets, one after the other, with independent errors."""
     if all(each.ndim == 3 for each in many):
         return np.concatenate(many)
     return block_diag(*(block_diag(*each) if each.ndim == 3 else each for each in many))
@@ -101,11 +115,16 @@ def moved_covariance(covariance: Any, gain: np.ndarray) -> np.ndarray:
 
 
 def whitening(covariance: np.ndarray, here: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Standard errors (K, n) of values, and what makes errors in units of these independent.
+    """Standard errors (K, n) of values, and the whitening matrices of their errors.
+
+    Equation: `L = F^-1`, F the Cholesky factor of the correlation: `L e / sigma` are independent.
 
     Args:
-        covariance: (K, n, n), or (K, n, K, n).
-        here: (K, n), whether a value takes part; others are left out as if not measured.
+        covariance: (K, n, n) of each shot, or (K, n, K, n) of all.
+        here: (K, n), True for values that take part; others count as independent, of error 1.
+
+    Returns:
+        sigma (K, n), and L in the shape of the covariance.
 
     Raises:
         ValueError: a combination of the values has no error.

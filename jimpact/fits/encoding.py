@@ -51,7 +51,10 @@ def versions() -> dict[str, str]:
 
 
 def encoded(value: Any) -> Any:
-    """What a JSON file can hold, from which `decoded` makes the value again, bit by bit."""
+    """A value as JSON data, from which `decoded` makes it again, bit by bit.
+
+    Arrays, mappings, tuples and dataclasses become dictionaries that name their kind.
+    """
     if value is None or isinstance(value, bool | str | int):
         return value
     if isinstance(value, float):
@@ -73,7 +76,7 @@ def encoded(value: Any) -> Any:
 
 
 def decoded(data: Any) -> Any:
-    """What `encoded` has encoded."""
+    """The value of data that `encoded` has made: a dictionary names the kind of its content."""
     if not isinstance(data, dict):
         return data
     if "class" in data:
@@ -96,7 +99,10 @@ def _name_of(cls: type) -> str:
 
 
 def _class_of(place: str) -> Any:
-    """The class of a name; those that a build before 0.2 gave to a module of jimpact, too."""
+    """The class of a name that `_name_of` gave: 'ji.LZB', 'Solution' or 'module:Name'.
+
+    Names of jimpact's own modules, as builds before 0.2 gave them, count without the module.
+    """
     module, _, name = place.rpartition(":")
     if module and module.partition(".")[0] != "jimpact":
         return attrgetter(name)(import_module(module))
@@ -114,9 +120,9 @@ def _saved_fields(cls: Any) -> list[str]:
 
 
 def grouped(fields: dict[str, Any], parts: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields, encoded, in which those of its parts, by name, stand in these parts.
+    """Encoded fields, with those that belong to a class in `parts` moved into a field of that name.
 
-    Older files hold them beside the others.
+    Older files hold all of them side by side.
     """
     rest, groups = dict(fields), {}
     for name, part in parts.items():
@@ -126,7 +132,10 @@ def grouped(fields: dict[str, Any], parts: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def instance_of(cls: Any, fields: dict[str, Any]) -> Any:
-    """An instance of a class with these fields, which are all that it has."""
+    """An instance of a dataclass with these encoded fields; a TypeError unless it has just these.
+
+    Fields of older files get their present names.
+    """
     if not dataclasses.is_dataclass(cls):
         raise TypeError(f"{cls!r} is no class of a law, scene or result")
     known = set(_saved_fields(cls))

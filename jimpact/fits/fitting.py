@@ -163,7 +163,7 @@ def fit(
 
 
 def _check_derivatives(problem: FitProblem, solution: Solution) -> None:
-    """Raise a ValueError where derivatives are not finite, whichever shots are left out."""
+    """Raise a ValueError if derivatives of measured values at the minimum are not finite."""
     lost = np.flatnonzero(~np.isfinite(solution.starts[0].jacobian).all(axis=1))
     if len(lost):
         at = ", ".join(f"{name} = {x:g}" for name, x in zip(problem.names, solution.value))
@@ -175,7 +175,7 @@ def _check_derivatives(problem: FitProblem, solution: Solution) -> None:
 
 
 def _without(problem: FitProblem, lost: np.ndarray) -> FitProblem:
-    """The problem without these shots (K,), which it names."""
+    """The problem without the shots where `lost` (K,) is True, whose labels go to `left_out`."""
     assert problem.experiments is not None
     labels = (problem.experiments.shots[k] for k in np.flatnonzero(lost))
     used = np.broadcast_to(~lost[:, None], problem.measured.shape).astype(float)
@@ -185,15 +185,19 @@ def _without(problem: FitProblem, lost: np.ndarray) -> FitProblem:
 def as_fit(
     problem: FitProblem, solution: Solution, search: Search, robust: float | None = None
 ) -> Fit[Any]:
-    """The fit at the end of a search, with its errors.
+    """The `Fit` of a solution, with its errors.
 
-    `robust`: noise times the root of the degrees of freedom, of a loss that outliers move little.
+    Args:
+        problem: that was solved.
+        solution: its minima.
+        search: options of the search.
+        robust: noise times the root of the degrees of freedom after a robust loss, or None.
     """
     judged = Judged(replace(problem, scene=problem.to_scene(solution.value)), solution, robust)
     errors = judged.errors
     starts, limit = [], solution.starts[0].sum_of_squares + HARDLY_WORSE * errors.noise**2
     for end in solution.starts:
-        matters = not end.sum_of_squares > limit  # also where the noise is not known
+        matters = not end.sum_of_squares > limit  # also where the noise is NaN
         error = uncertainty(problem, end, errors.noise).standard_error if matters else None
         starts.append(FitMinimum(end.sum_of_squares, end.value, end.count, error))
     return Fit(
@@ -276,7 +280,7 @@ def fit_many(
         only_shots = same and data.scenes is None and data.sigma_pre is None
         other = first.of_other(data, scene) if only_shots else of_shots(law, scene, data, *choice)
         problems.append(other)
-    each: dict[int, Ends] = {}  # where its starts ended
+    each: dict[int, Ends] = {}  # of the starts of a data set
     with progress_bar(progress) as show:
         for members in _alike(problems):
             first = problems[members[0]]
@@ -291,7 +295,7 @@ def fit_many(
 
     @functools.cache
     def made(k: int) -> Fit[AnyLaw]:
-        """The fit of one; shots that cannot be used are left out in a new one."""
+        """The `Fit` of data set k; if it has unusable shots, fitted anew without these."""
         solution = solution_of(problems[k], each[k])
         search = Search(seed=seed, max_steps=max_steps, progress=False)
         if unusable(problems[k], solution).any():
@@ -306,7 +310,7 @@ def fit_many(
 
 
 def _alike(problems: Sequence[FitProblem]) -> list[list[int]]:
-    """Problems that share one program: their arrays have the same shapes."""
+    """Indices of problems, grouped by the shapes of their arrays: a group shares one program."""
     groups: dict[Any, list[int]] = {}
     for k, problem in enumerate(problems):
         leaves, structure = jax.tree.flatten(problem.for_compiled())
@@ -398,7 +402,8 @@ def bootstrap(
     z = np.random.default_rng(seed).normal(size=(samples, *fit.predicted.shape))
     errors = problem.measurement.errors_of(fit.noise * np.moveaxis(z, 0, -1))
     measured = fit.predicted + np.moveaxis(errors, -1, 0)
-    means = np.tile(problem.prior_mean, (samples, 1))  # as if they had been measured anew
+    # means of priors are drawn, too, as if they had been measured again
+    means = np.tile(problem.prior_mean, (samples, 1))
     z = np.random.default_rng((seed, 1)).normal(size=(samples, len(problem.priors)))
     for prior, drawn in zip(problem.priors, z.T):
         i = prior.parameter
@@ -445,7 +450,7 @@ def leave_one_out(fit: Fit, *, workers: int | None = None, progress: float | Non
 def _refits(
     fit: Fit, problems: list[FitProblem], workers: int | None, progress: float | None
 ) -> Refits:
-    """Minima of these problems next to a fit."""
+    """`Refits` of B problems of changed data, each from the parameters of the fit."""
     points = np.tile(fit.problem.variables.point(fit.value), (len(problems), 1))
     with progress_bar(progress) as show:
         solver = Solver(show=show, workers=workers)

@@ -3,10 +3,14 @@
 The set `{E : E >= 0, G^-1 (I + E) >= 0, G^-1 - E^T G^-1 E copositive}` is convex (each x >= 0
 asks `|E x| <= |x|` in the norm of G^-1). Residuals are linear in E, so a fit goes where it likes
 and then to the admissible matrix of the least sum of squares.
+
+Axes: S scenes, m contacts, Q variables y of the solver, F = 2^m - 1 faces (supports) of the cone of
+approaches x >= 0, C conditions `slack(y) >= 0`. G is the Delassus matrix in units of
+`kinetic_norm`.
 """
 
 from itertools import product
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -42,13 +46,24 @@ _WORST = 2  # new cuts of each scene and contact
 _FACES = ("E >= 0", "G^-1 (I + E) >= 0", "G^-1 - E^T G^-1 E copositive (energy)")
 
 
-_Share = tuple[jax.Array, jax.Array, jax.Array]  # of the way, whether it fell, passes
-# z, slacks at y and derivatives of the cuts that hold it, whether to go on, steps
-_Nearest = tuple[jax.Array, tuple[jax.Array, jax.Array], jax.Array, jax.Array]
+_Share = tuple[jax.Array, jax.Array, jax.Array]  # share of the way, True if it fell, passes
+
+
+class _Cut(NamedTuple):
+    """State of a search by cutting planes: the point z (Q,), and the active cuts that hold it.
+
+    `slacks` (Q,) are those of the cuts at the first point y, `slopes` (Q, Q) their derivatives.
+    """
+
+    z: jax.Array
+    slacks: jax.Array
+    slopes: jax.Array
+    goes_on: jax.Array
+    steps: jax.Array
 
 
 class AdmissibleMatrices(eqx.Module):
-    """The y whose matrix `E = origin + map y` is admissible in S scenes and inside its bounds.
+    """The set of y whose matrix `E = origin + map y` is admissible in S scenes and within bounds.
 
     Source: Brogliato, Nonsmooth Mechanics (2016), Prop. 6.2 and 6.3.
     """
@@ -61,15 +76,15 @@ class AdmissibleMatrices(eqx.Module):
     center: jax.Array  # y strictly inside
 
     def matrices(self, y: jax.Array) -> jax.Array:
-        """E (S, m, m), with zeros for open contacts."""
+        """`E = origin + map y` (S, m, m) of each scene, with zeros for open contacts."""
         m = self.closed.shape[1]
         e = (self.origin + self.map @ y).reshape(m, m)
         return e[None] * (self.closed[:, :, None] * self.closed[:, None, :])
 
     def elementwise(self, y: jax.Array) -> jax.Array:
-        """All that must be >= 0 and is linear in y: E, impulses, distances from the bounds.
+        """Slacks of the conditions linear in y: `E`, `G^-1 (I + E)`, `y - low`, `high - y`.
 
-        1 where there is no bound.
+        They must be >= 0; 1 where there is no bound.
         """
         e = self.matrices(y)
         identity = jnp.eye(e.shape[1], dtype=e.dtype)[None]
@@ -87,14 +102,17 @@ class AdmissibleMatrices(eqx.Module):
         return scenes * (2**m - 1)
 
     def worst(self, y: jax.Array) -> jax.Array:
-        """Approaches x >= 0 (S, F, m) among which each face has that of the least lost energy.
+        """Approaches x >= 0 (S, F, m) of length 1, one for each face, that lose the least energy.
 
-        The minimizer with a given support is an eigenvector of the smallest eigenvalue there
-        (see `jimpact.theory.restitution_matrices`); the others are valid approaches all the same.
+        On each face, of the approaches with a given support, the minimizer of `x^T Q x` with `Q =
+        G^-1 - E^T G^-1 E` is an eigenvector of the smallest eigenvalue of that block of Q, if it
+        is positive (see `jimpact.theory.restitution_matrices`). Otherwise its positive part is an
+        approach all the same, with a condition of its own.
         """
         m = self.closed.shape[1]
         q = self._dissipation(y)
-        faces = jnp.asarray(list(product((0, 1), repeat=m))[1:], q.dtype)
+        faces = jnp.asarray(list(product((0, 1), repeat=m))[1:], q.dtype)  # (F, m) supports
+        # larger than all eigenvalues: contacts outside of the support do not take part
         above = (m + 1.0) * (jnp.abs(q).max() + jnp.abs(self.inverse).max())
         inside = faces[:, :, None] * faces[:, None, :]
         outside = above * (1 - faces)[:, :, None] * jnp.eye(m, dtype=q.dtype)[None]
@@ -115,7 +133,8 @@ class AdmissibleMatrices(eqx.Module):
         """The admissible z of the least `g^T (z - y) + (z - y)^T H (z - y) / 2`.
 
         By cutting planes: conditions on the energy are concave, so that they lie below all their
-        tangents. Those at the last z, the worst ones, join those that hold this z.
+        tangents. Each step solves the quadratic program with the linear conditions, the cuts that
+        were active before, and the tangents at z of the conditions that are violated most.
         """
         size, dtype = y.shape[0], y.dtype
         largest = jnp.max(jnp.diagonal(hessian))
@@ -127,46 +146,55 @@ class AdmissibleMatrices(eqx.Module):
         linear = slack[:first], rows[:first]
         worst = min(len(slack) - first, _WORST * self.closed.size)
 
-        def closer(state: _Nearest) -> _Nearest:
-            """One step."""
-            z, held, _, step = state
+        def add_cuts(state: _Cut) -> _Cut:
+            """Cut at z, solve the quadratic program, and keep the cuts of the largest multipliers.
+
+            It ends where z satisfies all conditions on the energy: it is then the best of a set
+            that contains the admissible one.
+            """
+            z = state.z
             energy, tangent = (x[first:] for x in self.conditions(z))
             which = jnp.argsort(energy)[:worst]
-            new = energy[which] + tangent[which] @ (y - z), tangent[which]
-            slacks, slopes = (jnp.concatenate(parts) for parts in zip(linear, held, new))
-            move, pressure, solved = _quadratic(hessian, gradient, slacks, slopes)
-            holding = first + jnp.argsort(-pressure[first:])[:size]
-            held = slacks[holding], slopes[holding]
-            inside = (energy.min() >= -rounding) & (step > 0)  # the best of a larger set
+            new = energy[which] + tangent[which] @ (y - z), tangent[which]  # the tangents at y
+            parts = zip(linear, (state.slacks, state.slopes), new)
+            slacks, slopes = map(jnp.concatenate, parts)
+            move, multipliers, solved = _quadratic(hessian, gradient, slacks, slopes)
+            active = first + jnp.argsort(-multipliers[first:])[:size]
+            inside = (energy.min() >= -rounding) & (state.steps > 0)
             goes_on = solved & ~inside
-            return jnp.where(goes_on, y + move, z), held, goes_on, step + 1
+            z = jnp.where(goes_on, y + move, z)
+            return _Cut(z, slacks[active], slopes[active], goes_on, state.steps + 1)
 
-        none = jnp.ones(size, dtype), jnp.zeros((size, size), dtype)
-        start = (y, none, jnp.asarray(True), jnp.asarray(0))
-        end = jax.lax.while_loop(lambda s: s[2] & (s[3] < _CUTS), closer, start)
+        no_cuts = jnp.ones(size, dtype), jnp.zeros((size, size), dtype)
+        start = _Cut(y, *no_cuts, jnp.asarray(True), jnp.asarray(0))
+        z = jax.lax.while_loop(lambda s: s.goes_on & (s.steps < _CUTS), add_cuts, start).z
         # cutting planes leave rounding
-        share = self.share(end[0])
-        inside = self.center + (1 - _SHORT * jnp.finfo(dtype).eps) * share * (end[0] - self.center)
-        return jnp.where(share < 1, inside, end[0])
+        share = self.share(z)
+        inside = self.center + (1 - _SHORT * jnp.finfo(dtype).eps) * share * (z - self.center)
+        return jnp.where(share < 1, inside, z)
 
     def share(self, y: jax.Array) -> jax.Array:
-        """How much of the way from the center to y is admissible, at most 1."""
+        """The largest s <= 1 (), with which `center + s (y - center)` is admissible."""
         slack, target = self.elementwise(self.center), self.elementwise(y)
-        crossed = (target < 0) & (target < slack)  # others, y does not change
+        crossed = (target < 0) & (target < slack)  # the others do not change along the ray
         share = jnp.where(crossed, slack / jnp.where(crossed, slack - target, 1.0), 1.0).min()
 
-        def closer(state: _Share) -> _Share:
-            """The share after one more look at the worst approaches."""
+        def shortened(state: _Share) -> _Share:
+            """The share at which no approach that is worst at the last share gains energy."""
             share, _, passes = state
             x = self.worst(self.center + share * (y - self.center))
             nearer = jnp.minimum(share, self._energy_share(y, x).min())
             return nearer, nearer < share, passes + 1
 
         first = (share, jnp.asarray(True), jnp.asarray(0))
-        return jax.lax.while_loop(lambda s: s[1] & (s[2] < _SCALINGS), closer, first)[0]
+        return jax.lax.while_loop(lambda s: s[1] & (s[2] < _SCALINGS), shortened, first)[0]
 
     def _energy_share(self, y: jax.Array, x: jax.Array) -> jax.Array:
-        """Where on the ray the energy ratio of approaches x reaches 1; above the true end."""
+        """Shares s (S, F) of the ray at which `|E(s) x| = |x|`, of approaches x (S, F, m).
+
+        Equation: `E(s) x = u + s w`, u = E(center) x, w = E(y) x - u, in the norm of G^-1: the
+        positive root of `|w|^2 s^2 + 2 (u, w) s = |x|^2 - |u|^2`; inf where there is none.
+        """
         start = jnp.einsum("sij,sfj->sfi", self.matrices(self.center), x)
         rate = jnp.einsum("sij,sfj->sfi", self.matrices(y), x) - start
         a, b = _square(self.inverse, rate), jnp.einsum("sfi,sij,sfj->sf", start, self.inverse, rate)
@@ -177,11 +205,15 @@ class AdmissibleMatrices(eqx.Module):
         return jnp.where(below > 0, above / jnp.where(below > 0, below, 1.0), jnp.inf)
 
     def conditions(self, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Slacks (C,), >= 0 but for rounding, of all conditions, and their derivatives (C, Q)."""
-        x = self.worst(y)  # at qn- = -x the energy lost is x^T Q x / 2
+        """Slacks (C,) of all conditions, >= 0 where admissible, and their derivatives (C, Q).
+
+        First those of `elementwise`, then `x^T Q x` of the worst approach on each face, twice the
+        energy that is lost, with `Q = G^-1 - E^T G^-1 E`.
+        """
+        x = self.worst(y)
 
         def slacks(y: jax.Array) -> tuple[jax.Array, jax.Array]:
-            """Slacks, to be differentiated, and once more as they are."""
+            """The slacks (C,) at y, to be differentiated, and again as they are."""
             lost = _square(self._dissipation(y), x)
             value = jnp.concatenate([self.elementwise(y), lost.reshape(-1)])
             return value, value
@@ -193,7 +225,14 @@ class AdmissibleMatrices(eqx.Module):
 def _quadratic(
     hessian: jax.Array, gradient: jax.Array, slack: jax.Array, rows: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """`min d^T H d / 2 + g^T d` with `slack + A d >= 0`: d, multipliers, whether solved."""
+    """Solve `min d^T H d / 2 + g^T d` with `slack + A d >= 0` by its dual problem, an LCP.
+
+    Equation: `0 <= l  perp  A H^-1 A^T l + slack - A H^-1 g >= 0`, `d = H^-1 (A^T l - g)`; the rows
+    of A are scaled to length 1.
+
+    Returns:
+        d (Q,), the multipliers l (C,), True if the LCP is solved.
+    """
     length = jnp.sqrt(jnp.sum(rows**2, axis=1))
     depends = length > _FLAT * length.max()  # others are rounding
     scale = jnp.where(depends, 1 / jnp.where(depends, length, 1.0), 0.0)
@@ -207,14 +246,21 @@ def _quadratic(
 
 
 def _square(a: jax.Array, x: jax.Array) -> jax.Array:
-    """`x^T A x` of x (S, F, m)."""
+    """`x^T A x` (S, F) of x (S, F, m) with A (S, m, m)."""
     return jnp.einsum("sfi,sij,sfj->sf", x, a, x)
 
 
 def matrix_region(
     law: Law, scenes: list[Scene], variables: Variables, start: np.ndarray, ties: Ties
 ) -> AdmissibleMatrices | None:
-    """The y whose (m, m) `RestitutionMatrix` is admissible in each scene; None for other laws.
+    """The set of y whose `RestitutionMatrix` is admissible in each scene; None for other laws.
+
+    Args:
+        law: at its start values.
+        scenes: with m contacts each.
+        variables: y of the fit.
+        start: (P,) start values, which must be admissible.
+        ties: of the fit.
 
     Raises:
         ValueError: redundant contacts, too many contacts, a start that is not admissible, fixed
@@ -225,6 +271,7 @@ def matrix_region(
     if any(tie.field == "matrix" for tie in ties):
         raise ValueError("Argument `ties` must not tie a `matrix` that has to stay admissible.")
     owner = variables.owner
+    # E = origin + moves y: each entry moves with the variable that owns it
     moves = np.where(owner[:, None] == np.arange(len(owner)), variables.scale, 0.0)
     origin, start = np.where(owner < 0, variables.fixed, 0.0), variables.point(start)
     bounds = np.stack([variables.low, variables.high])
@@ -282,7 +329,7 @@ def _region(
     bounds: np.ndarray | None,
     center: np.ndarray,
 ) -> AdmissibleMatrices:
-    """The region of these scenes; the conditions of equal ones count once."""
+    """The admissible set of `E = origin + mix y` in these scenes; of equal ones only one counts."""
     m = scenes[0].contacts
     if m > LARGEST:
         raise ValueError(
@@ -300,7 +347,10 @@ def encloses(law: Law, contacts: int) -> bool:
 
 
 def _inverse(scene: Scene) -> np.ndarray:
-    """G^-1 with a further row that marks closed contacts."""
+    """G^-1 (m, m) and one more row: 1 for closed contacts, 0 for open ones, which are decoupled.
+
+    Equation: `G_ij = W_ij / (s_i s_j)`, W the Delassus matrix, s the `kinetic_norm`.
+    """
     w = decoupled(delassus_matrix(scene), scene.closed)
     g = np.asarray(as_matrix(scaled(w, 1 / kinetic_norm(scene))))
     smallest = np.linalg.eigvalsh(g)[0]
@@ -317,13 +367,13 @@ _conditions = quick_jit(AdmissibleMatrices.conditions)
 
 
 def _host_conditions(region: AdmissibleMatrices, y: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Slacks and their derivatives on the host."""
+    """`AdmissibleMatrices.conditions` on the host, in double precision."""
     slack, rows = _conditions(region, jnp.asarray(y, region.center.dtype))
     return np.asarray(slack, float), np.asarray(rows, float)
 
 
 def _kinds(region: AdmissibleMatrices) -> tuple[slice, slice, slice]:
-    """Where the conditions named in `_FACES` are in a list of all."""
+    """Slices of the list of all conditions for each kind in `_FACES`, in their order."""
     entries = len(region.origin)
     impulses = entries * (1 + len(region.inverse))
     return slice(entries), slice(entries, impulses), slice(-region.faces, None)
@@ -335,22 +385,22 @@ def _rounding(region: AdmissibleMatrices) -> float:
 
 
 def _inner_point(region: AdmissibleMatrices, start: np.ndarray) -> np.ndarray | None:
-    """y near the start, from which all conditions are half as far as possible, or farther.
+    """A y near the start whose least slack is at least half of the largest possible; None: none.
 
-    By cutting planes: the least condition, concave in y, lies below all tangents so far, and the
-    next y is where these leave most. None: there is no such y.
+    Kelley's cutting planes: the least slack is concave in y, so it lies below all tangents so far;
+    the next y maximizes t under these (a linear program), in a box of 1 around the start.
     """
     from scipy.optimize import linprog  # late: slow to import
 
     free = np.any(np.asarray(region.map) != 0, axis=0)
     box = [*((x - moves, x + moves) for x, moves in zip(start, free)), (None, 1.0)]
-    y, most, planes = start, np.inf, np.zeros((0, len(start) + 2))
+    y, most, planes = start, np.inf, np.zeros((0, len(start) + 2))  # rows: A, 1 of t, right side
     for _ in range(_CUTS):
         slack, rows = _host_conditions(region, y)
         moving = np.any(rows[:, free] != 0, axis=1)
         if slack[moving].min() > max(0.5 * most, _rounding(region)):
             return y
-        # t <= slack + rows (z - y)
+        # t <= slack + rows (z - y) for the next point z
         new = np.column_stack([-rows, np.ones(len(rows)), slack - rows @ y])[moving]
         planes = np.vstack([planes, new])
         cost = np.append(np.zeros(len(start)), -1.0)
@@ -362,7 +412,7 @@ def _inner_point(region: AdmissibleMatrices, start: np.ndarray) -> np.ndarray | 
 
 
 def boundary(region: AdmissibleMatrices | None, y: np.ndarray) -> tuple[str, ...]:
-    """The conditions that the E of y is at the edge of (other than by fixed entries), in words."""
+    """Names of the admissibility conditions that are active at y, other than by fixed entries."""
     if region is None:
         return ()
     slack, rows = _host_conditions(region, y)

@@ -59,7 +59,7 @@ class Measurement:
     @property
     def here(self) -> Bool[np.ndarray, "*value"]:
         """True where a value was measured."""
-        return ~np.isnan(self.value)
+        return np.asarray(~np.isnan(self.value))
 
     def residual(self, prediction: Prediction) -> Float[Array, " R"]:
         """`L (predicted - value) / sigma` of R values; 0 where no value was measured.

@@ -85,7 +85,7 @@ def posterior(
     inner = None if problem.matrix is None else _Inner(problem, problem.matrix)
 
     def model() -> None:
-        """The model that numpyro samples."""
+        """Sample x from the priors, and add the log density of the data: numpyro's model."""
         if inner is None:
             x = jnp.stack([numpyro.sample(name, prior) for name, prior in each.items()])
         else:
@@ -127,7 +127,7 @@ def posterior(
 
 
 def _arviz() -> Any:
-    """ArviZ; one whose results are built in another way is refused before anything is sampled."""
+    """The module arviz; an ImportError if it is missing or too new, before anything is sampled."""
     arviz = needed("arviz", HOW)
     if int(arviz.__version__.split(".")[0]) >= TOO_NEW:
         raise ImportError(
@@ -137,10 +137,10 @@ def _arviz() -> Any:
 
 
 def _drawn(sampler: Any, seed: int, shown: bool) -> tuple[Any, Any]:
-    """Draws by name, and what numpyro's `sampler` says of them; each (chains, samples)."""
+    """Draws by name, and the sampler's fields such as 'diverging'; each (chains, samples)."""
 
     def drawn(key: jax.Array) -> tuple[Any, Any]:
-        """Both of them."""
+        """Run the sampler with a random key: draws and fields."""
         sampler.run(key)
         return sampler.get_samples(True), sampler.get_extra_fields(True)
 
@@ -151,30 +151,37 @@ def _drawn(sampler: Any, seed: int, shown: bool) -> tuple[Any, Any]:
 
 
 class _Inner:
-    """All admissible matrices as the space of z (P,), and how volumes change on the way."""
+    """The map of z in R^P onto the admissible matrices: `y = y_0 + L(d) tanh(|z| / L(d)) d`.
+
+    d = z / |z|, y_0 is the center of the region, L(d) how far it reaches from there.
+    """
 
     def __init__(self, problem: FitProblem, region: Any):
         self.problem, self.region, self.count = problem, region, len(problem.names)
         self.reach = jax.jit(self._reach)
 
     def _reach(self, direction: jax.Array) -> jax.Array:
-        """L: how far the region reaches from its center."""
+        """L (): how far the region reaches from its center in a direction (P,) of length 1."""
         ahead = jnp.zeros_like(self.region.center).at[: self.count].set(_AFAR * direction)
         return _AFAR * self.region.share(self.region.center + ahead)
 
     def values(self, z: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """x (P,) of z, and the logarithm of the determinant of dx/dz, up to a constant."""
+        """x (P,) of z, and the logarithm of the determinant of dx/dz, up to a constant.
+
+        Equation: with r = |z|, m = L tanh(r / L): `det = dm/dr (m / r)^(P - 1)`, `dm/dr = 1 /
+        cosh(r / L)^2`; the dependence of L on d does not change it.
+        """
         r = jnp.sqrt(jnp.sum(z**2) + jnp.finfo(z.dtype).tiny)
         reach = self.reach(z / r)
         move = reach * jnp.tanh(r / reach)
         y = self.region.center.at[: self.count].add(move * z / r)
         x = y[: self.count] * self.problem.variables.scale[: self.count]
-        # of dmove/dr = 1 / cosh^2, in a form that does not overflow
+        # log(1 / cosh^2), in a form that does not overflow
         slope = -2 * (jnp.logaddexp(r / reach, -r / reach) - jnp.log(2.0))
         return x, slope + (self.count - 1) * jnp.log(move / r)
 
     def free(self, start: np.ndarray) -> jax.Array:
-        """z of values x, a little inside."""
+        """z (P,) of values x: `|z| = L artanh(|y - y_0| / L)`, at most `1 - _INSIDE` of the way."""
         move = (jnp.asarray(self.problem.variables.point(start)) - self.region.center)[: self.count]
         size = jnp.linalg.norm(move)
         if size == 0:
@@ -184,14 +191,17 @@ class _Inner:
 
 
 def _inside(start: np.ndarray, domains: np.ndarray) -> np.ndarray:
-    """The start moved away from the ends of the domains."""
+    """The start (P,), at least the share `_INSIDE` of the width from the ends of `domains`."""
     low, high = domains.T
     width = np.where(np.isfinite(high - low), high - low, np.maximum(np.abs(start), 1.0))
     return np.clip(start, low + _INSIDE * width, high - _INSIDE * width)
 
 
 def _priors(problem: FitProblem, chosen_priors: dict[str, Any], kinds: Any) -> dict[str, Any]:
-    """A distribution of numpyro a parameter: chosen, or of the fit, or flat."""
+    """The numpyro distribution of each parameter, by name: chosen, or that of the fit, or flat.
+
+    `kinds` is the module `numpyro.distributions`.
+    """
     parameters, priors = problem.parameters, {}
     own = {i: Normal(mean, std) for i, mean, std in problem.priors}
     for i, (name, field) in enumerate(zip(problem.names, parameters.of_fields)):
@@ -204,7 +214,13 @@ def _priors(problem: FitProblem, chosen_priors: dict[str, Any], kinds: Any) -> d
 
 
 def _prior(name: str, chosen: Any, low: float, high: float, log: bool, kinds: Any) -> Any:
-    """The numpyro distribution of one parameter."""
+    """The numpyro distribution of one parameter in its domain [low, high].
+
+    Flat where none is chosen (`log`: in the logarithm); the normal one is truncated to the domain.
+
+    Raises:
+        ValueError: a distribution that reaches beyond the domain, or of another kind.
+    """
     if chosen is None:
         if np.isfinite([low, high]).all():
             return kinds.LogUniform(low, high) if log else kinds.Uniform(low, high)
@@ -240,7 +256,7 @@ def _prior(name: str, chosen: Any, low: float, high: float, log: bool, kinds: An
 
 
 def _warn(draws: Any, arviz: Any) -> None:
-    """Say where the draws are not to be trusted."""
+    """Warn of transitions that diverged, and of chains that disagree (r-hat above `MIXED`)."""
     diverging = int(np.asarray(draws.sample_stats["diverging"]).sum())
     if diverging:
         warnings.warn(

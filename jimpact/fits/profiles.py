@@ -17,7 +17,7 @@ _BEYOND = 1.3  # how far a contour's picture goes, in half-widths of the region 
 
 
 def _check_profiled(fit: Fit, level: float, points: int) -> None:
-    """Raise an error unless these are arguments of profiles or contours of a fit."""
+    """Raise an error unless the fit can be profiled, and level and points are in their ranges."""
     check_level(level)
     as_whole("points", points, 3)
     check_kind("fit", fit, Fit)
