@@ -97,8 +97,8 @@ class Experiments(eqx.Module):
         resolution: Any = None,
         covariance: Any = None,
     ):
-        self.pre = _as_rows("pre", pre)
-        self.post = _as_rows("post", post)
+        """Check and convert the arguments; resolution and covariance determine sigma."""
+        self.pre, self.post = _as_rows("pre", pre), _as_rows("post", post)
         if self.pre.shape != self.post.shape:
             raise ValueError(
                 "Arguments `pre` and `post` must have the same shape, "
@@ -204,7 +204,7 @@ class Experiments(eqx.Module):
         return _filled([m @ (post - pre) for m, pre, post in self.balances(scene)])
 
     def momentum_ratio(self, scene: Scene | None = None) -> np.ndarray:
-        """`C^T M v+ / C^T M v-` (K, c), see `momentum_excess`; inf or NaN where none was before."""
+        """`C^T M v+ / C^T M v-` (K, c) in a scene, see `momentum_excess`; inf or NaN over 0."""
         rows = []
         with np.errstate(divide="ignore", invalid="ignore"):
             for m, pre, post in self.balances(scene):
@@ -358,7 +358,7 @@ class Experiments(eqx.Module):
         return np.array(self.each(None, lambda scene: scene.contacts))
 
     def approach_speed(self, scene: Scene | None = None) -> np.ndarray:
-        """Largest approach speed `max(0, -N^T v-)` (K,) of the closed contacts of a shot [m/s].
+        """Largest approach speed `max(0, -N^T v-)` (K,) of closed contacts of the scene [m/s].
 
         >>> import jimpact as ji
         >>> data = ji.Experiments(pre=[1.0, 0.25], post=[0.2, 0.9])
@@ -370,7 +370,7 @@ class Experiments(eqx.Module):
         return np.array([max(-gamma.min(initial=0.0), 0.0) for gamma in rates])
 
     def natural_errors(self, scene: Scene | None = None) -> np.ndarray:
-        """Errors (n,) of equal weight: 1 m/s, and those rad/s that have as much kinetic energy.
+        """Errors (n,) of equal weight in a scene: 1 m/s, and those rad/s of as much energy.
 
         Equation: `sqrt(mean M_ii of the velocities in m/s / mean M_ii of those in rad/s)`.
         """

@@ -87,6 +87,10 @@ class DataBalances:
     def __init__(
         self, experiments: Experiments, scene: Scene | None, stored_energy: float, uses_gaps: bool
     ):
+        """Compute the balances of all shots; arguments as of the class.
+
+        Momentum: excess `C^T M (v+ - v-)`, scale `sum |m v-|`. Energy: `T+ - T- - stored_energy`.
+        """
         self.experiments, self.scene = experiments, scene
         self.stored_energy, self.uses_gaps = stored_energy, uses_gaps
         self.total = len(experiments.shots)

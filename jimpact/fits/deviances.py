@@ -85,6 +85,7 @@ class Deviances:
     """
 
     def __init__(self, fit: Estimate[Any], limit: float, show: Show):
+        """Start from the minima of the fit; `limit` is a deviance, `show` displays progress."""
         self.fit, self.problem, self.limit, self.show = fit, fit.problem, limit, show
         has_noise = np.isfinite(fit.noise) and fit.noise > 0
         # of an exact fit: that of rounding
@@ -329,7 +330,7 @@ class Lines(Deviances):
         )
 
     def _end(self, i: int, y: np.ndarray, deviance: np.ndarray, k: int, step: int) -> float:
-        """Where the deviance D passes the limit beyond the k-th value; else the domain's end.
+        """End of an interval: where the deviance D passes the limit, or the end of the domain.
 
         By linear interpolation of sqrt(D) between the values k and k + step.
 

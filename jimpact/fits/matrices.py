@@ -342,7 +342,7 @@ def _region(
 
 
 def encloses(law: Law, contacts: int) -> bool:
-    """Whether a fit keeps this law's matrix admissible."""
+    """True if a fit keeps the matrix of this law admissible."""
     return isinstance(law, RestitutionMatrix) and law.admissible and law.matrix.shape[0] == contacts
 
 

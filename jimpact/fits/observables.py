@@ -34,7 +34,7 @@ _CONTACT = jax.jit(contact_of)  # remembers the shapes that it has seen; only th
 
 
 class Prediction(NamedTuple):
-    """What a law predicts: values, where they are meaningless, and status codes (S,)."""
+    """Predictions of a law: values, `bad` where they are meaningless, and status codes (S,)."""
 
     value: jax.Array
     bad: jax.Array

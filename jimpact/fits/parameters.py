@@ -503,7 +503,7 @@ class LawInScene(Law):
     tilt: OptionalValues = parameter(low=-np.pi, high=np.pi, default=None)
 
     def impulses(self, contact: Contact) -> Impulses:
-        """Those of the law, in a contact of a scene with these parts."""
+        """Impulses of the law, in a contact of a scene with these parts."""
         return self.law.impulses(contact)
 
     def in_scene(self, scene: Scene) -> Scene:

@@ -34,7 +34,7 @@ class LawInMotion(Law):
     floor: OptionalValues = parameter(per_contact=False, default=None)
 
     def impulses(self, contact: Contact) -> Impulses:
-        """Those of the law."""
+        """Impulses of the law."""
         return self.law.impulses(contact)
 
     def in_system(self, system: System) -> System:

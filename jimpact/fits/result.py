@@ -82,7 +82,7 @@ class Predicted(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
-    """What `fit` finds, in numbers: see `Fit`, which can be printed and saved.
+    """The result of `fit` in numbers; see `Fit`, which can be printed and saved.
 
     Findings and profiles are computed when they are asked for.
     """
@@ -133,7 +133,7 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What is wrong with data or fit, in words."""
+        """The sentences of the findings."""
         return tuple(each.line for each in self.findings if each.line)
 
     @property
@@ -169,7 +169,7 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
 
     @property
     def from_prior(self) -> np.ndarray:
-        """True (P,) for parameters known by their priors alone: the data hardly reduce the error."""
+        """True (P,) for parameters known by their priors alone: data hardly reduce their errors."""
         std = np.full(len(self.names), np.inf)
         for prior in self.problem.priors:
             std[prior.parameter] = prior.std
@@ -316,5 +316,5 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
 
     @property
     def shows_lack_of_fit(self) -> bool:
-        """Whether a test rejects the law."""
+        """True if a test rejects the law."""
         return self.found("lack_of_fit")

@@ -187,9 +187,9 @@ def solution_of(
     """
     counts = np.ones(len(ends.y), int) if counts is None else counts
     count, measured = len(problem.names), problem.measured
-    # rows of the residual: measured values, copies that fill up the shots, Q priors; those in use
+    # a residual has R rows: measured values, copies that fill up the shots, Q priors; those in use
     first_prior = ends.residual.shape[1] - len(problem.variables.low)
-    own = [*range(measured.size), *(first_prior + prior.parameter for prior in problem.priors)]
+    used = [*range(measured.size), *(first_prior + prior.parameter for prior in problem.priors)]
     groups, minima = _groups(problem, ends), []
     best = groups[0][0]
     end = ends.rows(best)
@@ -198,14 +198,14 @@ def solution_of(
         kept = [i for i in group if ends.converged[i] or i == best]
         for i in kept[:1]:
             squares, value = float(ends.squares[i]), problem.values_at(ends.y[i])
-            slope, residual = ends.jacobian[i][own, :count], ends.residual[i][own]
+            jacobian, residual = ends.jacobian[i][used, :count], ends.residual[i][used]
             starts = int(counts[kept].sum())
-            minima.append(FitMinimum(squares, value, starts, None, slope, residual))
-    rows = slice(len(measured)) if measured.ndim else ...
+            minima.append(FitMinimum(squares, value, starts, None, jacobian, residual))
+    shots = slice(len(measured)) if measured.ndim else ...  # without copies
     return Solution(
         starts=tuple(minima),
-        predicted=end.predicted[rows],
-        status=end.status[rows],
+        predicted=end.predicted[shots],
+        status=end.status[shots],
         slopes=end.slopes,
         converged=bool(end.converged),
         stuck=bool(end.stuck),
@@ -216,13 +216,19 @@ def solution_of(
 
 
 def find_minima(problem: FitProblem, starts: int | None, seed: int, solver: Solver) -> Solution:
-    """The distinct minima of a problem, from `starts` start points; only the best is solved finely.
+    """The distinct minima of a problem by multistart; the best one is solved to full accuracy.
 
     Two thirds of the start points are random in the box. The law is only piecewise smooth, so that
     the sum of squares has side minima close to a minimum: the others lie around the best end. With
     `starts` None, start points are the lowest of many points, further ones around the best follow
     as long as they lower the sum of squares, and the search is repeated with twice as many other
     points where chi^2 rejects the best minimum, as long as that helps.
+
+    Args:
+        problem: least squares.
+        starts: number of start points, or None; one: the law's own values.
+        seed: of the random points.
+        solver: options.
     """
     rng = np.random.default_rng(seed)
     if starts == 1:
@@ -271,7 +277,7 @@ def _rough_ends(
         most: number of starts in each round where `starts` is None.
     """
     count, noise = starts or most, 0.0 if problem.sigma is None else 1.0
-    far, log = count - count // 3, problem.parameters.log
+    random, log = count - count // 3, problem.parameters.log  # two thirds of the starts
     scanned = starts is None and bool(len(log) > 1 or log.any())
     if solver.method == "levenberg-marquardt":
         solver = solver._replace(max_steps=min(ROUGH_STEPS, solver.max_steps))
@@ -282,14 +288,14 @@ def _rough_ends(
 
     def around(ends: Ends, _: int) -> Ends | None:
         """Ends of starts around the best end; None if no such point is lower than those near it."""
-        points = _near(problem, ends, SCANNED if scanned else count - far, noise, rng)
+        points = _near(problem, ends, SCANNED if scanned else count - random, noise, rng)
         if scanned:
-            points = _lowest(problem, points, count - far)
+            points = _lowest(problem, points, count - random)
         return rough(points) if len(points) else None
 
-    ends = rough((_first_points if scanned else start_points)(problem, far, rng))
+    ends = rough((_first_points if scanned else start_points)(problem, random, rng))
     rounds = 1 if starts else ROUNDS
-    return _extended(ends, rounds if count > far else 0, len(log), around)
+    return _extended(ends, rounds if count > random else 0, len(log), around)
 
 
 def _extended(
@@ -322,13 +328,13 @@ def _box(problem: FitProblem) -> Float[np.ndarray, "2 P"]:
     `START_RESTITUTION`.
     """
     log, count = problem.parameters.log, len(problem.names)
-    own = problem.variables.point(problem.start)[:count]
+    start = problem.variables.point(problem.start)[:count]
     low, high = (
         np.array(end, float)[:count] for end in (problem.variables.low, problem.variables.high)
     )
     reach = np.where(log, np.log(START_FACTOR), START_SCALES)
-    low = np.where(log | np.isinf(low), np.maximum(low, own - reach), low)
-    high = np.where(log | np.isinf(high), np.minimum(high, own + reach), high)
+    low = np.where(log | np.isinf(low), np.maximum(low, start - reach), low)
+    high = np.where(log | np.isinf(high), np.minimum(high, start + reach), high)
     elastic = np.array(problem.parameters.of_fields) == "restitution"
     low = np.where(elastic & (high > START_RESTITUTION), np.maximum(low, START_RESTITUTION), low)
     return np.stack([low, high])
@@ -385,14 +391,13 @@ def _lowest(
     if isinstance(problem.observe, Shots) and hasattr(law, "max_steps"):
         steps = min(SCAN_STEPS * problem.observe.bodies, law.max_steps)
         law = replace(law, max_steps=steps)  # type: ignore[call-arg]
-    squares, many = (
-        np.empty(len(points)),
-        stacked([replace(problem, law=law).for_compiled()], len(points)),
-    )
-    for rows, some in in_parts(_squares, (many, points), SCAN_LANES, np.arange(len(points))):
-        squares[rows] = np.nan_to_num(some, nan=np.inf)
+    many = stacked([replace(problem, law=law).for_compiled()], len(points))
+    squares = np.empty(len(points))
+    for rows, part in in_parts(_squares, (many, points), SCAN_LANES, np.arange(len(points))):
+        squares[rows] = np.nan_to_num(part, nan=np.inf)
     width = np.ptp(points[:, :parameters], axis=0)  # distances are in units of it
     apart = (points[:, None] - points)[..., :parameters] / np.where(width > 0, width, 1.0)
+    # indices (S, P + 1) of the neighbours of each point, without itself
     nearest = np.argsort(np.sum(apart**2, axis=-1), axis=1)[:, 1 : parameters + 2]
     lowest = np.flatnonzero(squares < squares[nearest].min(axis=1))
     return points[lowest[np.argsort(squares[lowest])][:count]]

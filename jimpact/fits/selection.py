@@ -120,6 +120,7 @@ class LawFits(Tabular):
         return record | as_data({"laws": self.entries} | speed)
 
     def __str__(self) -> str:
+        """The table with the values of the parameters, and notes on other laws and the speed."""
         fits = [entry.fit for entry in self.entries.values()]
         rows = [(*row, named_values(x, x.value)) for row, x in zip(self.table.rows, fits)]
         notes = ["rms and error of shots left out in m/s; simplest adequate law first."]
@@ -131,8 +132,8 @@ class LawFits(Tabular):
         if self.speed_fit is not None:
             tier, against = _against(self.speed_fit)
             so = "the data then fit" if tier == "fits" else f"still {against}"
-            found = zip(self.speed_fit.names, self.speed_fit.value, self.speed_fit.standard_error)
-            values = ", ".join(f"{name} = {x:.4g} ± {error:.2g}" for name, x, error in found)
+            fitted = zip(self.speed_fit.names, self.speed_fit.value, self.speed_fit.standard_error)
+            values = ", ".join(f"{name} = {x:.4g} ± {error:.2g}" for name, x, error in fitted)
             notes.append(f"With it {values}: {so}.")
         columns = (*_COLUMNS, Column("values"))
         return str(Table(columns, rows, head=[self.verdict, ""], notes=notes))
@@ -157,6 +158,7 @@ class NestedTest(NamedTuple):
         return self.chance < WORSE
 
     def __str__(self) -> str:
+        """The test in a sentence: statistic, degrees of freedom, p-value."""
         needed, rest = "needed" if self.needed else "not needed", self.degrees_of_freedom
         kind, freedom = "chi^2", degrees(self.more)
         if rest is not None:
@@ -172,7 +174,7 @@ class NestedTest(NamedTuple):
 
 
 def nested_test(simple: Fit, full: Fit) -> NestedTest:
-    """Whether the data need the parameters that one fit has beyond another one.
+    """Test by F or chi^2 if the data need the parameters that one fit has beyond another one.
 
     Equation: `F = (S - S_full) / q / (S_full / f)`, S sums of squares, q further parameters that
     the data determine, f degrees of freedom of the full fit; with sigma, unless the full fit

@@ -281,7 +281,7 @@ def _values(
 
 
 def _is_nan(cell: str) -> bool:
-    """Whether a cell says NaN."""
+    """True if the text of a cell is NaN."""
     return cell.lower() == "nan"
 
 

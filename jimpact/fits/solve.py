@@ -418,15 +418,15 @@ def minimize(
     states, converged = _descended(many, points, solver, *rule)
     y, steps, stuck = np.asarray(states.y), states.steps, states.stuck
     once, moved = solver._replace(max_steps=1), np.full(len(y), project is not None)
-    for _ in range(SETTLING):
+    for _ in range(SETTLING):  # by turns: the best allowed point, residual and Jacobian there
         if not moved.any():
             break
-        inside = np.empty_like(y)
+        allowed = np.empty_like(y)
         lanes, workers = many.lanes(len(y)), solver.workers
         for rows, nearest in in_parts(best_allowed, (project, states), lanes, workers=workers):
-            inside[rows] = nearest
-        states, _ = _descended(many, inside, once, *rule)
-        moved, y = np.abs(inside - y).max(axis=1) > SETTLED, inside
+            allowed[rows] = nearest
+        states, _ = _descended(many, allowed, once, *rule)
+        moved, y = np.abs(allowed - y).max(axis=1) > SETTLED, allowed
     size = np.asarray(many.size, float)
     return Ends(
         y=np.asarray(states.y, float),
@@ -469,28 +469,28 @@ def _descended(
     """
     dtype, count = points.dtype, len(points)
     limit: Any = solver.max_steps
-    descends = solver.method != "levenberg-marquardt"
-    if not descends:
-        limit = np.asarray(limit)  # one program serves all limits
+    by_gradient = solver.method != "levenberg-marquardt"
+    if not by_gradient:
+        limit = np.asarray(limit)  # an argument of the program, which serves all limits
     rule: Any = {"method": solver.method, "max_steps": limit, "stop": np.asarray(stop, dtype)}
     advance, states = partial(advance_all, **rule), begin(problems, points, solver)
     problems = replace(problems, zeros=None)
     converged = np.zeros(count, bool)
-    active, lanes = np.arange(count), problems.lanes(count)
-    first = True
+    active, lanes = np.arange(count), problems.lanes(count)  # indices of the solves that go on
+    compiles = True  # the first time
     while len(active):
-        before, every = states.cost.copy(), (problems, states)
-        for rows, some in in_parts(advance, every, lanes, active, solver.workers, first):
-            for leaf, value in zip(jax.tree.leaves(states), jax.tree.leaves(some)):
+        before, trees = states.cost.copy(), (problems, states)
+        for rows, part in in_parts(advance, trees, lanes, active, solver.workers, compiles):
+            for leaf, value in zip(jax.tree.leaves(states), jax.tree.leaves(part)):
                 leaf[rows] = value
-        first = False
-        converged = _converged(states, DESCENDED if descends else CONVERGED)
+        compiles = False
+        converged = _converged(states, DESCENDED if by_gradient else CONVERGED)
         ended = states.done | (states.steps >= solver.max_steps)
-        if not descends:
+        if not by_gradient:
             creeps = (states.cost > (1 - CREEPS) * before) & (states.memory.value < _SHORT)
             ended |= creeps & ~converged
-        active = active[~ended[active]]  # indices of the solves that go on
-        if noise is not None and not descends:
+        active = active[~ended[active]]
+        if noise is not None and not by_gradient:
             active = _better_half(states, active, noise / problems.size[0])
         done, steps = count - len(active), int(states.steps.max())
         solver.show(f"fit: {done} of {count} {what} done, step {steps}", done, count)
@@ -524,10 +524,10 @@ def _converged(states: SolverState, enough: float) -> Bool[np.ndarray, " S"]:
 
 
 def stacked(problems: Sequence[Any], each: int = 1) -> Any:
-    """Problems of one structure as one, with a leading axis in each array, each `each` times."""
+    """N problems of one structure as one, with an axis S = N `each` in front: each repeated."""
 
     def side_by_side(*leaves: Any) -> Any:
-        """The arrays of all problems in one; a leaf that is no array is the same in all."""
+        """A leaf of all problems as one array (S, ...); what is no array is the same in all."""
         if not eqx.is_array(leaves[0]):
             return leaves[0]
         return np.repeat(np.stack([np.asarray(leaf) for leaf in leaves]), each, axis=0)
