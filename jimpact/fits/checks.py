@@ -70,11 +70,11 @@ class Judged:
             loss_noise: noise times the root of the degrees of freedom after a robust loss, or None.
         """
         self.problem, self.solution, self.robust = problem, solution, loss_noise is not None
-        minimum, here = solution.starts[0], ~np.isnan(problem.measured).ravel()
-        of_value = np.nonzero(~np.isnan(np.atleast_1d(problem.measured)))[0]
-        self.shot = np.append(of_value, np.full(len(problem.priors), NO_SHOT))
-        self.shots = np.unique(of_value)
-        self.used = used = np.append(here, np.ones(len(problem.priors), bool))
+        minimum, measured = solution.starts[0], ~np.isnan(problem.measured).ravel()
+        shot = np.nonzero(~np.isnan(np.atleast_1d(problem.measured)))[0]  # of each value
+        self.shot = np.append(shot, np.full(len(problem.priors), NO_SHOT))
+        self.shots = np.unique(shot)
+        self.used = used = np.append(measured, np.ones(len(problem.priors), bool))
         # not the residual of the search, which is a penalty where the law fails
         errors = problem.measurement.independent(problem.measured - solution.predicted)
         self.residual = np.append(errors, -minimum.residual[errors.size :])[used]
@@ -370,7 +370,7 @@ def _pattern(judged: Judged) -> Iterator[Finding]:
     E (R, q) an orthonormal basis of further regressors: v- of the shots, with coefficients of
     their own for each body, orthogonal to the Jacobian; f degrees of freedom left.
     """
-    problem, rest = judged.problem, judged.freedom
+    problem, freedom = judged.problem, judged.freedom
     if not judged.shows_noise or list(_beyond_noise(judged)):  # which says enough
         return
     assert problem.experiments is not None
@@ -379,25 +379,25 @@ def _pattern(judged: Judged) -> Iterator[Finding]:
     basis = u[:, singular > ROUNDING * singular[0]]  # of the columns of v-, over shots
     body = np.broadcast_to(np.arange(pre.shape[1]), problem.measured.shape)
     body = body[~np.isnan(problem.measured)]  # the body of each residual
-    regressors = [basis[judged.shot] * (body == i)[:, None] for i in range(pre.shape[1])]
-    more, momentum = np.hstack(regressors), judged.momentum
+    of_bodies = [basis[judged.shot] * (body == i)[:, None] for i in range(pre.shape[1])]
+    regressors, momentum = np.hstack(of_bodies), judged.momentum
     # no law explains momentum errors
-    more, residual = (x - momentum @ (momentum.T @ x) for x in (more, judged.residual))
-    rest -= 0 if problem.experiments.lost_freedom else momentum.shape[1]
-    fitted = _range(problem, judged.jacobian)
-    extra = _range(problem, more - fitted @ (fitted.T @ more), float(np.linalg.norm(more)))
+    regressors, residual = (x - momentum @ (momentum.T @ x) for x in (regressors, judged.residual))
+    freedom -= 0 if problem.experiments.lost_freedom else momentum.shape[1]
+    fitted, size = _range(problem, judged.jacobian), float(np.linalg.norm(regressors))
+    extra = _range(problem, regressors - fitted @ (fitted.T @ regressors), size)
     count = extra.shape[1]
-    rest -= count
+    freedom -= count
     explained = float(np.sum((extra.T @ residual) ** 2))
-    left = float(residual @ residual) - explained
-    if rest < _LEAST or left <= 0 or count == 0:
+    unexplained = float(residual @ residual) - explained
+    if freedom < _LEAST or unexplained <= 0 or count == 0:
         return
-    ratio = explained / count / (left / rest)
-    if fdtrc(count, rest, ratio) < LEVEL:
+    ratio = explained / count / (unexplained / freedom)
+    if fdtrc(count, freedom, ratio) < LEVEL:
         yield Finding(
             "lack_of_fit",
             f"Lack of fit: the residuals follow the velocities before the impact (F = {ratio:.3g} "
-            f"with {count} and {degrees(rest)}): the law does not fit.",
+            f"with {count} and {degrees(freedom)}): the law does not fit.",
             numbers={"F": ratio},
         )
 

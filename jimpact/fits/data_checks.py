@@ -148,20 +148,20 @@ class DataBalances:
             gains: only excesses > 0 count.
         """
         _, excess, scale, before, _, error = np.array(defects).reshape(-1, 6).T
-        size, known = excess if gains else np.abs(excess), self.experiments.sigma is not None
+        size, has_sigma = excess if gains else np.abs(excess), self.experiments.sigma is not None
         sigmas = max(DEFECT_SIGMAS, float(ndtri(1 - 0.5 * level / max(len(defects), 1))))
-        beyond = size > (sigmas * error if known else DEFECT_TOLERANCE * scale)
+        beyond = size > (sigmas * error if has_sigma else DEFECT_TOLERANCE * scale)
         flagged = {d.k: d.ratio for d, far in zip(defects, beyond) if far}
-        if known or len(defects) < 2 or not flagged or np.mean(size > GROSS * scale) >= 0.5:
+        if has_sigma or len(defects) < 2 or not flagged or np.mean(size > GROSS * scale) >= 0.5:
             return flagged
-        alone = self._beyond_scatter(defects) if gains else set()
-        if alone:
-            return {k: ratio for k, ratio in flagged.items() if k in alone}
-        some = error > 0
-        weight = 1 / error[some]
+        outliers = self._beyond_scatter(defects) if gains else set()
+        if outliers:
+            return {k: ratio for k, ratio in flagged.items() if k in outliers}
+        has_error = error > 0
+        weight = 1 / error[has_error]
         # excess / error is compared with a constant, and with before / error
-        shapes = np.sign(weight), weight * before[some]
-        chance = min(_chance(weight * excess[some], shape, gains) for shape in shapes)
+        shapes = np.sign(weight), weight * before[has_error]
+        chance = min(_chance(weight * excess[has_error], shape, gains) for shape in shapes)
         return flagged if chance < level / len(shapes) else {}
 
     def _beyond_scatter(self, gains: list[_Defect]) -> set[int]:

@@ -273,11 +273,13 @@ def fit_many(
     for k, data in enumerate(many):
         check_kind(f"many[{k}]", data, Experiments)
     first = of_shots(law, scene, many[0], *choice)
-    same = scene is not None and first.measurement.mixing is None
-    same &= getattr(first.law, "rtol", None) != COARSE_RTOL  # where the noise allows it
+    # problems of other shots follow from the first one, but where more depends on the data:
+    # scenes, errors of v-, and the coarse tolerance that their noise allows
+    follow = scene is not None and first.measurement.mixing is None
+    follow &= getattr(first.law, "rtol", None) != COARSE_RTOL
     problems = [first]
     for data in many[1:]:
-        only_shots = same and data.scenes is None and data.sigma_pre is None
+        only_shots = follow and data.scenes is None and data.sigma_pre is None
         other = first.of_other(data, scene) if only_shots else of_shots(law, scene, data, *choice)
         problems.append(other)
     each: dict[int, Ends] = {}  # of the starts of a data set

@@ -142,9 +142,9 @@ class AdmissibleMatrices(eqx.Module):
         hessian = hessian + weight * jnp.eye(size, dtype=dtype)
         rounding = _SHORT * jnp.finfo(dtype).eps * jnp.abs(self.inverse).max()
         slack, rows = self.conditions(y)
-        first = len(slack) - self.faces
-        linear = slack[:first], rows[:first]
-        worst = min(len(slack) - first, _WORST * self.closed.size)
+        linear_count = len(slack) - self.faces  # those on the energy come last
+        linear = slack[:linear_count], rows[:linear_count]
+        worst = min(self.faces, _WORST * self.closed.size)  # number of new cuts
 
         def add_cuts(state: _Cut) -> _Cut:
             """Cut at z, solve the quadratic program, and keep the cuts of the largest multipliers.
@@ -153,13 +153,13 @@ class AdmissibleMatrices(eqx.Module):
             that contains the admissible one.
             """
             z = state.z
-            energy, tangent = (x[first:] for x in self.conditions(z))
+            energy, tangent = (x[linear_count:] for x in self.conditions(z))
             which = jnp.argsort(energy)[:worst]
             new = energy[which] + tangent[which] @ (y - z), tangent[which]  # the tangents at y
             parts = zip(linear, (state.slacks, state.slopes), new)
             slacks, slopes = map(jnp.concatenate, parts)
             move, multipliers, solved = _quadratic(hessian, gradient, slacks, slopes)
-            active = first + jnp.argsort(-multipliers[first:])[:size]
+            active = linear_count + jnp.argsort(-multipliers[linear_count:])[:size]
             inside = (energy.min() >= -rounding) & (state.steps > 0)
             goes_on = solved & ~inside
             z = jnp.where(goes_on, y + move, z)

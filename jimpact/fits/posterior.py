@@ -2,7 +2,7 @@
 
 import sys
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -83,27 +83,11 @@ def posterior(
     each = _priors(problem, dict(priors or {}), numpyro.distributions)
 
     inner = None if problem.matrix is None else _Inner(problem, problem.matrix)
-
-    def model() -> None:
-        """Sample x from the priors, and add the log density of the data: numpyro's model."""
-        if inner is None:
-            x = jnp.stack([numpyro.sample(name, prior) for name, prior in each.items()])
-        else:
-            flat = numpyro.distributions.ImproperUniform(
-                numpyro.distributions.constraints.real_vector, (), (len(each),)
-            )
-            x, change = inner.values(numpyro.sample(_FREE, flat))
-            log_priors = [prior.log_prob(x[i]) for i, prior in enumerate(each.values())]
-            numpyro.factor("prior", change + sum(log_priors))
-            for i, name in enumerate(each):
-                numpyro.deterministic(name, x[i])
-        numpyro.factor("data", problem.log_density(x))
-
     first = dict(zip(problem.names, _inside(start, problem.domains)))
     if inner is not None:
         first = {_FREE: inner.free(start)}
     kernel = numpyro.infer.NUTS(
-        model,
+        _model(problem, each, inner, numpyro),
         forward_mode_differentiation=True,
         dense_mass=len(each) > 1,
         init_strategy=numpyro.infer.init_to_value(values=first),
@@ -124,6 +108,33 @@ def posterior(
         del draws.posterior[_FREE]
     _warn(draws, arviz)
     return draws
+
+
+def _model(
+    problem: FitProblem, priors: dict[str, Any], inner: "_Inner | None", numpyro: Any
+) -> Callable[[], None]:
+    """The model for numpyro: x (P,) from the priors, with the log density of the data at x.
+
+    Of an admissible matrix (`inner`) z (P,) is sampled in the place of x; the log density is then
+    that of the priors at x(z), plus the logarithm of the determinant of dx/dz.
+    """
+
+    def model() -> None:
+        """Sample x, or z, and add the logarithms of the densities."""
+        if inner is None:
+            x = jnp.stack([numpyro.sample(name, prior) for name, prior in priors.items()])
+        else:
+            flat = numpyro.distributions.ImproperUniform(
+                numpyro.distributions.constraints.real_vector, (), (len(priors),)
+            )
+            x, log_determinant = inner.values(numpyro.sample(_FREE, flat))
+            log_priors = [prior.log_prob(x[i]) for i, prior in enumerate(priors.values())]
+            numpyro.factor("prior", log_determinant + sum(log_priors))
+            for i, name in enumerate(priors):
+                numpyro.deterministic(name, x[i])
+        numpyro.factor("data", problem.log_density(x))
+
+    return model
 
 
 def _arviz() -> Any:
@@ -203,9 +214,9 @@ def _priors(problem: FitProblem, chosen_priors: dict[str, Any], kinds: Any) -> d
     `kinds` is the module `numpyro.distributions`.
     """
     parameters, priors = problem.parameters, {}
-    own = {i: Normal(mean, std) for i, mean, std in problem.priors}
+    of_fit = {i: Normal(mean, std) for i, mean, std in problem.priors}
     for i, (name, field) in enumerate(zip(problem.names, parameters.of_fields)):
-        chosen = chosen_priors.get(name, chosen_priors.get(field, own.get(i)))
+        chosen = chosen_priors.get(name, chosen_priors.get(field, of_fit.get(i)))
         low, high = problem.domains[i].tolist()
         priors[name] = _prior(name, chosen, low, high, bool(parameters.log[i]), kinds)
     for name in chosen_priors:

@@ -504,7 +504,7 @@ def of_shots(
         check_kind("scene", scene, Scene)
     check_concrete("law", law)
     check_concrete("scene", scene)
-    law, of_tolerance = tolerated(law, scene, experiments)
+    law, note_on_rtol = tolerated(law, scene, experiments)
     observe, alike, measurement = _measured_shots(experiments, scene)
     law = with_parts_of_scene(law, scene, experiments.scenes is not None, free)
     masses = experiments.each(scene, dense_mass)
@@ -512,7 +512,7 @@ def of_shots(
     problem = _build(law, observe, measurement, (free, *choice), energy)
     problem = replace(
         problem,
-        notes=(*problem.notes, *of_tolerance),
+        notes=(*problem.notes, *note_on_rtol),
         experiments=experiments,
         scene=scene,
     )

@@ -146,10 +146,8 @@ def contour(
         deviances, width = Deviances(fit, limit, show), _BEYOND * np.sqrt(limit)
         values = []
         for i in pair:
-            pieces, scale = (
-                fit.linearized_interval(i, width),
-                np.asarray(fit.problem.variables.scale)[i],
-            )
+            pieces = fit.linearized_interval(i, width)
+            scale = np.asarray(fit.problem.variables.scale)[i]
             outer = np.array([pieces[0][0], pieces[-1][1]])
             outer = scaled(outer, scale, fit.problem.parameters.log[i])
             low, high = np.clip(outer, *deviances.reach(i)).tolist()

@@ -176,15 +176,16 @@ def _parameters(fit: "Fit") -> list[str]:
     seen = fit.determined
     for i, (name, pieces) in enumerate(zip(fit.names, fit.intervals())):
         error = fit.standard_error[i]
-        known = "unknown" if np.isnan(error) else f"{error:.3g}"
-        known = "undetermined" if np.isinf(error) else known
+        error_text = "unknown" if np.isnan(error) else f"{error:.3g}"
+        error_text = "undetermined" if np.isinf(error) else error_text
         interval = "-"
         if np.isfinite(error) or fit.profiles:
             interval = pieces_in_words(pieces, (fit.bounds[0][i], fit.bounds[1][i]))
         note = "at its bound" if fit.at_bound[i] else ""
         note = ", ".join(filter(None, [note if seen[i] else UNSEEN, _prior(fit, i)]))
         value = marked(fit.value[i], seen[i], ".6g")
-        lines.append(f"{name:{width}s} {value:>12s} {known:>12s}   {interval}   {note}".rstrip())
+        cells = f"{name:{width}s} {value:>12s} {error_text:>12s}   {interval}   {note}"
+        lines.append(cells.rstrip())
     lines += [f"{name} = {with_error(*pair)} is tied" for name, pair in fit.tied.items()]
     freedom = fit.degrees_of_freedom
     if fit.problem.sigma is None and 0 < freedom <= FEW_DEGREES:

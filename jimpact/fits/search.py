@@ -428,7 +428,7 @@ def _near(
     curvature = np.swapaxes(jacobian, 1, 2) @ jacobian
     inverse = np.linalg.pinv(curvature, rcond=least, hermitian=True)
     error = np.sqrt(variance * np.diagonal(inverse, axis1=1, axis2=2))
-    centre = np.arange(count) % len(best)
+    centre = np.arange(count) % len(best)  # by turns: the index in `best` of each point's centre
     spread = np.exp(rng.uniform(np.log(NEAR_SPREAD), np.log(FAR_SPREAD), (count, 1)))
     z = rng.normal(size=(count, len(error[0])))
     move = np.minimum(spread * error[centre], START_SCALES) * z

@@ -429,21 +429,21 @@ def _judged(fits: dict[str, Fit]) -> dict[str, LawFit]:
     against = {name: _against(each) for name, each in fits.items()}
     squares = {name: _per_shot(each, errors[name]) for name, each in fits.items()}
     usable = [name for name in fits if against[name][0] != "fails"] or list(fits)
-    many = all(np.isfinite(squares[name]).sum() >= _LEAST for name in usable)
-    least = {name: np.nansum(squares[name]) if many else _variance(fits[name]) for name in usable}
-    best = min(usable, key=lambda name: (least[name], len(fits[name].names)))
+    by_shots = all(np.isfinite(squares[name]).sum() >= _LEAST for name in usable)
+    error = {n: np.nansum(squares[n]) if by_shots else _variance(fits[n]) for n in usable}
+    best = min(usable, key=lambda name: (error[name], len(fits[name].names)))
     entries = []
     for name, each in fits.items():
         tier, verdict = against[name]
-        if many:
+        if by_shots:
             chance, level, worse = _chance(squares[name], squares[best]), WORSE, "predicts worse"
         else:
             chance, level, worse = _by_residuals(each, fits[best]), WORSE_OF_FEW, "fits worse"
         if tier != "fails" and chance < level:
             worse = f"{worse} than {best} (p-value {chance:.1g})"
             tier, verdict = "worse", f"{verdict}, {worse}" if tier != "fits" else worse
-        error = each.problem.rms(errors[name])
-        entries.append(LawFit(name, each, error, _aicc(each), verdict, tier))
+        rms = each.problem.rms(errors[name])
+        entries.append(LawFit(name, each, rms, _aicc(each), verdict, tier))
     return {x.name: x for x in sorted(entries, key=_order)}
 
 

@@ -233,14 +233,15 @@ def _check_columns(where: str, columns: list[CsvColumn]) -> dict[str, int]:
             )
     kinds = [kind for kind in _KINDS if kind in _NEEDED or any(x == kind for x, _ in keys)]
     bodies = max(1, *(c.body for c in velocities)) if velocities else 1
-    counts = {
+    counts = {  # one for each body; gaps and coordinates q may be more or fewer
         kind: bodies
         if kind in (*_NEEDED, *_ERRORS, "mass")
         else max(body for other, body in keys if other == kind)
         for kind in kinds
     }
-    each = [(i + 1, k) for i in range(max(counts.values())) for k in kinds if i < counts[k]]
-    missing = [f"{kind}_{i}" for i, kind in each if (kind, i) not in keys]
+    # of every kind, columns 1 to its count
+    required = [(i + 1, k) for i in range(max(counts.values())) for k in kinds if i < counts[k]]
+    missing = [f"{kind}_{i}" for i, kind in required if (kind, i) not in keys]
     if missing:
         raise ValueError(
             f"{where}: column `{missing[0]}[unit]` is missing; every body from 1 to {bodies} needs "
