@@ -162,7 +162,7 @@ def _conserved(problem: FitProblem) -> list[np.ndarray]:
     return bases
 
 
-def _noise(judged: Judged) -> tuple[float, int]:
+def _pure_error(judged: Judged) -> tuple[float, int]:
     """Pure error: the sum of squared residuals that no law can change, and its degrees of freedom.
 
     Equation: over groups of g shots with equal v-, of residuals r_k, their mean m, and the momentum
@@ -316,7 +316,7 @@ def _not_finite(judged: Judged) -> Iterator[Finding]:
         )
 
 
-def _beyond_sigma(judged: Judged) -> Iterator[Finding]:
+def _above_sigma(judged: Judged) -> Iterator[Finding]:
     """Yield `lack_of_fit` where chi^2 rejects the stated sigma, with the factor `stretch`."""
     if judged.inexact and judged.stretch > 1:
         how = "are those of the loss" if judged.robust else "are stretched by that"
@@ -325,28 +325,28 @@ def _beyond_sigma(judged: Judged) -> Iterator[Finding]:
             f"Lack of fit: the residuals are {judged.stretch:.2g} times what sigma allows (chi^2 = "
             f"{judged.squares:.4g} with {degrees(judged.freedom)}): the law or "
             "the stated errors are wrong, or the parameters scatter; the standard errors "
-            f"{how}.{_held(judged.problem)}",
+            f"{how}.{_friction_note(judged.problem)}",
             numbers={"ratio": judged.stretch, "chi_squared": judged.squares},
         )
 
 
-def _held(problem: FitProblem) -> str:
+def _friction_note(problem: FitProblem) -> str:
     """A sentence for laws with friction that is not fitted: it may be why the law does not fit."""
     if "friction" not in free_parameters_of(problem.law) or "friction" in problem.fields:
         return ""
     return " The law's `friction` is held at its start: name it in `free` to fit it."
 
 
-def _beyond_noise(judged: Judged) -> Iterator[Finding]:
+def _above_pure_error(judged: Judged) -> Iterator[Finding]:
     """Yield `lack_of_fit` by the F test of lack of fit against pure error, without sigma.
 
     Equation: `F = ((S - S_e) / (f - f_e)) / (S_e / f_e)`, S the sum of squares of f degrees of
-    freedom, S_e the pure error of f_e (`_noise`), not less than the rounding of readings.
+    freedom, S_e the pure error of f_e (`_pure_error`), not less than the rounding of readings.
     """
     problem = judged.problem
     if not judged.shows_noise:
         return
-    pure_error, error_freedom = _noise(judged)
+    pure_error, error_freedom = _pure_error(judged)
     law_freedom = judged.freedom - error_freedom
     if error_freedom < _LEAST or law_freedom < 1:
         return
@@ -358,12 +358,12 @@ def _beyond_noise(judged: Judged) -> Iterator[Finding]:
             "lack_of_fit",
             f"Lack of fit: the residuals are {np.sqrt(ratio):.2g} times the noise that momentum "
             f"and repeated shots show ({law_freedom} and {degrees(error_freedom)}): the law does "
-            f"not fit, and the standard errors mean little.{_held(problem)}",
+            f"not fit, and the standard errors mean little.{_friction_note(problem)}",
             numbers={"ratio": float(np.sqrt(ratio))},
         )
 
 
-def _pattern(judged: Judged) -> Iterator[Finding]:
+def _linear_in_velocities(judged: Judged) -> Iterator[Finding]:
     """Yield `lack_of_fit` where residuals are linear in the velocities before, by an F test.
 
     Equation: `F = (|E^T r|^2 / q) / ((|r|^2 - |E^T r|^2) / f)`, r without its momentum directions,
@@ -371,7 +371,7 @@ def _pattern(judged: Judged) -> Iterator[Finding]:
     their own for each body, orthogonal to the Jacobian; f degrees of freedom left.
     """
     problem, freedom = judged.problem, judged.freedom
-    if not judged.shows_noise or list(_beyond_noise(judged)):  # which says enough
+    if not judged.shows_noise or list(_above_pure_error(judged)):  # which says enough
         return
     assert problem.experiments is not None
     pre = np.asarray(problem.experiments.pre, float)
@@ -558,7 +558,7 @@ def _precision(judged: Judged) -> Iterator[Finding]:
 
 FIT_CHECKS = (
     *(_unknown_corrections, _search, _statuses, _matrix, _not_finite),
-    *(_beyond_sigma, _beyond_noise, _pattern, _contradicted_priors, _suspicious),
+    *(_above_sigma, _above_pure_error, _linear_in_velocities, _contradicted_priors, _suspicious),
     *(_units, _at_bounds, _choices, _unknown_errors, _precision),
 )
 

@@ -1,12 +1,14 @@
 """Covariances of the velocities (v-, v+) of measured shots: one for each shot, or of all shots.
 
-Of each shot: (K, 2n, 2n). Of all shots: (2nK, 2nK), in the order v-, v+ of shot 1, of shot 2, ...
+Of each shot: (K, N, N) with N = 2n. Of all shots: (M, M) with M = N K, in the order v-, v+ of shot
+1, of shot 2, ...
 """
 
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 from scipy.linalg import block_diag
 
 from jimpact.tools.checks import as_float_array, check_concrete, check_values
@@ -17,7 +19,9 @@ from jimpact.tools.checks import as_float_array, check_concrete, check_values
 ROUNDING = 1e-10
 
 
-def as_covariance(value: Any, shape: tuple[int, int]) -> np.ndarray:
+def as_covariance(
+    value: Any, shape: tuple[int, int]
+) -> Float[np.ndarray, "K N N"] | Float[np.ndarray, "M M"]:
     """The checked covariance of the errors of (v-, v+) of K shots of n velocities.
 
     It must be positive definite for each shot, but for v- of variance 0, which are exact. That of
@@ -28,7 +32,7 @@ def as_covariance(value: Any, shape: tuple[int, int]) -> np.ndarray:
         shape: (K, n).
 
     Returns:
-        (2nK, 2nK) where errors of different shots are correlated, else (K, 2n, 2n).
+        That of all shots only where errors of different shots are correlated.
     """
     check_concrete("covariance", value)
     as_float_array("covariance", value)  # raises for what are no numbers
@@ -54,13 +58,15 @@ def as_covariance(value: Any, shape: tuple[int, int]) -> np.ndarray:
     return array
 
 
-def _check_positive(matrix: np.ndarray, where: str, exact: np.ndarray, least: float) -> None:
+def _check_positive(
+    matrix: Float[np.ndarray, "N N"], where: str, exact: Bool[np.ndarray, " N"], least: float
+) -> None:
     """Raise a ValueError unless a covariance is symmetric and its correlation positive definite.
 
     Args:
-        matrix: covariance (N, N).
+        matrix: covariance.
         where: end of the message.
-        exact: (N,) True for entries that may have variance 0.
+        exact: True for entries that may have variance 0.
         least: lowest eigenvalue of the correlation that is allowed.
     """
     must = "Argument `covariance` must be"
@@ -68,19 +74,19 @@ def _check_positive(matrix: np.ndarray, where: str, exact: np.ndarray, least: fl
     sizes = np.sqrt(np.abs(np.outer(variance, variance)))
     if not (np.abs(matrix - matrix.T) <= ROUNDING * sizes).all():
         raise ValueError(f"{must} symmetric, but is not{where}.")
-    none = (variance == 0) & exact & ~matrix.any(axis=1)
-    some = np.ix_(~none, ~none)
-    if not (variance[~none] > 0).all():
+    uncertain = ~((variance == 0) & exact & ~matrix.any(axis=1))
+    if not (variance[uncertain] > 0).all():
         raise ValueError(f"{must} positive definite, but has a variance <= 0{where}.")
-    lowest = np.linalg.eigvalsh(matrix[some] / sizes[some])[0]
+    block = np.ix_(uncertain, uncertain)
+    lowest = np.linalg.eigvalsh(matrix[block] / sizes[block])[0]
     if lowest < least:
         raise ValueError(
             f"{must} positive definite, but its correlation has the eigenvalue {lowest:.3g}{where}."
         )
 
 
-def diagonal_blocks(covariance: Any, size: int) -> np.ndarray:
-    """Covariance (K, size, size) of each shot: as it is, or the blocks of (K size, K size)."""
+def diagonal_blocks(covariance: Any, size: int) -> Float[np.ndarray, "K N N"]:
+    """The covariance of each shot: as it is, or the diagonal blocks of that of all shots."""
     array = np.asarray(covariance, float)
     if array.ndim == 3:
         return array
@@ -88,7 +94,9 @@ def diagonal_blocks(covariance: Any, size: int) -> np.ndarray:
     return array.reshape(count, size, count, size)[np.arange(count), :, np.arange(count)]
 
 
-def covariance_of(covariance: Any, shots: np.ndarray, n: int) -> np.ndarray:
+def covariance_of(
+    covariance: Any, shots: Int[np.ndarray, " S"], n: int
+) -> Float[np.ndarray, "S N N"] | Float[np.ndarray, "M M"]:
     """Covariance of (v-, v+) of some shots (indices from 0) of n velocities, in the same form."""
     array = np.asarray(covariance, float)
     if array.ndim == 3:
@@ -104,8 +112,10 @@ def joined_covariance(many: Sequence[Any]) -> np.ndarray:
     return block_diag(*(block_diag(*each) if each.ndim == 3 else each for each in many))
 
 
-def moved_covariance(covariance: Any, gain: np.ndarray) -> np.ndarray:
-    """`G C G^T` of values G (v-, v+) of each shot, gain (K, m, 2n): (K, m, m), or (K, m, K, m)."""
+def moved_covariance(
+    covariance: Any, gain: Float[np.ndarray, "K m N"]
+) -> Float[np.ndarray, "K m m"] | Float[np.ndarray, "K m K m"]:
+    """The covariance `G C G^T` of values `G (v-, v+)` of each shot, or of all, G the gain."""
     array = np.asarray(covariance, float)
     if array.ndim == 3:
         return gain @ array @ gain.swapaxes(1, 2)
@@ -114,23 +124,26 @@ def moved_covariance(covariance: Any, gain: np.ndarray) -> np.ndarray:
     return np.einsum("kia,kalb,ljb->kilj", gain, blocks, gain, optimize=True)
 
 
-def whitening(covariance: np.ndarray, here: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Standard errors (K, n) of values, and the whitening matrices of their errors.
+def whitening(
+    covariance: Float[np.ndarray, "K n n"] | Float[np.ndarray, "K n K n"],
+    used: Bool[np.ndarray, "K n"],
+) -> tuple[Float[np.ndarray, "K n"], Float[np.ndarray, "K n n"] | Float[np.ndarray, "K n K n"]]:
+    """Standard errors of values, and the whitening matrices of their errors.
 
     Equation: `L = F^-1`, F the Cholesky factor of the correlation: `L e / sigma` are independent.
 
     Args:
-        covariance: (K, n, n) of each shot, or (K, n, K, n) of all.
-        here: (K, n), True for values that take part; others count as independent, of error 1.
+        covariance: of the values of each shot, or of all.
+        used: True for values that take part; others count as independent, of error 1.
 
     Returns:
-        sigma (K, n), and L in the shape of the covariance.
+        sigma, and L in the shape of the covariance.
 
     Raises:
         ValueError: a combination of the values has no error.
     """
-    rows = here if covariance.ndim == 3 else here.reshape(1, -1)
-    size = rows.shape[1]
+    rows = used if covariance.ndim == 3 else used.reshape(1, -1)
+    size = rows.shape[1]  # of one matrix for each shot, or of one for all
     matrices = covariance.reshape(-1, size, size)
     matrices = np.where(rows[:, :, None] & rows[:, None, :], matrices, np.eye(size))
     errors = np.sqrt(np.diagonal(matrices, axis1=1, axis2=2))
@@ -141,4 +154,4 @@ def whitening(covariance: np.ndarray, here: np.ndarray) -> tuple[np.ndarray, np.
             "Argument `covariance` must leave an error in each velocity after an impact that the "
             "law predicts from those before, but is singular there: are shots in it twice?"
         ) from None
-    return errors.reshape(here.shape), np.linalg.inv(factor).reshape(covariance.shape)
+    return errors.reshape(used.shape), np.linalg.inv(factor).reshape(covariance.shape)

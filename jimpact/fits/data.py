@@ -233,13 +233,13 @@ class Experiments(eqx.Module):
         >>> [round(float(v), 6) for v in corrected.post[0]]
         [0.15, 0.85]
         """
-        post, lost, after = np.array(self.post, dtype=float), list(self.lost), _after(self)
-        for k, (m, pre, row) in enumerate(self.balances(scene)):
-            if len(m) == 0 or np.isnan(row).any():
+        corrected, lost, after = np.array(self.post, dtype=float), list(self.lost), _after(self)
+        for k, (m, pre, post) in enumerate(self.balances(scene)):
+            if len(m) == 0 or np.isnan(post).any():
                 continue
-            post[k] -= _smallest_change(after[k], m) @ (m @ (row - pre))
+            corrected[k] -= _smallest_change(after[k], m) @ (m @ (post - pre))
             lost[k] += len(m)
-        return self._with(post=post, lost_freedom=lost)
+        return self._with(post=corrected, lost_freedom=lost)
 
     def _with(self, **changed: Any) -> "Experiments":
         """A copy with some arguments changed, by name; all are checked anew."""
@@ -475,7 +475,7 @@ def _check_alone(given: str, others: dict[str, Any]) -> None:
 
 
 def _as_rows(name: str, value: Any) -> jax.Array:
-    """Velocities as (K, n)."""
+    """Velocities as an array (K, n), of one shot (1, n)."""
     array = as_float_array(name, value)
     check_concrete(name, array)
     array = array[None, :] if array.ndim == 1 else array

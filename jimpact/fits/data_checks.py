@@ -154,17 +154,17 @@ class DataBalances:
         flagged = {d.k: d.ratio for d, far in zip(defects, beyond) if far}
         if has_sigma or len(defects) < 2 or not flagged or np.mean(size > GROSS * scale) >= 0.5:
             return flagged
-        outliers = self._beyond_scatter(defects) if gains else set()
+        outliers = self._gain_outliers(defects) if gains else set()
         if outliers:
             return {k: ratio for k, ratio in flagged.items() if k in outliers}
         has_error = error > 0
         weight = 1 / error[has_error]
         # excess / error is compared with a constant, and with before / error
         shapes = np.sign(weight), weight * before[has_error]
-        chance = min(_chance(weight * excess[has_error], shape, gains) for shape in shapes)
+        chance = min(_p_value(weight * excess[has_error], shape, gains) for shape in shapes)
         return flagged if chance < level / len(shapes) else {}
 
-    def _beyond_scatter(self, gains: list[_Defect]) -> set[int]:
+    def _gain_outliers(self, gains: list[_Defect]) -> set[int]:
         """Indices of shots whose gain of energy is an outlier among all shots, without sigma.
 
         Excesses over their standard errors (of a sigma of 1 m/s) scatter by the noise about their
@@ -312,7 +312,7 @@ def _shorter_half(values: np.ndarray) -> float:
     return _SIGMA_OVER_HALF * float(np.min(ordered[count - 1 :] - ordered[: 1 - count or None])) / 2
 
 
-def _chance(excess: np.ndarray, shape: np.ndarray, gains: bool) -> float:
+def _p_value(excess: np.ndarray, shape: np.ndarray, gains: bool) -> float:
     """p-value of the hypothesis a = 0 in a regression of excesses (N,) on a shape (N,).
 
     Equation: `excess = a shape + noise`, `t = a / error(a)`; P(T > t) of Student's t with N - 1

@@ -11,6 +11,7 @@ from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from jimpact.fits.estimate import Estimate
 from jimpact.fits.findings import Finding
@@ -36,13 +37,13 @@ _FROM_BEST = -1  # the branch of what was searched from the best minimum
 
 
 class Lowest(NamedTuple):
-    """A minimum with some parameters fixed: |r|^2, at y (Q,), and the start that it descends from.
+    """A minimum with some parameters fixed: |r|^2, at y, and the start that it descends from.
 
     `branch` is the index of that start, `_FROM_BEST` of the best minimum.
     """
 
     squares: float
-    y: np.ndarray
+    y: Float[np.ndarray, " Q"]
     branch: int = _FROM_BEST
 
 
@@ -62,8 +63,8 @@ class Grid(NamedTuple):
         """The values of the parameters at a cell."""
         return [float(values[k]) for values, k in zip(self.values, cell)]
 
-    def nearest(self, y: np.ndarray) -> Index:
-        """The cell nearest to y (Q,)."""
+    def nearest(self, y: Float[np.ndarray, " Q"]) -> Index:
+        """The cell nearest to y."""
         return tuple(int(np.abs(v - y[i]).argmin()) for i, v in zip(self.which, self.values))
 
     def neighbours(self, cell: Index) -> list[Index]:
@@ -118,12 +119,12 @@ class Deviances:
             self.starts = [self.best]
 
     def minimize(
-        self, trials: Sequence[tuple[tuple[int, ...], Sequence[float], np.ndarray]]
+        self, trials: Sequence[tuple[tuple[int, ...], Sequence[float], Float[np.ndarray, " Q"]]]
     ) -> Ends:
         """Least squares over the parameters that are not fixed, all trials side by side.
 
-        A trial holds the indices of the fixed parameters, their values (scaled), and the start y
-        (Q,). `lowest` is updated.
+        A trial holds the indices of the fixed parameters, their values (scaled), and the start y.
+        `lowest` is updated.
         """
         points = np.array([y for _, _, y in trials])
         # of the Q entries of y the first P are parameters, and the others stay
@@ -185,9 +186,9 @@ class Deviances:
             for (g, cell, branch), squares, y in zip(trials, ends.squares.tolist(), ends.y):
                 cells = minima[g]
                 if cell in cells and not squares < (1 - SAME) * cells[cell].squares:
-                    continue
+                    continue  # not lower than from another start
                 cells[cell] = Lowest(squares, y, branch)
-                if self.of(squares) > self.limit:
+                if self.of(squares) > self.limit:  # no further in this direction
                     if branch != _FROM_BEST:
                         waiting[g, cell, _FROM_BEST] = self.best.y
                     continue
@@ -250,7 +251,7 @@ class Lines(Deviances):
             first = widest
         count = np.log(1 + (GROWTH - 1) * (high - low) / first) / np.log(GROWTH)
         away = first * (GROWTH ** np.arange(1, count + 1) - 1) / (GROWTH - 1)
-        near = centres[:, None] + np.concatenate([-away, away])
+        near = centres[:, None] + np.concatenate([-away, away])  # a row for each start
         owner = np.abs(near[..., None] - centres).argmin(axis=-1)  # the nearest start
         near = near[(owner == np.arange(len(centres))[:, None]) & (near > low) & (near < high)]
         return Grid((i,), (np.unique([*centres, low, high, *near]),))
@@ -296,8 +297,10 @@ class Lines(Deviances):
             if min(-height[a], height[b]) > END and abs(values[b] - values[a]) > least:
                 yield _Crossing(values[a], values[b], height[a], height[b])
 
-    def deviance(self, line: dict[float, Lowest]) -> tuple[np.ndarray, np.ndarray]:
-        """Fixed values (G,) in order, and their deviances (G,)."""
+    def deviance(
+        self, line: dict[float, Lowest]
+    ) -> tuple[Float[np.ndarray, " G"], Float[np.ndarray, " G"]]:
+        """Fixed values in order, and their deviances."""
         values = sorted(line)
         return np.array(values), np.array([self.of(line[y].squares) for y in values])
 
@@ -329,23 +332,30 @@ class Lines(Deviances):
             better=None if is_of_fit else self.problem.values_at(self.best.y),
         )
 
-    def _end(self, i: int, y: np.ndarray, deviance: np.ndarray, k: int, step: int) -> float:
+    def _end(
+        self,
+        i: int,
+        y: Float[np.ndarray, " G"],
+        deviance: Float[np.ndarray, " G"],
+        k: int,
+        step: int,
+    ) -> float:
         """End of an interval: where the deviance D passes the limit, or the end of the domain.
 
         By linear interpolation of sqrt(D) between the values k and k + step.
 
         Args:
             i: index of the parameter.
-            y: (G,) fixed values, scaled.
-            deviance: (G,) their deviances.
+            y: fixed values, scaled.
+            deviance: of each value.
             k: index of the last value below the limit.
             step: -1 for the lower end, 1 for the upper.
         """
         beyond = k + step
         if not 0 <= beyond < len(y):
             return float(self.problem.domains[i][(step + 1) // 2])
-        p, q = np.sqrt(deviance[k]), np.sqrt(deviance[beyond])
-        share = (np.sqrt(self.limit) - p) / (q - p)
+        root, root_beyond = np.sqrt(deviance[k]), np.sqrt(deviance[beyond])
+        share = (np.sqrt(self.limit) - root) / (root_beyond - root)
         return float(self.values(i, y[k] + share * (y[beyond] - y[k])))
 
 

@@ -1,13 +1,16 @@
 """Errors of the velocities before an impact, passed on to those after it."""
 
 import numpy as np
+from jaxtyping import Float
 
 from jimpact.core.scene import Scene
 from jimpact.fits.covariances import diagonal_blocks, moved_covariance
 from jimpact.fits.data import Experiments, kept_by_corrections
 
 
-def covariance_after(data: Experiments, scene: Scene | None, slopes: np.ndarray) -> np.ndarray:
+def covariance_after(
+    data: Experiments, scene: Scene | None, slopes: Float[np.ndarray, "M n n"]
+) -> Float[np.ndarray, "K n n"] | Float[np.ndarray, "K n K n"]:
     """Covariance of `v+ measured - v+(law at v- measured)`, with the errors of v- passed on.
 
     Equation: `C = A S A^T + (I - P) S_++ (I - P)^T`, `A = P [-J, I]`, with S the covariance of
@@ -17,10 +20,10 @@ def covariance_after(data: Experiments, scene: Scene | None, slopes: np.ndarray)
     Args:
         data: K shots of n velocities, with errors of v-.
         scene: of all shots; None: each has its own.
-        slopes: J (K or more, n, n); where it is not finite, the identity.
+        slopes: J of M >= K shots; where it is not finite, the identity.
 
     Returns:
-        C (K, n, n) of each shot; (K, n, K, n) where the covariance of the data is of all shots.
+        C of each shot; of all shots where the covariance of the data is.
     """
     count, n = data.pre.shape
     slope = np.asarray(slopes[:count], float)

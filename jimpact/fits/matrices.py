@@ -4,9 +4,9 @@ The set `{E : E >= 0, G^-1 (I + E) >= 0, G^-1 - E^T G^-1 E copositive}` is conve
 asks `|E x| <= |x|` in the norm of G^-1). Residuals are linear in E, so a fit goes where it likes
 and then to the admissible matrix of the least sum of squares.
 
-Axes: S scenes, m contacts, Q variables y of the solver, F = 2^m - 1 faces (supports) of the cone of
-approaches x >= 0, C conditions `slack(y) >= 0`. G is the Delassus matrix in units of
-`kinetic_norm`.
+Axes: S scenes, m contacts, E = m m entries, Q variables y of the solver, F = 2^m - 1 faces
+(supports) of the cone of approaches x >= 0, C conditions `slack(y) >= 0`. G is the Delassus matrix
+in units of `kinetic_norm`.
 """
 
 from itertools import product
@@ -16,6 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from jimpact.core.contact import decoupled, delassus_matrix, kinetic_norm
 from jimpact.core.law import Law
@@ -46,20 +47,21 @@ _WORST = 2  # new cuts of each scene and contact
 _FACES = ("E >= 0", "G^-1 (I + E) >= 0", "G^-1 - E^T G^-1 E copositive (energy)")
 
 
-_Share = tuple[jax.Array, jax.Array, jax.Array]  # share of the way, True if it fell, passes
+# share of the way, True if it fell, passes
+_Share = tuple[Float[Array, ""], Bool[Array, ""], Int[Array, ""]]
 
 
 class _Cut(NamedTuple):
-    """State of a search by cutting planes: the point z (Q,), and the active cuts that hold it.
+    """State of a search by cutting planes: the point z, and the Q active cuts that hold it.
 
-    `slacks` (Q,) are those of the cuts at the first point y, `slopes` (Q, Q) their derivatives.
+    `slacks` are those of the cuts at the first point y, `slopes` their derivatives.
     """
 
-    z: jax.Array
-    slacks: jax.Array
-    slopes: jax.Array
-    goes_on: jax.Array
-    steps: jax.Array
+    z: Float[Array, " Q"]
+    slacks: Float[Array, " Q"]
+    slopes: Float[Array, "Q Q"]
+    goes_on: Bool[Array, ""]
+    steps: Int[Array, ""]
 
 
 class AdmissibleMatrices(eqx.Module):
@@ -68,20 +70,20 @@ class AdmissibleMatrices(eqx.Module):
     Source: Brogliato, Nonsmooth Mechanics (2016), Prop. 6.2 and 6.3.
     """
 
-    origin: jax.Array  # (m m,)
-    map: jax.Array  # (m m, Q)
-    inverse: jax.Array  # G^-1 (S, m, m), the identity for open contacts
-    closed: jax.Array  # (S, m) zeros and ones
-    bounds: jax.Array | None  # (2, Q) of y
-    center: jax.Array  # y strictly inside
+    origin: Float[Array, " E"]
+    map: Float[Array, "E Q"]
+    inverse: Float[Array, "S m m"]  # G^-1, the identity for open contacts
+    closed: Float[Array, "S m"]  # ones, zeros for open contacts
+    bounds: Float[Array, "2 Q"] | None  # of y
+    center: Float[Array, " Q"]  # y strictly inside
 
-    def matrices(self, y: jax.Array) -> jax.Array:
-        """`E = origin + map y` (S, m, m) of each scene, with zeros for open contacts."""
+    def matrices(self, y: Float[Array, " Q"]) -> Float[Array, "S m m"]:
+        """`E = origin + map y` of each scene, with zeros for open contacts."""
         m = self.closed.shape[1]
         e = (self.origin + self.map @ y).reshape(m, m)
         return e[None] * (self.closed[:, :, None] * self.closed[:, None, :])
 
-    def elementwise(self, y: jax.Array) -> jax.Array:
+    def elementwise(self, y: Float[Array, " Q"]) -> Float[Array, " L"]:
         """Slacks of the conditions linear in y: `E`, `G^-1 (I + E)`, `y - low`, `high - y`.
 
         They must be >= 0; 1 where there is no bound.
@@ -101,8 +103,8 @@ class AdmissibleMatrices(eqx.Module):
         scenes, m = self.closed.shape
         return scenes * (2**m - 1)
 
-    def worst(self, y: jax.Array) -> jax.Array:
-        """Approaches x >= 0 (S, F, m) of length 1, one for each face, that lose the least energy.
+    def worst(self, y: Float[Array, " Q"]) -> Float[Array, "S F m"]:
+        """Approaches x >= 0 of length 1, one for each face, that lose the least energy.
 
         On each face, of the approaches with a given support, the minimizer of `x^T Q x` with `Q =
         G^-1 - E^T G^-1 E` is an eigenvector of the smallest eigenvalue of that block of Q, if it
@@ -123,13 +125,15 @@ class AdmissibleMatrices(eqx.Module):
         x = x / jnp.where(norm > 0, norm, 1.0)
         return jax.lax.stop_gradient(x)
 
-    def _dissipation(self, y: jax.Array) -> jax.Array:
-        """`Q = G^-1 - E^T G^-1 E` (S, m, m)."""
+    def _dissipation(self, y: Float[Array, " Q"]) -> Float[Array, "S m m"]:
+        """`G^-1 - E^T G^-1 E` of each scene."""
         e = self.matrices(y)
         return self.inverse - jnp.swapaxes(e, 1, 2) @ self.inverse @ e
 
     @full_precision
-    def nearest(self, y: jax.Array, hessian: jax.Array, gradient: jax.Array) -> jax.Array:
+    def nearest(
+        self, y: Float[Array, " Q"], hessian: Float[Array, "Q Q"], gradient: Float[Array, " Q"]
+    ) -> Float[Array, " Q"]:
         """The admissible z of the least `g^T (z - y) + (z - y)^T H (z - y) / 2`.
 
         By cutting planes: conditions on the energy are concave, so that they lie below all their
@@ -173,8 +177,8 @@ class AdmissibleMatrices(eqx.Module):
         inside = self.center + (1 - _SHORT * jnp.finfo(dtype).eps) * share * (z - self.center)
         return jnp.where(share < 1, inside, z)
 
-    def share(self, y: jax.Array) -> jax.Array:
-        """The largest s <= 1 (), with which `center + s (y - center)` is admissible."""
+    def share(self, y: Float[Array, " Q"]) -> Float[Array, ""]:
+        """The largest s <= 1 with which `center + s (y - center)` is admissible."""
         slack, target = self.elementwise(self.center), self.elementwise(y)
         crossed = (target < 0) & (target < slack)  # the others do not change along the ray
         share = jnp.where(crossed, slack / jnp.where(crossed, slack - target, 1.0), 1.0).min()
@@ -189,8 +193,8 @@ class AdmissibleMatrices(eqx.Module):
         first = (share, jnp.asarray(True), jnp.asarray(0))
         return jax.lax.while_loop(lambda s: s[1] & (s[2] < _SCALINGS), shortened, first)[0]
 
-    def _energy_share(self, y: jax.Array, x: jax.Array) -> jax.Array:
-        """Shares s (S, F) of the ray at which `|E(s) x| = |x|`, of approaches x (S, F, m).
+    def _energy_share(self, y: Float[Array, " Q"], x: Float[Array, "S F m"]) -> Float[Array, "S F"]:
+        """Shares s of the ray from the center to y at which `|E(s) x| = |x|`, of approaches x.
 
         Equation: `E(s) x = u + s w`, u = E(center) x, w = E(y) x - u, in the norm of G^-1: the
         positive root of `|w|^2 s^2 + 2 (u, w) s = |x|^2 - |u|^2`; inf where there is none.
@@ -204,8 +208,8 @@ class AdmissibleMatrices(eqx.Module):
         above, below = jnp.where(b > 0, c, root - b), jnp.where(b > 0, root + b, a)
         return jnp.where(below > 0, above / jnp.where(below > 0, below, 1.0), jnp.inf)
 
-    def conditions(self, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Slacks (C,) of all conditions, >= 0 where admissible, and their derivatives (C, Q).
+    def conditions(self, y: Float[Array, " Q"]) -> tuple[Float[Array, " C"], Float[Array, "C Q"]]:
+        """Slacks of all conditions, >= 0 where admissible, and their derivatives.
 
         First those of `elementwise`, then `x^T Q x` of the worst approach on each face, twice the
         energy that is lost, with `Q = G^-1 - E^T G^-1 E`.
@@ -223,35 +227,42 @@ class AdmissibleMatrices(eqx.Module):
 
 
 def _quadratic(
-    hessian: jax.Array, gradient: jax.Array, slack: jax.Array, rows: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Solve `min d^T H d / 2 + g^T d` with `slack + A d >= 0` by its dual problem, an LCP.
+    hessian: Float[Array, "Q Q"],
+    gradient: Float[Array, " Q"],
+    slack: Float[Array, " C"],
+    rows: Float[Array, "C Q"],
+) -> tuple[Float[Array, " Q"], Float[Array, " C"], Bool[Array, ""]]:
+    """Solve `min d^T H d / 2 + g^T d` with `slack + A d >= 0`, A the rows, by its dual LCP.
 
     Equation: `0 <= l  perp  A H^-1 A^T l + slack - A H^-1 g >= 0`, `d = H^-1 (A^T l - g)`; the rows
     of A are scaled to length 1.
 
     Returns:
-        d (Q,), the multipliers l (C,), True if the LCP is solved.
+        d, the multipliers l, True if the LCP is solved.
     """
     length = jnp.sqrt(jnp.sum(rows**2, axis=1))
     depends = length > _FLAT * length.max()  # others are rounding
     scale = jnp.where(depends, 1 / jnp.where(depends, length, 1.0), 0.0)
     rows, slack = rows * scale[:, None], jnp.where(depends, slack * scale, 1.0)
     factor = jax.scipy.linalg.cho_factor(hessian)
-    free = -jax.scipy.linalg.cho_solve(factor, gradient)
-    response = jax.scipy.linalg.cho_solve(factor, rows.T)
+    unconstrained = -jax.scipy.linalg.cho_solve(factor, gradient)
+    response = jax.scipy.linalg.cho_solve(factor, rows.T)  # H^-1 A^T
     # positive semidefinite; the multipliers need not be unique, the step is
-    dual = solve_lcp(rows @ response, slack + rows @ free, symmetric=False)
-    return free + response @ dual.z, dual.z * scale, dual.code == CODE["ok"]
+    dual = solve_lcp(rows @ response, slack + rows @ unconstrained, symmetric=False)
+    return unconstrained + response @ dual.z, dual.z * scale, dual.code == CODE["ok"]
 
 
-def _square(a: jax.Array, x: jax.Array) -> jax.Array:
-    """`x^T A x` (S, F) of x (S, F, m) with A (S, m, m)."""
+def _square(a: Float[Array, "S m m"], x: Float[Array, "S F m"]) -> Float[Array, "S F"]:
+    """The quadratic forms `x^T A x`."""
     return jnp.einsum("sfi,sij,sfj->sf", x, a, x)
 
 
 def matrix_region(
-    law: Law, scenes: list[Scene], variables: Variables, start: np.ndarray, ties: Ties
+    law: Law,
+    scenes: list[Scene],
+    variables: Variables,
+    start: Float[np.ndarray, " P"],
+    ties: Ties,
 ) -> AdmissibleMatrices | None:
     """The set of y whose `RestitutionMatrix` is admissible in each scene; None for other laws.
 
@@ -259,7 +270,7 @@ def matrix_region(
         law: at its start values.
         scenes: with m contacts each.
         variables: y of the fit.
-        start: (P,) start values, which must be admissible.
+        start: values, which must be admissible.
         ties: of the fit.
 
     Raises:
@@ -295,8 +306,8 @@ def matrix_region(
     return eqx.tree_at(lambda r: r.center, region, jnp.asarray(center, dtype))
 
 
-def admissible_start(scenes: list[Scene]) -> np.ndarray:
-    """A matrix E (m, m) that is admissible in all scenes.
+def admissible_start(scenes: list[Scene]) -> Float[np.ndarray, "m m"]:
+    """A matrix E that is admissible in all scenes.
 
     `I / 2` where it will do (chains); else one from which all conditions are far.
 
@@ -324,10 +335,10 @@ def admissible_start(scenes: list[Scene]) -> np.ndarray:
 def _region(
     scenes: list[Scene],
     dtype: Any,
-    origin: np.ndarray,
-    mix: np.ndarray,
-    bounds: np.ndarray | None,
-    center: np.ndarray,
+    origin: Float[np.ndarray, " E"],
+    mix: Float[np.ndarray, "E Q"],
+    bounds: Float[np.ndarray, "2 Q"] | None,
+    center: Float[np.ndarray, " Q"],
 ) -> AdmissibleMatrices:
     """The admissible set of `E = origin + mix y` in these scenes; of equal ones only one counts."""
     m = scenes[0].contacts
@@ -346,8 +357,8 @@ def encloses(law: Law, contacts: int) -> bool:
     return isinstance(law, RestitutionMatrix) and law.admissible and law.matrix.shape[0] == contacts
 
 
-def _inverse(scene: Scene) -> np.ndarray:
-    """G^-1 (m, m) and one more row: 1 for closed contacts, 0 for open ones, which are decoupled.
+def _inverse(scene: Scene) -> Float[np.ndarray, "rows m"]:
+    """G^-1 and one more row: 1 for closed contacts, 0 for open ones, which are decoupled.
 
     Equation: `G_ij = W_ij / (s_i s_j)`, W the Delassus matrix, s the `kinetic_norm`.
     """
@@ -366,7 +377,9 @@ def _inverse(scene: Scene) -> np.ndarray:
 _conditions = quick_jit(AdmissibleMatrices.conditions)
 
 
-def _host_conditions(region: AdmissibleMatrices, y: Any) -> tuple[np.ndarray, np.ndarray]:
+def _host_conditions(
+    region: AdmissibleMatrices, y: Any
+) -> tuple[Float[np.ndarray, " C"], Float[np.ndarray, "C Q"]]:
     """`AdmissibleMatrices.conditions` on the host, in double precision."""
     slack, rows = _conditions(region, jnp.asarray(y, region.center.dtype))
     return np.asarray(slack, float), np.asarray(rows, float)
@@ -384,7 +397,9 @@ def _rounding(region: AdmissibleMatrices) -> float:
     return _ROUNDING[str(region.center.dtype)] * float(np.abs(np.asarray(region.inverse)).max())
 
 
-def _inner_point(region: AdmissibleMatrices, start: np.ndarray) -> np.ndarray | None:
+def _inner_point(
+    region: AdmissibleMatrices, start: Float[np.ndarray, " Q"]
+) -> Float[np.ndarray, " Q"] | None:
     """A y near the start whose least slack is at least half of the largest possible; None: none.
 
     Kelley's cutting planes: the least slack is concave in y, so it lies below all tangents so far;
@@ -411,7 +426,7 @@ def _inner_point(region: AdmissibleMatrices, start: np.ndarray) -> np.ndarray | 
     return None
 
 
-def boundary(region: AdmissibleMatrices | None, y: np.ndarray) -> tuple[str, ...]:
+def boundary(region: AdmissibleMatrices | None, y: Float[np.ndarray, " Q"]) -> tuple[str, ...]:
     """Names of the admissibility conditions that are active at y, other than by fixed entries."""
     if region is None:
         return ()

@@ -57,7 +57,7 @@ class Measurement:
         return cls(value, weight, unit, np.asarray(unit * np.linalg.norm(weight)), mixing, sigma)
 
     @property
-    def here(self) -> Bool[np.ndarray, "*value"]:
+    def is_measured(self) -> Bool[np.ndarray, "*value"]:
         """True where a value was measured."""
         return np.asarray(~np.isnan(self.value))
 
@@ -81,7 +81,7 @@ class Measurement:
         if mixing is not None:  # factors times L, instead of weights times factors
             weight, scale = self.weight * used, np.where(used, factor, 1.0)
             if mixing.ndim == 4:  # of all shots: those left out leave the covariance, too
-                mixing = _without(np.asarray(mixing, float), used & self.here)
+                mixing = _without(np.asarray(mixing, float), used & self.is_measured)
             mixing = scale.reshape(scale.shape + (1,) * (mixing.ndim - 2)) * mixing
         value = np.where(used, self.value, np.nan)
         return Measurement.of(value, self.sigma, weight, self.unit, mixing)
@@ -94,11 +94,11 @@ class Measurement:
         Equation: sigma is the root of its diagonal; `L = F^-1`, F the Cholesky factor of the
         correlation.
         """
-        here = self.here
-        sigma, mixing = whitening(covariance, here)
+        measured = self.is_measured
+        sigma, mixing = whitening(covariance, measured)
         # factors that a weight already has (shots left out) stay
-        old = np.where(here, np.asarray(self.sigma, float), 1.0)
-        weight, sigma = self.weight * old / sigma, np.where(here, sigma, np.nan)
+        old = np.where(measured, np.asarray(self.sigma, float), 1.0)
+        weight, sigma = self.weight * old / sigma, np.where(measured, sigma, np.nan)
         return Measurement.of(self.value, sigma, weight, self.unit, mixing)
 
     def filled(self, shots: Int[np.ndarray, " M"]) -> "Measurement":
@@ -107,17 +107,18 @@ class Measurement:
         parts = self.value, self.weight, self.mixing
         value, weight, mixing = jax.tree.map(lambda x: np.asarray(x)[shots], parts)
         weight[count:] = 0.0
-        if mixing is not None and mixing.ndim == 4:
+        if mixing is not None and mixing.ndim == 4:  # (M, n, K, n) so far
             mixing = mixing[:, :, shots]
             mixing[count:] = 0.0  # or a copy would count as the shot
         return replace(self, value=value, weight=weight, mixing=mixing)
 
-    def independent(self, errors: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    def independent(self, errors: Any) -> Float[np.ndarray, "..."]:
         """Errors `L e / sigma` (K, n, ...) of variance 1, independent of each other, of errors e.
 
         NaN counts as 0. Further axes hold derivatives, or samples.
         """
-        return _mixed(np.nan_to_num(errors) * self._weight_of(errors), self.mixing)
+        errors = np.asarray(np.nan_to_num(errors))
+        return np.asarray(_mixed(errors * self._weight_of(errors), self.mixing))
 
     def errors_of(self, independent: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         """The inverse of `independent`: `e = sigma L^-1 u` (K, n, ...) of independent errors u.
@@ -139,13 +140,15 @@ class Measurement:
 
         It needs a known sigma. L is triangular: log det L is the sum over its diagonal.
         """
-        here = self.here
-        sigma, log_diagonal = np.broadcast_to(self.sigma, here.shape), np.zeros(here.shape)
+        measured = self.is_measured
+        shape = measured.shape
+        sigma, log_diagonal = np.broadcast_to(self.sigma, shape), np.zeros(shape)
         if self.mixing is not None:
-            size = here.size if self.mixing.ndim == 4 else here.shape[1]
+            size = measured.size if self.mixing.ndim == 4 else shape[1]
             diagonal = np.diagonal(self.mixing.reshape(-1, size, size), axis1=1, axis2=2)
-            log_diagonal = np.log(diagonal.reshape(here.shape))
-        return float(np.sum(np.log(sigma[here] * math.sqrt(2 * math.pi)) - log_diagonal[here]))
+            log_diagonal = np.log(diagonal.reshape(shape))
+        log_sigma = np.log(sigma[measured] * math.sqrt(2 * math.pi))
+        return float(np.sum(log_sigma - log_diagonal[measured]))
 
 
 @full_precision
@@ -166,8 +169,8 @@ def _inverse(mixing: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
 
 
 def _without(
-    mixing: Float[np.ndarray, "K n K n"], here: Bool[np.ndarray, "K n"]
+    mixing: Float[np.ndarray, "K n K n"], used: Bool[np.ndarray, "K n"]
 ) -> Float[np.ndarray, "K n K n"]:
-    """L of all shots where only the values `here` take part: that of their part of `L^-1 L^-T`."""
-    back = _inverse(mixing).reshape(here.size, here.size)
-    return whitening((back @ back.T).reshape(mixing.shape), here)[1]
+    """L of all shots where only the values `used` take part: that of their part of `L^-1 L^-T`."""
+    factor = _inverse(mixing).reshape(used.size, used.size)
+    return whitening((factor @ factor.T).reshape(mixing.shape), used)[1]

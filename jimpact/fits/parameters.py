@@ -125,7 +125,7 @@ def free_parameters(
 
     `absolute`: forces or times were measured, which show a common factor of all stiffnesses.
     """
-    known, fixed = free_parameters_of(law), ""
+    known, fixed = free_parameters_of(law), ""  # `fixed`: the stiffness that the note is about
     if free is DEFAULT_FREE:
         free = default_free(law, absolute)
         if "stiffness" in known and "stiffness" not in free:
@@ -197,7 +197,7 @@ def as_names(argument: str, names: Any) -> tuple[str, ...]:
 
 
 def default_free(law: Law, absolute: bool = False) -> tuple[str, ...]:
-    """The fields that are fitted by default: how the contacts bounce, or else all.
+    """The fields that are fitted by default: restitution, stiffness, matrix, speed; or else all.
 
     A single stiffness of which only ratios matter is left out; `absolute`: see `free_parameters`.
     """
@@ -269,7 +269,7 @@ def _check_name(argument: str, name: str, known: Any) -> None:
 
 
 def bounds_of(parameters: Parameters, law: Law, bounds: Mapping[str, Any] | None) -> Limits:
-    """Lower and upper bounds (P,): the user's, or else the field's domain."""
+    """Bounds (P,), (P,): the user's, else the field's domain; the narrowest of a shared value."""
     chosen, fields = dict(bounds or {}), sorted(set(parameters.of_fields))
     for name in chosen:
         _check_name("bounds", entry_of(name)[0], fields)
@@ -556,7 +556,7 @@ def with_parts_of_scene(law: Law, scene: Scene | None, own_scenes: bool, free: A
     planar = scene.tangents is not None and scene.tangents.shape == scene.normals.shape
     flat = jnp.zeros(scene.contacts, scene.mass.dtype) if planar else None
     mass = scene.mass if scene.mass.ndim == 1 else None
-    known = {
+    known = {  # the part of the scene, None: it has none that could be fitted; what it must have
         "mass": (mass, "that of `scene` is (n,)"),
         "gaps": (scene.gaps, "`scene` has gaps"),
         "tilt": (flat, "`scene` has one tangent for each contact"),

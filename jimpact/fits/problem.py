@@ -346,7 +346,7 @@ class FitProblem:
     def _of_data(self, x: Any) -> jax.Array:
         """The residual of what was measured."""
         residual = self.measurement.residual(self.observe(self.law_in_scene(x)))
-        return residual[np.flatnonzero(self.measurement.here)]
+        return residual[np.flatnonzero(self.measurement.is_measured)]
 
     def jacobian(self, x: Any) -> jax.Array:
         """(R, P) derivatives of `residual` at x (P,), by forward mode."""
@@ -439,9 +439,9 @@ class FitProblem:
     @property
     def values(self) -> int:
         """Number of independent values: measured ones, less those that corrections took; priors."""
-        here, data = self.measurement.here, self.experiments
-        lost = 0 if data is None else np.array(data.lost)[here.any(axis=1)].sum()
-        return int(here.sum() - lost) + len(self.priors)
+        measured, data = self.measurement.is_measured, self.experiments
+        lost = 0 if data is None else np.array(data.lost)[measured.any(axis=1)].sum()
+        return int(measured.sum() - lost) + len(self.priors)
 
     @property
     def labels(self) -> tuple[str, ...]:

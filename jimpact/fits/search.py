@@ -519,23 +519,24 @@ def robust_minimum(
     `MEDIAN median|r|`. The covariance is `s^2 mean(psi^2) / mean(psi')^2 (J^T J)^-1` (Huber, 1981);
     the noise returned is `s |psi| / mean(psi')`, a noise times the root of the degrees of freedom.
     """
-    here = ~np.isnan(problem.measured)
+    measured = ~np.isnan(problem.measured)
     for _ in range(LOSS_ROUNDS):
         problem = problem.with_errors_before(solution.slopes)
         error = problem.measurement.independent(problem.measured - solution.predicted)
         scale = 1.0
         if problem.sigma is None:
-            scale = max(MEDIAN * float(np.median(np.abs(error[here]))), np.finfo(float).tiny)
-        share, slope = LOSSES[loss](error / scale)
-        factor, before = np.sqrt(share), problem.variables.point(solution.value)
+            median = float(np.median(np.abs(error[measured])))
+            scale = max(MEDIAN * median, np.finfo(float).tiny)
+        weight, slope = LOSSES[loss](error / scale)  # psi(u) / u, psi'(u)
+        factor, before = np.sqrt(weight), problem.variables.point(solution.value)
         weighed = problem.weighed(factor)
         solution = solution_of(weighed, minimize([weighed.least_squares()], before[None], solver))
         if np.abs(problem.variables.point(solution.value) - before).max() <= SETTLED:
             break
     else:
         solution = replace(solution, converged=False)
-    psi = (share * error / scale)[here]
-    noise = scale * np.sqrt(np.sum(psi**2)) / max(slope[here].mean(), LEAST_SLOPE)
+    psi = (weight * error / scale)[measured]
+    noise = scale * np.sqrt(np.sum(psi**2)) / max(slope[measured].mean(), LEAST_SLOPE)
     # weighted as in the problem, without the factors of the loss
     starts = solution_of(problem, outcome_at(problem, solution.value)).starts
     return problem, replace(solution, starts=starts), float(noise)

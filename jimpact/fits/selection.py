@@ -130,7 +130,7 @@ class LawFits(Tabular):
         if self.speed is not None:
             notes.append(f"Restitution that depends on the speed ({self.best.name}): {self.speed}")
         if self.speed_fit is not None:
-            tier, against = _against(self.speed_fit)
+            tier, against = _verdict_alone(self.speed_fit)
             so = "the data then fit" if tier == "fits" else f"still {against}"
             fitted = zip(self.speed_fit.names, self.speed_fit.value, self.speed_fit.standard_error)
             values = ", ".join(f"{name} = {x:.4g} ± {error:.2g}" for name, x, error in fitted)
@@ -224,12 +224,12 @@ def _f_test(gain: float, more: int, full: Fit, names: tuple[str, ...] = ()) -> N
 
     Equation: `F = (gain / more) / (S_full / f)`, f degrees of freedom left; p-value 1 without any.
     """
-    rest = full.degrees_of_freedom
-    if rest < 1:
-        return NestedTest(np.nan, more, rest, 1.0, names)
-    left = max(full.starts[0].sum_of_squares, full.problem.exact_squares)
-    ratio = gain / more / (left / rest)
-    return NestedTest(ratio, more, rest, float(fdtrc(more, rest, ratio)), names)
+    freedom = full.degrees_of_freedom
+    if freedom < 1:
+        return NestedTest(np.nan, more, freedom, 1.0, names)
+    squares = max(full.starts[0].sum_of_squares, full.problem.exact_squares)
+    ratio = gain / more / (squares / freedom)
+    return NestedTest(ratio, more, freedom, float(fdtrc(more, freedom, ratio)), names)
 
 
 def fit_laws(
@@ -420,13 +420,13 @@ def _variants(law: Law, contacts: int, alike: bool, more: tuple[str, ...]) -> di
 
 
 def _judged(fits: dict[str, Fit]) -> dict[str, LawFit]:
-    """The laws by name with their verdicts, in order: `_against` each, and against the best one.
+    """The laws by name in order, with verdicts: `_verdict_alone`, then against the best law.
 
     The best has the least sum of squared errors in shots left out; of fewer than `_LEAST` shots,
     the least variance of the residuals.
     """
     errors = {name: _errors_left_out(each) for name, each in fits.items()}
-    against = {name: _against(each) for name, each in fits.items()}
+    against = {name: _verdict_alone(each) for name, each in fits.items()}
     squares = {name: _per_shot(each, errors[name]) for name, each in fits.items()}
     usable = [name for name in fits if against[name][0] != "fails"] or list(fits)
     by_shots = all(np.isfinite(squares[name]).sum() >= _LEAST for name in usable)
@@ -436,18 +436,19 @@ def _judged(fits: dict[str, Fit]) -> dict[str, LawFit]:
     for name, each in fits.items():
         tier, verdict = against[name]
         if by_shots:
-            chance, level, worse = _chance(squares[name], squares[best]), WORSE, "predicts worse"
+            chance, level = _paired_p_value(squares[name], squares[best]), WORSE
         else:
-            chance, level, worse = _by_residuals(each, fits[best]), WORSE_OF_FEW, "fits worse"
+            chance, level = _f_test_of_residuals(each, fits[best]), WORSE_OF_FEW
         if tier != "fails" and chance < level:
-            worse = f"{worse} than {best} (p-value {chance:.1g})"
+            verb = "predicts" if by_shots else "fits"
+            worse = f"{verb} worse than {best} (p-value {chance:.1g})"
             tier, verdict = "worse", f"{verdict}, {worse}" if tier != "fits" else worse
         rms = each.problem.rms(errors[name])
         entries.append(LawFit(name, each, rms, _aicc(each), verdict, tier))
-    return {x.name: x for x in sorted(entries, key=_order)}
+    return {x.name: x for x in sorted(entries, key=_sort_key)}
 
 
-def _order(entry: LawFit) -> tuple[Any, ...]:
+def _sort_key(entry: LawFit) -> tuple[Any, ...]:
     """Sort key: tier, then number of parameters (of worse tiers: error), then order of `advise`."""
     tier, base, order = _TIERS.index(entry.tier), entry.name.split(",")[0], simplest_first()
     place = order.index(base) if base in order else len(order)
@@ -455,7 +456,7 @@ def _order(entry: LawFit) -> tuple[Any, ...]:
     return tier, entry.parameters if tier < 2 else error, place
 
 
-def _against(result: Fit) -> tuple[str, str]:
+def _verdict_alone(result: Fit) -> tuple[str, str]:
     """The tier of a fit by itself, one of `_TIERS`, and the verdict in words."""
     failing = [STATUS[code].name for code in result.status if STATUS[code].failure]
     if failing:
@@ -505,7 +506,7 @@ def _per_shot(result: Fit, error: np.ndarray) -> np.ndarray:
     return np.where(np.isnan(error).all(axis=1), np.nan, squares)
 
 
-def _chance(squares: np.ndarray, best: np.ndarray) -> float:
+def _paired_p_value(squares: np.ndarray, best: np.ndarray) -> float:
     """p-value of the hypothesis that a law predicts as well as the best: paired t tests over shots.
 
     The smaller one of two: of the squared errors (K,), and of their logarithms, which a few large
@@ -513,11 +514,11 @@ def _chance(squares: np.ndarray, best: np.ndarray) -> float:
     """
     both = np.isfinite(squares) & np.isfinite(best)
     some = both & (squares > 0) & (best > 0)
-    gain = _above_zero(squares[both] - best[both], best[both])
-    return min(gain, _above_zero(np.log(squares[some]) - np.log(best[some]), 1.0))
+    gain = _t_test(squares[both] - best[both], best[both])
+    return min(gain, _t_test(np.log(squares[some]) - np.log(best[some]), 1.0))
 
 
-def _above_zero(more: np.ndarray, size: Any) -> float:
+def _t_test(more: np.ndarray, size: Any) -> float:
     """p-value of the one-sided t test that the mean of `more` is 0: `t = mean / (std / sqrt(N))`.
 
     Values below `SAME size` count as 0: rounding.
@@ -537,7 +538,7 @@ def _variance(result: Fit) -> float:
     return result.starts[0].sum_of_squares / freedom if freedom > 0 else np.inf
 
 
-def _by_residuals(result: Fit, best: Fit) -> float:
+def _f_test_of_residuals(result: Fit, best: Fit) -> float:
     """p-value of an F test of the residuals of a law against those of the best one.
 
     The best one counts as having one parameter more at least; 1 where its residuals are larger.
