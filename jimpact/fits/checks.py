@@ -471,16 +471,16 @@ def _against_others(judged: Judged) -> Iterable[tuple[int, float, float]]:
     for k in judged.shots:
         rows = judged.shot == k
         r, q, n = judged.residual[rows], basis[rows], int(rows.sum())  # H_kk = q q^T
-        rest = MEDIAN_FREEDOM * freedom if judged.robust else freedom - n
-        if rest < _LEAST:
+        freedom_left = MEDIAN_FREEDOM * freedom if judged.robust else freedom - n
+        if freedom_left < _LEAST:
             continue
         if judged.robust:
             squares, noise = float(r @ r), median**2 * len(judged.residual) / freedom
         else:
             squares = float(r @ np.linalg.lstsq(np.eye(n) - q @ q.T, r, rcond=1e-9)[0])
-            noise = max(judged.squares - squares, 0.0) / rest
+            noise = max(judged.squares - squares, 0.0) / freedom_left
         noise = max(noise + reading, 0.0 if problem.sigma is None else 1.0)
-        yield int(k), squares, float(fdtrc(n, rest, squares / n / noise)) if noise else 0.0
+        yield int(k), squares, float(fdtrc(n, freedom_left, squares / n / noise)) if noise else 0.0
 
 
 def _units(judged: Judged) -> Iterator[Finding]:

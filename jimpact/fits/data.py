@@ -282,12 +282,12 @@ class Experiments(eqx.Module):
         rows = np.arange(len(self.shots))[which]
         fields = self._of_each_shot()
         covariance = fields.pop("covariance")
-        some: dict[str, Any] = {
+        chosen: dict[str, Any] = {
             k: None if x is None else [x[i] for i in rows] for k, x in fields.items()
         }
         if covariance is not None:
-            some["covariance"] = covariance_of(covariance, rows, self.pre.shape[1])
-        return self._with(**some)
+            chosen["covariance"] = covariance_of(covariance, rows, self.pre.shape[1])
+        return self._with(**chosen)
 
     def __add__(self, other: "Experiments") -> "Experiments":
         """These shots and others, see `join`."""
@@ -331,8 +331,8 @@ class Experiments(eqx.Module):
             joined["covariance"] = joined_covariance([data.joint for data in many])
         for name in columns[0]:
             parts = [each[name] for each in columns]
-            known = all(part is not None for part in parts)
-            joined[name] = [row for part in parts for row in part] if known else None
+            all_have_it = all(part is not None for part in parts)
+            joined[name] = [row for part in parts for row in part] if all_have_it else None
         if len(set(joined["shots"])) < len(joined["shots"]):
             sets = enumerate(many, 1)
             joined["shots"] = [f"{i}/{label}" for i, data in sets for label in data.shots]

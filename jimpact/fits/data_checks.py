@@ -322,8 +322,8 @@ def _p_value(excess: np.ndarray, shape: np.ndarray, gains: bool) -> float:
     if freedom < 1 or squares == 0 or not excess.any():
         return 1.0
     slope = float(shape @ excess) / squares
-    left = float(np.sum((excess - slope * shape) ** 2))
-    error = np.sqrt(left / freedom / squares)
+    unexplained = float(np.sum((excess - slope * shape) ** 2))
+    error = np.sqrt(unexplained / freedom / squares)
     t = slope / error if error else np.inf * np.sign(slope)
     above = float(stdtr(freedom, -t))
     return above if gains else 2 * min(above, 1 - above)

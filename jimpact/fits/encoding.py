@@ -46,8 +46,8 @@ _PARTS = {
 
 def versions() -> dict[str, str]:
     """Versions of jimpact, of what it computes with, and of Python."""
-    found = {name: import_module(name).__version__ for name in _PACKAGES}
-    return found | {"Python": f"{platform.python_version()}, {platform.system()}"}
+    numbers = {name: import_module(name).__version__ for name in _PACKAGES}
+    return numbers | {"Python": f"{platform.python_version()}, {platform.system()}"}
 
 
 def encoded(value: Any) -> Any:
@@ -124,11 +124,11 @@ def grouped(fields: dict[str, Any], parts: Mapping[str, Any]) -> dict[str, Any]:
 
     Older files hold all of them side by side.
     """
-    rest, groups = dict(fields), {}
+    others, groups = dict(fields), {}
     for name, part in parts.items():
-        of_part = {key: rest.pop(key) for key in _saved_fields(part)}
+        of_part = {key: others.pop(key) for key in _saved_fields(part)}
         groups[name] = {"class": part.__name__, "fields": of_part}
-    return rest | groups
+    return others | groups
 
 
 def instance_of(cls: Any, fields: dict[str, Any]) -> Any:
@@ -138,14 +138,14 @@ def instance_of(cls: Any, fields: dict[str, Any]) -> Any:
     """
     if not dataclasses.is_dataclass(cls):
         raise TypeError(f"{cls!r} is no class of a law, scene or result")
-    known = set(_saved_fields(cls))
-    fields = dict.fromkeys(known & _LATER) | fields
+    names = set(_saved_fields(cls))
+    fields = dict.fromkeys(names & _LATER) | fields
     if cls is FitProblem and "owner" in fields:
         fields["value"] = fields.pop("measured")  # its older name
         fields = grouped(fields, {"variables": Variables, "measurement": Measurement})
-    if known != set(fields):
+    if names != set(fields):
         name = getattr(cls, "__name__", cls)
-        raise TypeError(f"{name} has the fields {sorted(known)}, the file {sorted(fields)}")
+        raise TypeError(f"{name} has the fields {sorted(names)}, the file {sorted(fields)}")
     instance: Any = object.__new__(cls)  # as it was: its fields have been checked and converted
     for key, value in fields.items():
         object.__setattr__(instance, key, decoded(value))

@@ -136,8 +136,9 @@ def fit(
         problem = law
     else:
         problem = of_shots(law, scene, experiments, free, bounds, priors, ties)  # type: ignore[arg-type]
-    if problem.experiments is not None and (said := wrong_unit(problem.experiments, problem.scene)):
-        warnings.warn(said, stacklevel=2)  # before a search that may take long and find nothing
+    data = problem.experiments
+    if data is not None and (doubt := wrong_unit(data, problem.scene)):
+        warnings.warn(doubt, stacklevel=2)  # before a search that may take long and find nothing
     deadline = np.inf if search.limit is None else time.monotonic() + float(search.limit)
     with progress_bar(search.progress) as show:
         solver = Solver(method, steps, show, deadline)
@@ -289,8 +290,8 @@ def fit_many(
             solver = Solver(max_steps=max_steps, show=show, workers=workers)
             points = start_points(first, starts, np.random.default_rng(seed))
             points = np.tile(points, (len(members), 1))
-            some = [problems[k] for k in members]
-            settled_problems, ends = settled(some, points, solver, FINE_OF_MANY)
+            group = [problems[k] for k in members]
+            settled_problems, ends = settled(group, points, solver, FINE_OF_MANY)
             for i, (k, problem) in enumerate(zip(members, settled_problems)):
                 each[k] = ends.rows(slice(i * starts, (i + 1) * starts))
                 problems[k] = problem
@@ -412,8 +413,8 @@ def bootstrap(
         means[:, i] = fit.value[i] + fit.noise * prior.std * drawn
     dtype = problem.dtype
     pairs = zip(measured.astype(dtype), means)
-    again = [problem.measured_again(values, mean) for values, mean in pairs]
-    return _refits(fit, again, workers, progress)
+    resampled = [problem.measured_again(values, mean) for values, mean in pairs]
+    return _refits(fit, resampled, workers, progress)
 
 
 def leave_one_out(fit: Fit, *, workers: int | None = None, progress: float | None = None) -> Refits:

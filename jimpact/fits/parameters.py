@@ -125,10 +125,10 @@ def free_parameters(
 
     `absolute`: forces or times were measured, which show a common factor of all stiffnesses.
     """
-    known, fixed = free_parameters_of(law), ""  # `fixed`: the stiffness that the note is about
+    available, fixed = free_parameters_of(law), ""  # `fixed`: the stiffness that the note is about
     if free is DEFAULT_FREE:
         free = default_free(law, absolute)
-        if "stiffness" in known and "stiffness" not in free:
+        if "stiffness" in available and "stiffness" not in free:
             fixed = "stiffness"
     labels = _labels(law, free)  # by field: 0 is fixed, equal numbers share one value
     if not absolute and _only_ratios(law, labels) and labels.get("stiffness", np.zeros(1)).all():
@@ -162,12 +162,12 @@ def free_parameters(
 
 def _labels(law: Law, free: Any) -> dict[str, np.ndarray]:
     """Labels by field, shaped like it: 0 for fixed entries, equal numbers for a shared value."""
-    known, labels = free_parameters_of(law), {}
+    available, labels = free_parameters_of(law), {}
     choices = free if isinstance(free, Mapping) else dict.fromkeys(as_names("free", free), True)
     for name, choice in choices.items():
         field, entry = entry_of(name)
-        if field not in known:
-            raise ValueError(_unknown_field(law, name, list(known)))
+        if field not in available:
+            raise ValueError(_unknown_field(law, name, list(available)))
         shape = np.shape(value_of(law, field))
         if entry is None:
             labels[field] = _as_labels(field, choice, shape)
@@ -201,8 +201,9 @@ def default_free(law: Law, absolute: bool = False) -> tuple[str, ...]:
 
     A single stiffness of which only ratios matter is left out; `absolute`: see `free_parameters`.
     """
-    known = free_parameters_of(law)
-    fields = [name for name in (*DEFAULT_FREE, "matrix", *OF_SPEED) if name in known] or list(known)
+    available = free_parameters_of(law)
+    first = [name for name in (*DEFAULT_FREE, "matrix", *OF_SPEED) if name in available]
+    fields = first or list(available)
     single = "stiffness" in fields and np.size(value_of(law, "stiffness")) == 1
     if single and not absolute and _only_ratios(law, {}):
         fields.remove("stiffness")
@@ -478,13 +479,13 @@ def tied_names(law: Law, ties: Ties) -> list[str]:
 
 def _value(law: Law, name: str) -> Any:
     """The value of the field that `name` belongs to; a ValueError unless it is a parameter."""
-    known, (field, _) = free_parameters_of(law), entry_of(name)
-    if field not in known:
+    available, (field, _) = free_parameters_of(law), entry_of(name)
+    if field not in available:
         raise ValueError(
             f"Argument `ties` must use parameters of {type(law).__name__}, one of "
-            f"{', '.join(known)}, but uses {name!r}.{suggestion(field, known)}"
+            f"{', '.join(available)}, but uses {name!r}.{suggestion(field, available)}"
         )
-    return jnp.asarray(known[field].value)
+    return jnp.asarray(available[field].value)
 
 
 # ---------------------------------------------------------------------------- parts of a scene
@@ -556,16 +557,16 @@ def with_parts_of_scene(law: Law, scene: Scene | None, own_scenes: bool, free: A
     planar = scene.tangents is not None and scene.tangents.shape == scene.normals.shape
     flat = jnp.zeros(scene.contacts, scene.mass.dtype) if planar else None
     mass = scene.mass if scene.mass.ndim == 1 else None
-    known = {  # the part of the scene, None: it has none that could be fitted; what it must have
+    values = {  # the part of the scene, None: it has none that could be fitted; what it must have
         "mass": (mass, "that of `scene` is (n,)"),
         "gaps": (scene.gaps, "`scene` has gaps"),
         "tilt": (flat, "`scene` has one tangent for each contact"),
     }
     for name in parts:
-        value, where = known[name]
+        value, where = values[name]
         if value is None:
             raise ValueError(f"Argument `free` may name `{name}` only where {where}.")
-    return LawInScene(law, **{name: known[name][0] for name in parts})
+    return LawInScene(law, **{name: values[name][0] for name in parts})
 
 
 def limits_with_scene(
@@ -576,18 +577,18 @@ def limits_with_scene(
     Raises:
         ValueError: a part of the scene without a prior, or far from it at the start.
     """
-    known = {prior.parameter: prior for prior in priors}
+    prior_of = {prior.parameter: prior for prior in priors}
     low, high = (end.copy() for end in limits)
     start = entries(law, parameters.fields)[parameters.first]
     for i, (name, field) in enumerate(zip(parameters.names, parameters.of_fields)):
         if field not in OF_A_SCENE:
             continue
-        if i not in known:
+        if i not in prior_of:
             raise ValueError(
                 f"Argument `priors` must have (mean, standard deviation) for `{name}`, a part of "
                 "the scene that is fitted with the law."
             )
-        _, mean, std = known[i]
+        _, mean, std = prior_of[i]
         low[i], high[i] = max(low[i], mean - REACH * std), min(high[i], mean + REACH * std)
         if not low[i] <= start[i] <= high[i]:
             raise ValueError(

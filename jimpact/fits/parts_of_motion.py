@@ -96,10 +96,10 @@ def with_parts_of_motion(
             "Argument `free` may name `floor` only of bodies over a floor at rest, but the system "
             f"is of a {type(system.body).__name__}{where}."
         )
-    known: dict[str, Any] = {"q0": q0, "v0": v0, "floor": jnp.zeros((), q0.dtype)}
+    values: dict[str, Any] = {"q0": q0, "v0": v0, "floor": jnp.zeros((), q0.dtype)}
     if "gravity" in wanted:
-        known["gravity"] = _acceleration(system, q0.reshape(-1, q0.shape[-1])[0])
-    return LawInMotion(law, **{name: known[name] for name in wanted})
+        values["gravity"] = _acceleration(system, q0.reshape(-1, q0.shape[-1])[0])
+    return LawInMotion(law, **{name: values[name] for name in wanted})
 
 
 def _acceleration(system: System, q: jax.Array) -> jax.Array:

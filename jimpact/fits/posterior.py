@@ -102,8 +102,8 @@ def posterior(
         progress_bar=shown,
     )
 
-    values, said = _drawn(sampler, seed, shown)
-    draws = arviz.from_dict(posterior=values, sample_stats=said)
+    values, statistics = _drawn(sampler, seed, shown)
+    draws = arviz.from_dict(posterior=values, sample_stats=statistics)
     if inner is not None:
         del draws.posterior[_FREE]
     _warn(draws, arviz)
@@ -157,8 +157,8 @@ def _drawn(sampler: Any, seed: int, shown: bool) -> tuple[Any, Any]:
 
     # as one program a short run takes half of the time (16 for 29 s); a progress bar needs several
     run = drawn if shown else jax.jit(drawn, compiler_options=known_options())
-    values, said = jax.tree.map(np.asarray, run(jax.random.PRNGKey(seed)))
-    return values, said
+    values, statistics = jax.tree.map(np.asarray, run(jax.random.PRNGKey(seed)))
+    return values, statistics
 
 
 class _Inner:

@@ -287,9 +287,9 @@ class FitProblem:
         is_table = isinstance(self.observe, Shots) or self.measured.ndim == 2
         statuses = shape[0] if isinstance(self.observe, Shots) else 1
         # zeros shaped like predictions, status codes, and dv+/dv- of each shot
-        rest: Any = (np.zeros(shape, dtype), np.zeros(statuses, np.int32))
+        outcomes: Any = (np.zeros(shape, dtype), np.zeros(statuses, np.int32))
         if bare.measurement.mixing is not None:
-            rest += (np.zeros((*shape, shape[-1]), dtype),)
+            outcomes += (np.zeros((*shape, shape[-1]), dtype),)
         residual = np.zeros(math.prod(shape) + q, dtype)
         project = None
         if self.matrix is not None:
@@ -300,7 +300,7 @@ class FitProblem:
             high=self.variables.high,
             size=self.measurement.size,
             project=project,
-            zeros=(residual, np.zeros((len(residual), q), dtype), rest),
+            zeros=(residual, np.zeros((len(residual), q), dtype), outcomes),
             short=is_table and shape[1] <= FEW,
         )
 

@@ -154,8 +154,8 @@ def contour(
             values.append(np.linspace(low, high, points))
         (cells,) = deviances.fill([Grid(pair, (values[0], values[1]))])
     squares = np.full((points, points), np.inf)
-    for cell, known in cells.items():
-        squares[cell] = known.squares
+    for cell, minimum in cells.items():
+        squares[cell] = minimum.squares
     deviance = np.maximum((squares - deviances.lowest.squares) / deviances.variance, 0.0)
     if deviance.min() > limit:
         raise ValueError(

@@ -377,8 +377,8 @@ def _opens_and_closes(scene: Scene) -> bool:
 
 def _default(law: Law, more: tuple[str, ...]) -> dict[str, Any]:
     """The free parameters of a user's law: those by default, and those of `more` that it has."""
-    known = free_parameters_of(law)
-    return dict.fromkeys((*default_free(law), *(name for name in more if name in known)), True)
+    available = free_parameters_of(law)
+    return dict.fromkeys((*default_free(law), *(name for name in more if name in available)), True)
 
 
 def _variants(law: Law, contacts: int, alike: bool, more: tuple[str, ...]) -> dict[str, Candidate]:
@@ -392,15 +392,15 @@ def _variants(law: Law, contacts: int, alike: bool, more: tuple[str, ...]) -> di
         alike: True if all scenes have as many.
         more: further free parameters.
     """
-    known = free_parameters_of(law)
-    if "restitution" not in known or np.ndim(known["restitution"].value) > 1:
+    available = free_parameters_of(law)
+    if "restitution" not in available or np.ndim(available["restitution"].value) > 1:
         return {"": (law, _default(law, more))}
-    fields = [name for name in ("restitution", "stiffness") if name in known]
-    others = {name: True for name in more if name in known and name not in fields}
+    fields = [name for name in ("restitution", "stiffness") if name in available]
+    others = {name: True for name in more if name in available and name not in fields}
     if contacts == 1:  # the same program as a plain fit
         return {"": (law, dict.fromkeys(("restitution", *others), True))}
     for name in fields:
-        each = jnp.broadcast_to(known[name].value, (contacts,))
+        each = jnp.broadcast_to(available[name].value, (contacts,))
         law = with_parameter(law, name, each)
     # labels of `free`: equal numbers share one value, 0 is fixed
     each_own = np.arange(1, contacts + 1)
@@ -495,8 +495,8 @@ def _linearized(result: Fit) -> np.ndarray:
     flat = jacobian.reshape(-1, jacobian.shape[-1])
     inverse = np.linalg.pinv(flat.T @ flat, rcond=1e-12, hermitian=True)
     hat = jacobian @ inverse @ np.swapaxes(jacobian, 1, 2)
-    rest = np.eye(hat.shape[-1]) - hat
-    error = np.stack([np.linalg.lstsq(a, b, rcond=1e-9)[0] for a, b in zip(rest, residual)])
+    complement = np.eye(hat.shape[-1]) - hat
+    error = np.stack([np.linalg.lstsq(a, b, rcond=1e-9)[0] for a, b in zip(complement, residual)])
     return result.problem.measurement.errors_of(error)
 
 
@@ -513,9 +513,9 @@ def _paired_p_value(squares: np.ndarray, best: np.ndarray) -> float:
     ones do not dominate.
     """
     both = np.isfinite(squares) & np.isfinite(best)
-    some = both & (squares > 0) & (best > 0)
+    positive = both & (squares > 0) & (best > 0)
     gain = _t_test(squares[both] - best[both], best[both])
-    return min(gain, _t_test(np.log(squares[some]) - np.log(best[some]), 1.0))
+    return min(gain, _t_test(np.log(squares[positive]) - np.log(best[positive]), 1.0))
 
 
 def _t_test(more: np.ndarray, size: Any) -> float:
@@ -579,9 +579,9 @@ def _speed_test(
         options: of `fit`.
     """
     law, free = candidate
-    known, speeds = free_parameters_of(law), data.approach_speed(scene)
+    available, speeds = free_parameters_of(law), data.approach_speed(scene)
     speeds = speeds[speeds > 0]
-    constant_e = "restitution" in known and not known.keys() & set(OF_SPEED)
+    constant_e = "restitution" in available and not available.keys() & set(OF_SPEED)
     if not constant_e or len(speeds) < 2 or np.ptp(speeds) == 0:
         return None, None
     typical = float(np.exp(np.mean(np.log(speeds))))

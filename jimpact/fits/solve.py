@@ -202,8 +202,8 @@ def step_limit(method: Any, stated: int | None) -> int:
     Raises:
         ValueError: an unknown method.
     """
-    known = isinstance(method, str) and method in DEFAULT_STEPS
-    if not known:
+    is_named = isinstance(method, str) and method in DEFAULT_STEPS
+    if not is_named:
         optax = needed("optax", HOW)
         if not isinstance(method, optax.GradientTransformation):
             raise ValueError(
@@ -211,7 +211,7 @@ def step_limit(method: Any, stated: int | None) -> int:
                 f"optax.GradientTransformation, but has value {method!r}."
                 f"{suggestion(method, DEFAULT_STEPS)}"
             )
-    return DEFAULT_STEPS[method if known else "adam"] if stated is None else stated
+    return DEFAULT_STEPS[method if is_named else "adam"] if stated is None else stated
 
 
 def begin(problems: LeastSquares, y: Float[np.ndarray, "S Q"], solver: "Solver") -> SolverState:

@@ -68,9 +68,9 @@ class Variables:
             if parameters.of_fields[prior.parameter] in OF_A_SCENE:  # a gap is far smaller than 1 m
                 natural[prior.parameter] = prior.std
         low, high = (scaled(end, natural, parameters.log) for end in limits)
-        rest = (0, len(fixed) - count)  # behind the P parameters, Q - P entries
-        log, low, high = (np.pad(array, rest) for array in (parameters.log, low, high))
-        return cls(owner, fixed, np.pad(natural, rest, constant_values=1.0), log, low, high)
+        padding = (0, len(fixed) - count)  # behind the P parameters, Q - P entries
+        log, low, high = (np.pad(array, padding) for array in (parameters.log, low, high))
+        return cls(owner, fixed, np.pad(natural, padding, constant_values=1.0), log, low, high)
 
     @full_precision
     def parameters(self, y: Float[AnyArray, " Q"]) -> Float[Array, " Q"]:
