@@ -178,13 +178,17 @@ class AdmissibleMatrices(eqx.Module):
         return jnp.where(share < 1, inside, z)
 
     def share(self, y: Float[Array, " Q"]) -> Float[Array, ""]:
-        """The largest s <= 1 with which `center + s (y - center)` is admissible."""
+        """The largest s <= 1 with which `center + s (y - center)` is admissible.
+
+        First by the linear conditions; then it is shortened until the approaches of `worst`, which
+        change with s, gain no energy.
+        """
         slack, target = self.elementwise(self.center), self.elementwise(y)
         crossed = (target < 0) & (target < slack)  # the others do not change along the ray
         share = jnp.where(crossed, slack / jnp.where(crossed, slack - target, 1.0), 1.0).min()
 
         def shortened(state: _Share) -> _Share:
-            """The share at which no approach that is worst at the last share gains energy."""
+            """The share at which the approaches that are worst at the last one gain no energy."""
             share, _, passes = state
             x = self.worst(self.center + share * (y - self.center))
             nearer = jnp.minimum(share, self._energy_share(y, x).min())

@@ -275,33 +275,35 @@ def _pass(
     best = jax.tree.map(lambda a, b: jnp.where(better, a, b), tried, before)
     y, r = best.y, best.residual
     dtype = str(y.dtype)
-    slope = best.jacobian.T @ r
-    free = _free_gradient(problem, y, slope)
-    of_free = jnp.where((free == 0) & (slope != 0), 0.0, best.jacobian)
+    gradient = best.jacobian.T @ r
+    projected = _free_gradient(problem, y, gradient)
+    # without the columns of variables that are held at a bound
+    free_jacobian = jnp.where((projected == 0) & (gradient != 0), 0.0, best.jacobian)
     floor = jnp.asarray(_LEAST[dtype], y.dtype)
     if method == "levenberg-marquardt":
         memory = state.memory.after(state.cost - cost)
         dampings = jnp.stack([floor, memory.value])  # compiled once
-        moves, gains = jax.vmap(partial(_damped_step, free, of_free))(dampings)
+        moves, gains = jax.vmap(partial(_damped_step, projected, free_jacobian))(dampings)
         gain, trial = gains[0], jnp.clip(y + moves[1], problem.low, problem.high)
         change = best.jacobian @ (trial - y)  # of r in the linear model, after the cut at the box
         memory = memory._replace(promised=-(r @ change) - 0.5 * jnp.sum(change**2))
         stuck = memory.value > _STUCK
     else:
-        gain = _damped_step(free, of_free, floor)[1]
-        gradient = _free_gradient(problem, state.trial, jacobian.T @ residual)
+        gain = _damped_step(projected, free_jacobian, floor)[1]
+        trial_gradient = _free_gradient(problem, state.trial, jacobian.T @ residual)
         # optax itself mixes integers and floats: it needs the standard promotion
         with jax.numpy_dtype_promotion("standard"):
             move, memory = _transformation(method, max_steps).update(
-                gradient,
+                trial_gradient,
                 state.memory,
                 state.trial,
                 value=cost,
-                grad=gradient,
+                grad=trial_gradient,
                 value_fn=partial(_cost, problem),
             )
         trial = jnp.clip(state.trial + move, problem.low, problem.high)
         stuck = jnp.asarray(False)
+    # promises below which the search is done: always, or where no lower point was found
     finest = stop * best.cost / residual.shape[0] + STOP_EXACT[dtype]
     rounding = ROUNDING[dtype] * best.cost / residual.shape[0] + ROUNDING_EXACT[dtype]
     small = gain <= jnp.where(better, finest, jnp.maximum(finest, rounding))
