@@ -45,27 +45,37 @@ NO_SHOT = -1  # the place of a shot where a value belongs to none: a prior
 
 
 class Judged:
-    """A fit before it is reported, with its residuals as the tests need them.
+    """The residuals of a fit at its minimum, with all that the tests of this module need.
 
     Attributes:
+        problem, solution: the least-squares problem and its minimum.
+        robust: True after a fit by a robust loss.
         residual: (R,) of the measured values in units of sigma, those of the priors last.
-        jacobian: (R, P) derivatives.
-        shot: (R,) shots, `NO_SHOT` of priors; `shots`: those that have residuals.
+        jacobian: (R, P) derivatives of the residual in the scaled parameters.
+        shot: (R,) index of the shot of each residual, `NO_SHOT` of priors.
+        shots: indices of the shots that have residuals.
+        used: True for the rows that are in `residual`, of all measured values and priors.
         squares: the sum of squared residuals.
-        stretch: by how much errors are larger than stated, 1 where chi^2 does not reject them.
-        errors: of the parameters; with known errors of the data wider where the law does not fit.
+        stretch: factor by which errors are larger than stated; 1 where chi^2 does not reject them.
+        errors: of the parameters; stated errors of the data are multiplied by `stretch`.
         freedom: degrees of freedom.
     """
 
     def __init__(self, problem: FitProblem, solution: Solution, loss_noise: float | None):
-        """`loss_noise`: noise times the root of the degrees of freedom, of a robust loss."""
+        """Take residuals and errors from the minimum.
+
+        Args:
+            problem: least squares.
+            solution: its minimum.
+            loss_noise: noise times the root of the degrees of freedom after a robust loss, or None.
+        """
         self.problem, self.solution, self.robust = problem, solution, loss_noise is not None
-        minimum, here = solution.starts[0], ~np.isnan(problem.measured).ravel()
-        of_value = np.nonzero(~np.isnan(np.atleast_1d(problem.measured)))[0]
-        self.shot = np.append(of_value, np.full(len(problem.priors), NO_SHOT))
-        self.shots = np.unique(of_value)
-        self.used = used = np.append(here, np.ones(len(problem.priors), bool))
-        # where the law fails, what a search takes for the residual is no error
+        minimum, measured = solution.starts[0], ~np.isnan(problem.measured).ravel()
+        shot = np.nonzero(~np.isnan(np.atleast_1d(problem.measured)))[0]  # of each value
+        self.shot = np.append(shot, np.full(len(problem.priors), NO_SHOT))
+        self.shots = np.unique(shot)
+        self.used = used = np.append(measured, np.ones(len(problem.priors), bool))
+        # not the residual of the search, which is a penalty where the law fails
         errors = problem.measurement.independent(problem.measured - solution.predicted)
         self.residual = np.append(errors, -minimum.residual[errors.size :])[used]
         self.jacobian = minimum.jacobian[used]
@@ -81,13 +91,13 @@ class Judged:
             self.errors = uncertainty(problem, minimum, noise)
 
     def _stretch(self) -> float:
-        """`stretch` of known errors.
+        """Factor on stated errors that chi^2 rejects: `sqrt(chi^2 / degrees of freedom)`, else 1.
 
-        Equation: `sqrt(chi^2 / freedom)`, of all residuals, or of those that are not momentum if
-        that is more: the errors of a law or its parameters are in these.
+        The larger one of two: that of all residuals, and that of residuals without the directions
+        of conserved momentum, as errors of a law are in these only.
         """
         squares, freedom, data = self.squares, self.freedom, self.problem.experiments
-        tests = [(squares, freedom)]
+        tests = [(squares, freedom)]  # chi^2 and its degrees of freedom
         if data is not None and not data.lost_freedom:
             momentum = self.momentum
             squares -= float(np.sum((momentum.T @ self.residual) ** 2))
@@ -97,28 +107,31 @@ class Judged:
 
     @property
     def momentum(self) -> Any:
-        """(R, C) of shots: the directions in which residuals are momentum, a sparse matrix."""
+        """Orthonormal directions (R, C) of residuals that are momentum errors of shots; sparse."""
         of_priors = np.zeros((len(self.problem.priors), 0))
         blocks = [coo_array(block) for block in (*_conserved(self.problem), of_priors)]
         return block_diag(blocks, format="csr")[self.used]
 
     @property
     def inexact(self) -> bool:
-        """Whether there are residuals to test."""
+        """True where residuals can be tested: a degree of freedom is left, the fit is not exact."""
         return self.freedom >= 1 and self.squares > self.problem.exact_squares
 
     @property
     def shows_noise(self) -> bool:
-        """Whether residuals have to show the noise: those of shots without sigma."""
+        """True where the noise is estimated from the residuals: those of shots without sigma."""
         problem = self.problem
         return self.inexact and problem.sigma is None and problem.experiments is not None
 
 
 def unusable(problem: FitProblem, solution: Solution) -> np.ndarray:
-    """Shots (K,) whose impacts fail, or whose derivatives are not finite or absurdly large."""
+    """True for shots (K,) whose impact fails, or has derivatives that are not finite or too large.
+
+    Too large: beyond `ABSURD` times the largest velocity over a natural step of a parameter.
+    """
     if not isinstance(problem.observe, Shots):
         return np.zeros(1, bool)
-    slope = np.abs(problem.of_data(solution.starts[0].jacobian))
+    slope = np.abs(problem.of_data(solution.starts[0].jacobian))  # (K, n, P), over sigma
     allowed = (
         ABSURD
         * float(problem.measurement.unit)
@@ -130,27 +143,31 @@ def unusable(problem: FitProblem, solution: Solution) -> np.ndarray:
 
 
 def _conserved(problem: FitProblem) -> list[np.ndarray]:
-    """Of every shot the directions (n, c) in which residuals are momentum: orthonormal columns."""
+    """Orthonormal directions (n, c) of each shot's residuals in which they are momentum errors.
+
+    Equation: the range of `L^-T diag(sigma) M C`: an error e of v+ changes the conserved momenta
+    `C^T M v` by `(L^-T diag(sigma) M C)^T u`, `u = L e / sigma` its independent residual. No
+    direction of shots with values that were not measured.
+    """
     assert problem.experiments is not None
     bases, balances = [], problem.experiments.balances(problem.scene)
-    for k, ((rows, _, _), w) in enumerate(
-        zip(balances, np.asarray(problem.measurement.weight, float))
-    ):
-        whole = (w > 0).all() and len(rows)
-        back = (rows / w).T if whole else np.zeros((len(w), 0))
-        if whole and problem.measurement.mixing is not None:
-            own = (
-                problem.measurement.mixing[k]
-                if problem.measurement.mixing.ndim == 3
-                else problem.measurement.mixing[k, :, k]
-            )
-            back = np.linalg.solve(np.asarray(own, float).T, back)
-        bases.append(np.linalg.qr(back)[0])
+    mixing, weights = problem.measurement.mixing, np.asarray(problem.measurement.weight, float)
+    for k, ((rows, _, _), weight) in enumerate(zip(balances, weights)):  # rows = C^T M (c, n)
+        complete = (weight > 0).all() and len(rows)
+        directions = (rows / weight).T if complete else np.zeros((len(weight), 0))
+        if complete and mixing is not None:
+            block = mixing[k] if mixing.ndim == 3 else mixing[k, :, k]
+            directions = np.linalg.solve(np.asarray(block, float).T, directions)
+        bases.append(np.linalg.qr(directions)[0])
     return bases
 
 
-def _noise(judged: Judged) -> tuple[float, int]:
-    """Sum of squares that no law can change, and its degrees of freedom."""
+def _pure_error(judged: Judged) -> tuple[float, int]:
+    """Pure error: the sum of squared residuals that no law can change, and its degrees of freedom.
+
+    Equation: over groups of g shots with equal v-, of residuals r_k, their mean m, and the momentum
+    directions B (n, c) of `_conserved`: `sum |r_k - m|^2 + g |B^T m|^2`, `(g - 1) n + c` degrees.
+    """
     problem, experiments = judged.problem, judged.problem.experiments
     assert experiments is not None
     groups: dict[Any, list[int]] = {}
@@ -161,22 +178,25 @@ def _noise(judged: Judged) -> tuple[float, int]:
     squares, count = 0.0, 0
     for shots in groups.values():
         blocks = [judged.residual[judged.shot == k] for k in shots]
-        whole = np.array([block for block in blocks if len(block) == bodies])
-        if len(whole) == 0:
+        complete = np.array([block for block in blocks if len(block) == bodies])
+        if len(complete) == 0:
             continue
-        if (whole == whole[0]).all():  # readings that repeat to the last digit: noise is hidden
-            whole = whole[:1]
-        mean, basis = whole.mean(axis=0), conserved[shots[0]]
-        squares += float(np.sum((whole - mean) ** 2))
-        squares += len(whole) * float(np.sum((basis.T @ mean) ** 2))
-        count += (len(whole) - 1) * bodies + basis.shape[1]
+        if (complete == complete[0]).all():  # readings repeat to the last digit: noise is hidden
+            complete = complete[:1]
+        mean, basis = complete.mean(axis=0), conserved[shots[0]]
+        squares += float(np.sum((complete - mean) ** 2))
+        squares += len(complete) * float(np.sum((basis.T @ mean) ** 2))
+        count += (len(complete) - 1) * bodies + basis.shape[1]
         if experiments.lost_freedom:  # a correction took the momentum of every shot
-            count -= len(whole) * basis.shape[1]
+            count -= len(complete) * basis.shape[1]
     return squares, count
 
 
 def _reading_variance(problem: FitProblem) -> float:
-    """Of readings that were rounded: their last digit squared over 12, in weighted units."""
+    """Variance `d^2 / 12` of rounding to the last decimal d that all readings need, over sigma^2.
+
+    0 for readings of nine decimals or more.
+    """
     values = np.asarray(problem.measured, float)[~np.isnan(problem.measured)]
     largest = np.abs(values).max()
     for digits in range(9):
@@ -186,7 +206,10 @@ def _reading_variance(problem: FitProblem) -> float:
 
 
 def _range(problem: FitProblem, matrix: np.ndarray, size: float | None = None) -> np.ndarray:
-    """Orthonormal columns that span those of the matrix, but for what is small against `size`."""
+    """Orthonormal basis (R, r) of the range of a matrix (R, C): its left singular vectors.
+
+    Without those of singular values below `RANK_TOLERANCE size`; None: `size` is the largest one.
+    """
     u, singular, _ = np.linalg.svd(matrix, full_matrices=False)
     size = singular[0] if size is None else size
     return u[:, singular > RANK_TOLERANCE[problem.precision] * size]
@@ -196,7 +219,7 @@ def _range(problem: FitProblem, matrix: np.ndarray, size: float | None = None) -
 
 
 def _left_out(judged: Judged) -> Iterator[Finding]:
-    """Shots that were left out."""
+    """Yield `left_out`: labels of the shots that the fit has left out."""
     if labels := judged.problem.left_out:
         count = f"{len(labels)} of {len(judged.problem.measured)} shots"
         yield Finding(
@@ -209,12 +232,15 @@ def _left_out(judged: Judged) -> Iterator[Finding]:
 
 
 def _unknown_corrections(judged: Judged) -> Iterator[Finding]:
-    """Shots with `sigma_pre` and a correction that is not that of momentum."""
+    """Yield `unknown_correction`: shots with `sigma_pre` whose correction is not that of momentum.
+
+    They have lost degrees of freedom, but `kept_by_corrections` is the identity.
+    """
     data = judged.problem.experiments
     if data is None or data.sigma_pre is None:
         return
-    whole = kept_by_corrections(data, judged.problem.scene) == np.eye(data.pre.shape[1])
-    unknown = np.flatnonzero((np.array(data.lost) > 0) & whole.all(axis=(1, 2)))
+    identical = kept_by_corrections(data, judged.problem.scene) == np.eye(data.pre.shape[1])
+    unknown = np.flatnonzero((np.array(data.lost) > 0) & identical.all(axis=(1, 2)))
     if unknown.size:
         labels = tuple(data.shots[k] for k in unknown)
         yield Finding(
@@ -228,7 +254,7 @@ def _unknown_corrections(judged: Judged) -> Iterator[Finding]:
 
 
 def _search(judged: Judged) -> Iterator[Finding]:
-    """A kink for a minimum; a search that has not ended."""
+    """Yield `kink` where no step lowers the cost, `not_converged` where the search did not end."""
     if judged.solution.stuck:
         yield Finding(
             "kink",
@@ -243,7 +269,7 @@ def _search(judged: Judged) -> Iterator[Finding]:
 
 
 def _statuses(judged: Judged) -> Iterator[Finding]:
-    """The shots in which the fitted law fails."""
+    """Yield `law_fails` for each failure status, with the shots in which the fitted law has it."""
     data, status = judged.problem.experiments, judged.solution.status
     for code in np.unique(status) if data is not None else ():
         if STATUS[code].failure:
@@ -255,7 +281,10 @@ def _statuses(judged: Judged) -> Iterator[Finding]:
 
 
 def _matrix(judged: Judged) -> Iterator[Finding]:
-    """Conditions on a restitution matrix that it ends at, or that it need not satisfy."""
+    """Yield `matrix_edge` for active admissibility conditions, `matrix_free` where none are asked.
+
+    Both are of a `RestitutionMatrix`.
+    """
     problem, law, data = judged.problem, judged.problem.law, judged.problem.experiments
     if edges := boundary(problem.matrix, problem.variables.point(judged.solution.value)):
         yield Finding(
@@ -274,7 +303,7 @@ def _matrix(judged: Judged) -> Iterator[Finding]:
 
 
 def _not_finite(judged: Judged) -> Iterator[Finding]:
-    """Which values of a user's own function are not finite at the fitted parameters."""
+    """Yield `law_fails` for values of a user's observable that are not finite at the minimum."""
     problem = judged.problem
     lost = np.isfinite(problem.measured) & ~np.isfinite(judged.solution.predicted)
     if problem.experiments is None and lost.any():
@@ -287,8 +316,8 @@ def _not_finite(judged: Judged) -> Iterator[Finding]:
         )
 
 
-def _beyond_sigma(judged: Judged) -> Iterator[Finding]:
-    """Residuals larger than sigma allows."""
+def _above_sigma(judged: Judged) -> Iterator[Finding]:
+    """Yield `lack_of_fit` where chi^2 rejects the stated sigma, with the factor `stretch`."""
     if judged.inexact and judged.stretch > 1:
         how = "are those of the loss" if judged.robust else "are stretched by that"
         yield Finding(
@@ -296,83 +325,99 @@ def _beyond_sigma(judged: Judged) -> Iterator[Finding]:
             f"Lack of fit: the residuals are {judged.stretch:.2g} times what sigma allows (chi^2 = "
             f"{judged.squares:.4g} with {degrees(judged.freedom)}): the law or "
             "the stated errors are wrong, or the parameters scatter; the standard errors "
-            f"{how}.{_held(judged.problem)}",
+            f"{how}.{_friction_note(judged.problem)}",
             numbers={"ratio": judged.stretch, "chi_squared": judged.squares},
         )
 
 
-def _held(problem: FitProblem) -> str:
-    """Says that friction of the law is not fitted, which may be why the law does not fit."""
+def _friction_note(problem: FitProblem) -> str:
+    """A sentence for laws with friction that is not fitted: it may be why the law does not fit."""
     if "friction" not in free_parameters_of(problem.law) or "friction" in problem.fields:
         return ""
     return " The law's `friction` is held at its start: name it in `free` to fit it."
 
 
-def _beyond_noise(judged: Judged) -> Iterator[Finding]:
-    """What the law leaves over, against the noise of momentum and of repeated shots."""
+def _above_pure_error(judged: Judged) -> Iterator[Finding]:
+    """Yield `lack_of_fit` by the F test of lack of fit against pure error, without sigma.
+
+    Equation: `F = ((S - S_e) / (f - f_e)) / (S_e / f_e)`, S the sum of squares of f degrees of
+    freedom, S_e the pure error of f_e (`_pure_error`), not less than the rounding of readings.
+    """
     problem = judged.problem
     if not judged.shows_noise:
         return
-    noise, count = _noise(judged)
-    rest = judged.freedom - count
-    if count < _LEAST or rest < 1:
+    pure_error, error_freedom = _pure_error(judged)
+    law_freedom = judged.freedom - error_freedom
+    if error_freedom < _LEAST or law_freedom < 1:
         return
-    left = max(judged.squares - noise, 0.0)
-    ratio = left / rest / max(noise / count, _reading_variance(problem))
-    if fdtrc(rest, count, ratio) < LEVEL:
+    by_law = max(judged.squares - pure_error, 0.0)
+    variance = max(pure_error / error_freedom, _reading_variance(problem))
+    ratio = by_law / law_freedom / variance
+    if fdtrc(law_freedom, error_freedom, ratio) < LEVEL:
         yield Finding(
             "lack_of_fit",
             f"Lack of fit: the residuals are {np.sqrt(ratio):.2g} times the noise that momentum "
-            f"and repeated shots show ({rest} and {degrees(count)}): the law does not "
-            f"fit, and the standard errors mean little.{_held(problem)}",
+            f"and repeated shots show ({law_freedom} and {degrees(error_freedom)}): the law does "
+            f"not fit, and the standard errors mean little.{_friction_note(problem)}",
             numbers={"ratio": float(np.sqrt(ratio))},
         )
 
 
-def _pattern(judged: Judged) -> Iterator[Finding]:
-    """Whether the residuals are proportional to the velocities before: by an F test."""
-    problem, rest = judged.problem, judged.freedom
-    if not judged.shows_noise or list(_beyond_noise(judged)):  # which says enough
+def _linear_in_velocities(judged: Judged) -> Iterator[Finding]:
+    """Yield `lack_of_fit` where residuals are linear in the velocities before, by an F test.
+
+    Equation: `F = (|E^T r|^2 / q) / ((|r|^2 - |E^T r|^2) / f)`, r without its momentum directions,
+    E (R, q) an orthonormal basis of further regressors: v- of the shots, with coefficients of
+    their own for each body, orthogonal to the Jacobian; f degrees of freedom left.
+    """
+    problem, freedom = judged.problem, judged.freedom
+    if not judged.shows_noise or list(_above_pure_error(judged)):  # which says enough
         return
     assert problem.experiments is not None
     pre = np.asarray(problem.experiments.pre, float)
     u, singular, _ = np.linalg.svd(pre, full_matrices=False)
-    basis = u[:, singular > ROUNDING * singular[0]]
+    basis = u[:, singular > ROUNDING * singular[0]]  # of the columns of v-, over shots
     body = np.broadcast_to(np.arange(pre.shape[1]), problem.measured.shape)
-    body = body[~np.isnan(problem.measured)]
-    more = np.hstack([basis[judged.shot] * (body == i)[:, None] for i in range(pre.shape[1])])
-    momentum, known = judged.momentum, _range(problem, judged.jacobian)
-    # no law explains that part
-    more, residual = (x - momentum @ (momentum.T @ x) for x in (more, judged.residual))
-    rest -= 0 if problem.experiments.lost_freedom else momentum.shape[1]
-    extra = _range(problem, more - known @ (known.T @ more), float(np.linalg.norm(more)))
+    body = body[~np.isnan(problem.measured)]  # the body of each residual
+    of_bodies = [basis[judged.shot] * (body == i)[:, None] for i in range(pre.shape[1])]
+    regressors, momentum = np.hstack(of_bodies), judged.momentum
+    # no law explains momentum errors
+    regressors, residual = (x - momentum @ (momentum.T @ x) for x in (regressors, judged.residual))
+    freedom -= 0 if problem.experiments.lost_freedom else momentum.shape[1]
+    fitted, size = _range(problem, judged.jacobian), float(np.linalg.norm(regressors))
+    extra = _range(problem, regressors - fitted @ (fitted.T @ regressors), size)
     count = extra.shape[1]
-    rest -= count
+    freedom -= count
     explained = float(np.sum((extra.T @ residual) ** 2))
-    left = float(residual @ residual) - explained
-    if rest < _LEAST or left <= 0 or count == 0:
+    unexplained = float(residual @ residual) - explained
+    if freedom < _LEAST or unexplained <= 0 or count == 0:
         return
-    ratio = explained / count / (left / rest)
-    if fdtrc(count, rest, ratio) < LEVEL:
+    ratio = explained / count / (unexplained / freedom)
+    if fdtrc(count, freedom, ratio) < LEVEL:
         yield Finding(
             "lack_of_fit",
             f"Lack of fit: the residuals follow the velocities before the impact (F = {ratio:.3g} "
-            f"with {count} and {degrees(rest)}): the law does not fit.",
+            f"with {count} and {degrees(freedom)}): the law does not fit.",
             numbers={"F": ratio},
         )
 
 
 def _contradicted_priors(judged: Judged) -> Iterator[Finding]:
-    """Priors that the data, fitted without them, would not expect: each against N(0, 1)."""
+    """Yield `prior` for priors that a fit to the data without them contradicts.
+
+    Equation: the studentized residual `r_i / sqrt(1 - H_ii)` against the standard normal
+    distribution, H = U U^T the hat matrix, U an orthonormal basis of the range of the Jacobian; the
+    level is divided by the number of priors (Bonferroni).
+    """
     problem = judged.problem
     if not judged.inexact:
         return
-    known = _range(problem, judged.jacobian)
+    basis = _range(problem, judged.jacobian)
     for row, prior in zip(np.flatnonzero(judged.shot == NO_SHOT), problem.priors):
-        left = 1 - float(known[row] @ known[row])  # variance of the residual; 0: the prior decides
-        if left <= RANK_TOLERANCE[problem.precision]:
+        variance = 1 - float(basis[row] @ basis[row])  # of the residual; 0: the prior decides
+        if variance <= RANK_TOLERANCE[problem.precision]:
             continue
-        far = float(abs(judged.residual[row]) / np.sqrt(left))
+        far = float(abs(judged.residual[row]) / np.sqrt(variance))
         if chdtrc(1, far**2) < LEVEL / len(problem.priors):
             name = problem.names[prior.parameter]
             yield Finding(
@@ -385,7 +430,10 @@ def _contradicted_priors(judged: Judged) -> Iterator[Finding]:
 
 
 def _suspicious(judged: Judged) -> Iterator[Finding]:
-    """Shots that the others, fitted without them, would not expect."""
+    """Yield `suspicious`: outliers among the shots, by the F tests of `_against_others`.
+
+    Their level is divided by the number of shots (Bonferroni).
+    """
     if not judged.inexact or judged.problem.experiments is None:
         return
     labels, count = judged.problem.experiments.shots, len(judged.shots)
@@ -410,31 +458,33 @@ def _suspicious(judged: Judged) -> Iterator[Finding]:
 
 
 def _against_others(judged: Judged) -> Iterable[tuple[int, float, float]]:
-    """Every shot, its sum of squares, how often the noise of the others is as large: F tests.
+    """Index, sum of squares and p-value of each shot, against a fit to the others: F tests.
 
-    The others are fitted without it; after a robust loss their noise is that of the median
-    residual, which many outliers together do not hide in. `sigma`, if known, is the least noise.
+    Equation: `F = (S_k / n) / ((S - S_k) / (f - n))`, n values of shot k, `S_k = r_k^T (I -
+    H_kk)^-1 r_k` what S falls by without it, H the hat matrix, f degrees of freedom. After a robust
+    loss `S_k = |r_k|^2`, against the variance by the median residual, which many outliers together
+    do not hide in. `sigma`, if known, is the least noise; the rounding of readings is added.
     """
     problem, freedom = judged.problem, judged.freedom
-    known, reading = _range(problem, judged.jacobian), _reading_variance(problem)
+    basis, reading = _range(problem, judged.jacobian), _reading_variance(problem)
     median = MEDIAN * float(np.median(np.abs(judged.residual)))
     for k in judged.shots:
         rows = judged.shot == k
-        r, q, n = judged.residual[rows], known[rows], int(rows.sum())
-        rest = MEDIAN_FREEDOM * freedom if judged.robust else freedom - n
-        if rest < _LEAST:
+        r, q, n = judged.residual[rows], basis[rows], int(rows.sum())  # H_kk = q q^T
+        freedom_left = MEDIAN_FREEDOM * freedom if judged.robust else freedom - n
+        if freedom_left < _LEAST:
             continue
         if judged.robust:
             squares, noise = float(r @ r), median**2 * len(judged.residual) / freedom
         else:
             squares = float(r @ np.linalg.lstsq(np.eye(n) - q @ q.T, r, rcond=1e-9)[0])
-            noise = max(judged.squares - squares, 0.0) / rest
+            noise = max(judged.squares - squares, 0.0) / freedom_left
         noise = max(noise + reading, 0.0 if problem.sigma is None else 1.0)
-        yield int(k), squares, float(fdtrc(n, rest, squares / n / noise)) if noise else 0.0
+        yield int(k), squares, float(fdtrc(n, freedom_left, squares / n / noise)) if noise else 0.0
 
 
 def _units(judged: Judged) -> Iterator[Finding]:
-    """How velocities of different units are weighed without sigma."""
+    """Yield `mixed_units`: velocities in m/s and rad/s without sigma, weighed by kinetic energy."""
     data = judged.problem.experiments
     if data is not None and data.sigma is None and len(set(data.units)) > 1:
         yield Finding(
@@ -445,7 +495,7 @@ def _units(judged: Judged) -> Iterator[Finding]:
 
 
 def _at_bounds(judged: Judged) -> Iterator[Finding]:
-    """Parameters at a bound."""
+    """Yield `at_bound` for each parameter that is at its lower or upper bound."""
     for i in np.flatnonzero(judged.solution.at_bound):
         name, value = judged.problem.names[i], judged.solution.value[i]
         upper = value >= judged.problem.domains[i, 1]
@@ -459,7 +509,10 @@ def _at_bounds(judged: Judged) -> Iterator[Finding]:
 
 
 def _choices(judged: Judged) -> Iterator[Finding]:
-    """Fewer parameters determined than fitted, or several minima that fit as well as the best."""
+    """Yield `undetermined` where the rank is below P, or `several_minima` that fit equally well.
+
+    Equally well: the sums of squares differ by less than `EQUALLY_GOOD` variances of the noise.
+    """
     rank, count = judged.errors.rank, len(judged.problem.names)
     minima, noise = judged.solution.starts, np.nan_to_num(judged.errors.noise)
     more = max(EQUALLY_GOOD * noise**2, judged.problem.exact_squares)
@@ -477,7 +530,7 @@ def _choices(judged: Judged) -> Iterator[Finding]:
 
 
 def _unknown_errors(judged: Judged) -> Iterator[Finding]:
-    """Data without sigma that do not show their noise."""
+    """Yield `unknown_errors`: without sigma no degree of freedom is left, or the fit is exact."""
     if judged.problem.sigma is not None:
         return
     if judged.freedom < 1:
@@ -494,7 +547,7 @@ def _unknown_errors(judged: Judged) -> Iterator[Finding]:
 
 
 def _precision(judged: Judged) -> Iterator[Finding]:
-    """Fits in single precision."""
+    """Yield `single_precision` for a fit in float32."""
     if judged.problem.precision == "float32":
         yield Finding(
             "single_precision",
@@ -505,13 +558,13 @@ def _precision(judged: Judged) -> Iterator[Finding]:
 
 FIT_CHECKS = (
     *(_unknown_corrections, _search, _statuses, _matrix, _not_finite),
-    *(_beyond_sigma, _beyond_noise, _pattern, _contradicted_priors, _suspicious),
+    *(_above_sigma, _above_pure_error, _linear_in_velocities, _contradicted_priors, _suspicious),
     *(_units, _at_bounds, _choices, _unknown_errors, _precision),
 )
 
 
 def fit_findings(judged: Judged) -> list[Finding]:
-    """All findings, those about the data first."""
+    """All findings of a fit: shots left out, checks of the data, checks of the fit."""
     problem, data = judged.problem, judged.problem.experiments
     found = list(_left_out(judged))
     if data is not None:

@@ -1,12 +1,14 @@
 """Covariances of the velocities (v-, v+) of measured shots: one for each shot, or of all shots.
 
-Of each shot: (K, 2n, 2n). Of all shots: (2nK, 2nK), in the order v-, v+ of shot 1, of shot 2, ...
+Of each shot: (K, N, N) with N = 2n. Of all shots: (M, M) with M = N K, in the order v-, v+ of shot
+1, of shot 2, ...
 """
 
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 from scipy.linalg import block_diag
 
 from jimpact.tools.checks import as_float_array, check_concrete, check_values
@@ -17,23 +19,32 @@ from jimpact.tools.checks import as_float_array, check_concrete, check_values
 ROUNDING = 1e-10
 
 
-def as_covariance(value: Any, shape: tuple[int, int]) -> np.ndarray:
-    """A checked covariance of K shots of n velocities (`shape`); of all shots only if they share.
+def as_covariance(
+    value: Any, shape: tuple[int, int]
+) -> Float[np.ndarray, "K N N"] | Float[np.ndarray, "M M"]:
+    """The checked covariance of the errors of (v-, v+) of K shots of n velocities.
 
-    That of a shot must be positive definite, but for v- of variance 0, which are exact. That of all
-    shots may be singular: without a force v+ of an impact is v- of the next.
+    It must be positive definite for each shot, but for v- of variance 0, which are exact. That of
+    all shots may be singular: without a force v+ of an impact is v- of the next.
+
+    Args:
+        value: of each shot, or of all shots.
+        shape: (K, n).
+
+    Returns:
+        That of all shots only where errors of different shots are correlated.
     """
     check_concrete("covariance", value)
     as_float_array("covariance", value)  # raises for what are no numbers
-    # all digits, as those of an impact may be nearly those of another
+    # in double precision, as errors of one impact may be nearly those of another
     (count, n), array = shape, np.asarray(value, float)
-    each, whole = (count, 2 * n, 2 * n), (2 * n * count, 2 * n * count)
-    if array.shape == each[1:] and count == 1:
+    of_each, of_all = (count, 2 * n, 2 * n), (2 * n * count, 2 * n * count)
+    if array.shape == of_each[1:] and count == 1:
         array = array[None]
-    if array.shape not in (each, whole):
+    if array.shape not in (of_each, of_all):
         raise ValueError(
-            f"Argument `covariance` must have shape {each}, (v-, v+) of each shot, or {whole}, of "
-            f"all shots, but has shape {array.shape}."
+            f"Argument `covariance` must have shape {of_each}, (v-, v+) of each shot, or {of_all}, "
+            f"of all shots, but has shape {array.shape}."
         )
     check_values("covariance", array)
     blocks = diagonal_blocks(array, 2 * n)
@@ -47,26 +58,35 @@ def as_covariance(value: Any, shape: tuple[int, int]) -> np.ndarray:
     return array
 
 
-def _check_positive(matrix: np.ndarray, where: str, exact: np.ndarray, least: float) -> None:
-    """Raise unless symmetric and positive; `exact`: entries that may have no error."""
+def _check_positive(
+    matrix: Float[np.ndarray, "N N"], where: str, exact: Bool[np.ndarray, " N"], least: float
+) -> None:
+    """Raise a ValueError unless a covariance is symmetric and its correlation positive definite.
+
+    Args:
+        matrix: covariance.
+        where: end of the message.
+        exact: True for entries that may have variance 0.
+        least: lowest eigenvalue of the correlation that is allowed.
+    """
     must = "Argument `covariance` must be"
     variance = np.diagonal(matrix)
     sizes = np.sqrt(np.abs(np.outer(variance, variance)))
     if not (np.abs(matrix - matrix.T) <= ROUNDING * sizes).all():
         raise ValueError(f"{must} symmetric, but is not{where}.")
-    none = (variance == 0) & exact & ~matrix.any(axis=1)
-    some = np.ix_(~none, ~none)
-    if not (variance[~none] > 0).all():
+    uncertain = ~((variance == 0) & exact & ~matrix.any(axis=1))
+    if not (variance[uncertain] > 0).all():
         raise ValueError(f"{must} positive definite, but has a variance <= 0{where}.")
-    lowest = np.linalg.eigvalsh(matrix[some] / sizes[some])[0]
+    block = np.ix_(uncertain, uncertain)
+    lowest = np.linalg.eigvalsh(matrix[block] / sizes[block])[0]
     if lowest < least:
         raise ValueError(
             f"{must} positive definite, but its correlation has the eigenvalue {lowest:.3g}{where}."
         )
 
 
-def diagonal_blocks(covariance: Any, size: int) -> np.ndarray:
-    """(K, size, size): of each shot, also where the covariance is that of all."""
+def diagonal_blocks(covariance: Any, size: int) -> Float[np.ndarray, "K N N"]:
+    """The covariance of each shot: as it is, or the diagonal blocks of that of all shots."""
     array = np.asarray(covariance, float)
     if array.ndim == 3:
         return array
@@ -74,8 +94,10 @@ def diagonal_blocks(covariance: Any, size: int) -> np.ndarray:
     return array.reshape(count, size, count, size)[np.arange(count), :, np.arange(count)]
 
 
-def covariance_of(covariance: Any, shots: np.ndarray, n: int) -> np.ndarray:
-    """That of some shots (indices from 0) of n velocities."""
+def covariance_of(
+    covariance: Any, shots: Int[np.ndarray, " S"], n: int
+) -> Float[np.ndarray, "S N N"] | Float[np.ndarray, "M M"]:
+    """Covariance of (v-, v+) of some shots (indices from 0) of n velocities, in the same form."""
     array = np.asarray(covariance, float)
     if array.ndim == 3:
         return array[shots]
@@ -84,14 +106,16 @@ def covariance_of(covariance: Any, shots: np.ndarray, n: int) -> np.ndarray:
 
 
 def joined_covariance(many: Sequence[Any]) -> np.ndarray:
-    """That of the shots of several sets whose errors are independent."""
+    """Covariance of the shots of several sets, one after the other, with independent errors."""
     if all(each.ndim == 3 for each in many):
         return np.concatenate(many)
     return block_diag(*(block_diag(*each) if each.ndim == 3 else each for each in many))
 
 
-def moved_covariance(covariance: Any, gain: np.ndarray) -> np.ndarray:
-    """`G C G^T` of values G (v-, v+) of each shot, gain (K, m, 2n): (K, m, m), or (K, m, K, m)."""
+def moved_covariance(
+    covariance: Any, gain: Float[np.ndarray, "K m N"]
+) -> Float[np.ndarray, "K m m"] | Float[np.ndarray, "K m K m"]:
+    """The covariance `G C G^T` of values `G (v-, v+)` of each shot, or of all, G the gain."""
     array = np.asarray(covariance, float)
     if array.ndim == 3:
         return gain @ array @ gain.swapaxes(1, 2)
@@ -100,18 +124,26 @@ def moved_covariance(covariance: Any, gain: np.ndarray) -> np.ndarray:
     return np.einsum("kia,kalb,ljb->kilj", gain, blocks, gain, optimize=True)
 
 
-def whitening(covariance: np.ndarray, here: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Standard errors (K, n) of values, and what makes errors in units of these independent.
+def whitening(
+    covariance: Float[np.ndarray, "K n n"] | Float[np.ndarray, "K n K n"],
+    used: Bool[np.ndarray, "K n"],
+) -> tuple[Float[np.ndarray, "K n"], Float[np.ndarray, "K n n"] | Float[np.ndarray, "K n K n"]]:
+    """Standard errors of values, and the whitening matrices of their errors.
+
+    Equation: `L = F^-1`, F the Cholesky factor of the correlation: `L e / sigma` are independent.
 
     Args:
-        covariance: (K, n, n), or (K, n, K, n).
-        here: (K, n), whether a value takes part; others are left out as if not measured.
+        covariance: of the values of each shot, or of all.
+        used: True for values that take part; others count as independent, of error 1.
+
+    Returns:
+        sigma, and L in the shape of the covariance.
 
     Raises:
         ValueError: a combination of the values has no error.
     """
-    rows = here if covariance.ndim == 3 else here.reshape(1, -1)
-    size = rows.shape[1]
+    rows = used if covariance.ndim == 3 else used.reshape(1, -1)
+    size = rows.shape[1]  # of one matrix for each shot, or of one for all
     matrices = covariance.reshape(-1, size, size)
     matrices = np.where(rows[:, :, None] & rows[:, None, :], matrices, np.eye(size))
     errors = np.sqrt(np.diagonal(matrices, axis1=1, axis2=2))
@@ -122,4 +154,4 @@ def whitening(covariance: np.ndarray, here: np.ndarray) -> tuple[np.ndarray, np.
             "Argument `covariance` must leave an error in each velocity after an impact that the "
             "law predicts from those before, but is singular there: are shots in it twice?"
         ) from None
-    return errors.reshape(here.shape), np.linalg.inv(factor).reshape(covariance.shape)
+    return errors.reshape(used.shape), np.linalg.inv(factor).reshape(covariance.shape)

@@ -97,8 +97,8 @@ class Experiments(eqx.Module):
         resolution: Any = None,
         covariance: Any = None,
     ):
-        self.pre = _as_rows("pre", pre)
-        self.post = _as_rows("post", post)
+        """Check and convert the arguments; resolution and covariance determine sigma."""
+        self.pre, self.post = _as_rows("pre", pre), _as_rows("post", post)
         if self.pre.shape != self.post.shape:
             raise ValueError(
                 "Arguments `pre` and `post` must have the same shape, "
@@ -129,8 +129,7 @@ class Experiments(eqx.Module):
                 "before and after the impact weigh against each other."
             )
         self.scenes = None if scenes is None else _as_scenes(scenes, self.pre.shape)
-        labels = shots if shots is not None else range(1, len(measured) + 1)
-        self.shots = tuple(str(label) for label in labels)
+        self.shots = tuple(map(str, range(1, len(measured) + 1) if shots is None else shots))
         if len(self.shots) != len(measured):
             raise ValueError(
                 f"Argument `shots` must have {len(measured)} labels, one per shot, "
@@ -147,7 +146,7 @@ class Experiments(eqx.Module):
             )
 
     def __str__(self) -> str:
-        """How many shots, what is known of their errors, and the first of them."""
+        """Number of shots, units, missing values, the range of sigma, and the first shots."""
         count, n = self.pre.shape
         missing, sigma = int((~self.measured).sum()), self.sigma
         units = ", ".join(dict.fromkeys(self.units))
@@ -205,7 +204,7 @@ class Experiments(eqx.Module):
         return _filled([m @ (post - pre) for m, pre, post in self.balances(scene)])
 
     def momentum_ratio(self, scene: Scene | None = None) -> np.ndarray:
-        """Conserved momentum after over before in a scene (K, c); inf or NaN where none was."""
+        """`C^T M v+ / C^T M v-` (K, c) in a scene, see `momentum_excess`; inf or NaN over 0."""
         rows = []
         with np.errstate(divide="ignore", invalid="ignore"):
             for m, pre, post in self.balances(scene):
@@ -234,16 +233,16 @@ class Experiments(eqx.Module):
         >>> [round(float(v), 6) for v in corrected.post[0]]
         [0.15, 0.85]
         """
-        post, lost, after = np.array(self.post, dtype=float), list(self.lost), _after(self)
-        for k, (m, pre, row) in enumerate(self.balances(scene)):
-            if len(m) == 0 or np.isnan(row).any():
+        corrected, lost, after = np.array(self.post, dtype=float), list(self.lost), _after(self)
+        for k, (m, pre, post) in enumerate(self.balances(scene)):
+            if len(m) == 0 or np.isnan(post).any():
                 continue
-            post[k] -= _smallest_change(after[k], m) @ (m @ (row - pre))
+            corrected[k] -= _smallest_change(after[k], m) @ (m @ (post - pre))
             lost[k] += len(m)
-        return self._with(post=post, lost_freedom=lost)
+        return self._with(post=corrected, lost_freedom=lost)
 
     def _with(self, **changed: Any) -> "Experiments":
-        """A copy with other fields."""
+        """A copy with some arguments changed, by name; all are checked anew."""
         fields = self._of_each_shot() | {"units": self.units} | changed
         if fields["covariance"] is not None:  # the errors follow from it
             fields |= {"sigma": None, "sigma_pre": None}
@@ -251,12 +250,12 @@ class Experiments(eqx.Module):
         copy = Experiments(**fields)
         if resolution is None:
             return copy
-        # what it adds to sigma is there already
+        # set afterwards: sigma has the error of rounding already
         steps = np.asarray(resolution)
         return eqx.tree_at(lambda x: x.resolution, copy, steps, is_leaf=lambda x: x is None)
 
     def _of_each_shot(self) -> dict[str, Any]:
-        """What each shot has, by the name of its argument; None: no shot has it."""
+        """Arguments with one entry for each shot, by name; None where the shots have none."""
         values = {name: getattr(self, name) for name in _VALUES}
         fields: dict[str, Any] = {
             name: None if x is None else np.asarray(x) for name, x in values.items()
@@ -265,7 +264,7 @@ class Experiments(eqx.Module):
         return fields | shots | {"covariance": self.covariance}
 
     def with_contacts(self, contacts: int | Sequence[int]) -> "Experiments":
-        """The shots on such numbers of `contacts`."""
+        """The shots whose scenes have one of these numbers of contacts."""
         chosen = np.isin(self.contacts, contacts)
         if not chosen.any():
             numbers = ", ".join(map(str, sorted(set(self.contacts))))
@@ -273,7 +272,7 @@ class Experiments(eqx.Module):
         return self.only(chosen)
 
     def only(self, which: Any) -> "Experiments":
-        """Some of the shots: `which`, by indices (from 0) or a boolean for each.
+        """The shots at `which`: indices (from 0), or a boolean for each shot.
 
         >>> import jimpact as ji
         >>> data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.3, 0.7], [0.6, 1.4]])
@@ -283,12 +282,12 @@ class Experiments(eqx.Module):
         rows = np.arange(len(self.shots))[which]
         fields = self._of_each_shot()
         covariance = fields.pop("covariance")
-        some: dict[str, Any] = {
+        chosen: dict[str, Any] = {
             k: None if x is None else [x[i] for i in rows] for k, x in fields.items()
         }
         if covariance is not None:
-            some["covariance"] = covariance_of(covariance, rows, self.pre.shape[1])
-        return self._with(**some)
+            chosen["covariance"] = covariance_of(covariance, rows, self.pre.shape[1])
+        return self._with(**chosen)
 
     def __add__(self, other: "Experiments") -> "Experiments":
         """These shots and others, see `join`."""
@@ -332,8 +331,8 @@ class Experiments(eqx.Module):
             joined["covariance"] = joined_covariance([data.joint for data in many])
         for name in columns[0]:
             parts = [each[name] for each in columns]
-            known = all(part is not None for part in parts)
-            joined[name] = [row for part in parts for row in part] if known else None
+            all_have_it = all(part is not None for part in parts)
+            joined[name] = [row for part in parts for row in part] if all_have_it else None
         if len(set(joined["shots"])) < len(joined["shots"]):
             sets = enumerate(many, 1)
             joined["shots"] = [f"{i}/{label}" for i, data in sets for label in data.shots]
@@ -359,7 +358,7 @@ class Experiments(eqx.Module):
         return np.array(self.each(None, lambda scene: scene.contacts))
 
     def approach_speed(self, scene: Scene | None = None) -> np.ndarray:
-        """Speed (K,) of the fastest approach at a closed contact of its scene before a shot [m/s].
+        """Largest approach speed `max(0, -N^T v-)` (K,) of closed contacts of the scene [m/s].
 
         >>> import jimpact as ji
         >>> data = ji.Experiments(pre=[1.0, 0.25], post=[0.2, 0.9])
@@ -371,7 +370,7 @@ class Experiments(eqx.Module):
         return np.array([max(-gamma.min(initial=0.0), 0.0) for gamma in rates])
 
     def natural_errors(self, scene: Scene | None = None) -> np.ndarray:
-        """Error in each velocity (n,) of a scene that counts as 1 m/s: 1, in rad/s by energy.
+        """Errors (n,) of equal weight in a scene: 1 m/s, and those rad/s of as much energy.
 
         Equation: `sqrt(mean M_ii of the velocities in m/s / mean M_ii of those in rad/s)`.
         """
@@ -382,16 +381,16 @@ class Experiments(eqx.Module):
         return np.where(turns, np.sqrt(masses[~turns].mean() / masses[turns].mean()), 1.0)
 
     def balances(self, scene: Scene | None) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """Of every shot in its scene: C^T M (c, n), v-, v+."""
+        """`C^T M` (c, n) of `momentum_excess`, v- (n,) and v+ (n,) of each shot in its scene."""
         pre, post = np.asarray(self.pre, float), np.asarray(self.post, float)
         return [(rows, a, b) for rows, a, b in zip(self.each(scene, conserved_momenta), pre, post)]
 
     def each(self, scene: Scene | None, function: Callable[[Scene], Any]) -> list[Any]:
-        """`function` of the scene of every shot; of one that several shots have only once."""
+        """K values `function(scene)` of the scenes of the shots; once for a scene they share."""
         if self.scenes is not None:
-            different = {id(own): own for own in self.scenes}
-            values = {key: function(own) for key, own in different.items()}
-            return [values[id(own)] for own in self.scenes]
+            different = {id(each): each for each in self.scenes}
+            values = {key: function(each) for key, each in different.items()}
+            return [values[id(each)] for each in self.scenes]
         if scene is None:
             raise ValueError(
                 "Argument `scene` must be a Scene where the experiments carry none, but is None."
@@ -405,7 +404,7 @@ class Experiments(eqx.Module):
 
 
 def _after(data: Experiments) -> np.ndarray:
-    """Covariances (K, n, n) of v+, identities where nothing is known."""
+    """Covariance (K, n, n) of v+ of each shot; the identity where no error is known."""
     (count, n), joint = data.pre.shape, data.joint
     if joint is None:
         return np.tile(np.eye(n), (count, 1, 1))
@@ -413,13 +412,16 @@ def _after(data: Experiments) -> np.ndarray:
 
 
 def _smallest_change(after: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """The least change (n, c) of v+ of a covariance (n, n) for momenta of rows (c, n)."""
+    """`S m^T (m S m^T)^-1` (n, c), S = `after` (n, n), m = `rows` = C^T M (c, n).
+
+    Its columns are the changes of v+, least in the norm of S^-1, by one unit of each momentum.
+    """
     weighted = after @ rows.T
     return np.asarray(weighted @ np.linalg.inv(rows @ weighted))
 
 
 def kept_by_corrections(data: Experiments, scene: Scene | None) -> np.ndarray:
-    """(K, n, n) projectors by which the momentum of shots was corrected, identities if it was not.
+    """Projectors (K, n, n) of the momentum corrections of shots; identities where there was none.
 
     Equation: `I - S m^T (m S m^T)^-1 m` with m = C^T M and S the covariance of v+.
     """
@@ -432,19 +434,22 @@ def kept_by_corrections(data: Experiments, scene: Scene | None) -> np.ndarray:
 
 
 def _filled(rows: list[np.ndarray]) -> np.ndarray:
-    """Rows of one length; shots whose contacts can change more momenta have NaN at the end."""
+    """Rows of different lengths as an array (K, c), with NaN behind shorter ones."""
     columns = list(zip_longest(*rows, fillvalue=np.nan))
     return np.array(columns, float).reshape(-1, len(rows)).T
 
 
 def conserved_momenta(scene: Scene) -> np.ndarray:
-    """`C^T M` (c, n): C spans the complement of all contact and constraint directions."""
+    """`C^T M` (c, n): C spans the orthogonal complement of all normals, tangents, constraints.
+
+    Each column of C is scaled to a largest entry of 1.
+    """
     others = [x for x in (scene.tangents, scene.constraints) if x is not None]
     forces = np.hstack([np.asarray(x, float) for x in (scene.normals, *others)])
     u, singular, _ = np.linalg.svd(forces)
     rank = int((singular > singular[0] * max(forces.shape) * np.finfo(float).eps).sum())
     complement = u[:, rank:]
-    largest = np.argmax(np.abs(complement).round(12), axis=0)
+    largest = np.argmax(np.abs(complement).round(12), axis=0)  # the first of equal ones
     return (complement / complement[largest, np.arange(complement.shape[1])]).T @ dense_mass(scene)
 
 
@@ -470,7 +475,7 @@ def _check_alone(given: str, others: dict[str, Any]) -> None:
 
 
 def _as_rows(name: str, value: Any) -> jax.Array:
-    """Velocities as (K, n)."""
+    """Velocities as an array (K, n), of one shot (1, n)."""
     array = as_float_array(name, value)
     check_concrete(name, array)
     array = array[None, :] if array.ndim == 1 else array
@@ -483,7 +488,7 @@ def _as_rows(name: str, value: Any) -> jax.Array:
 
 
 def _as_sigma(name: str, value: Any, measured: np.ndarray, zero: bool = False) -> jax.Array | None:
-    """Standard errors as (K, n), NaN where no value was measured; `zero`: whether 0 is allowed."""
+    """Standard errors as (K, n), NaN where no value was measured; `zero`: 0 is allowed."""
     if value is None:
         return None
     sigma = as_float_array(name, value)
@@ -567,7 +572,10 @@ def read_experiments(
 def _scenes_of(
     path: str | Path, values: dict[str, np.ndarray], place: Scene | Body | None, near: float
 ) -> list[Scene] | None:
-    """The scenes of the shots of a file, None if they have none of their own."""
+    """Scenes of the shots by the columns q, mass, gap of a file; None without such columns.
+
+    `place` is the `Body` that q places, or the chain whose masses or gaps are replaced.
+    """
     columns = [kind for kind in ("q", "mass", "gap") if kind in values]
     if not columns:
         return None

@@ -57,19 +57,18 @@ def share(count: int, total: int) -> str:
 
 
 class _Defect(NamedTuple):
-    """By how much a balance of the k-th shot fails, its scale, the momentum or energy before, a
-    ratio, the standard error of the excess (with a sigma of 1 where it is not known)."""
+    """The balance of a momentum [N s], or of the energy [J], of a shot."""
 
-    k: int
-    excess: float
-    scale: float
+    k: int  # index of the shot
+    excess: float  # after less before
+    scale: float  # sum |m v-|, or the energy before
     before: float
-    ratio: float
-    error: float
+    ratio: float  # 1: conserved; see `DataBalances`
+    error: float  # standard error of the excess; with a sigma of 1 where it is not known
 
 
 class DataBalances:
-    """Measured shots with the balances of each; those with missing values are not judged.
+    """Balances of momentum and energy of measured shots; those with missing values have none.
 
     Momentum is reported as `1 + excess / sum |m v-|`, the excess in the direction of the momentum
     before: after over before where all bodies move one way. Without `sigma` the shots show their
@@ -88,23 +87,28 @@ class DataBalances:
     def __init__(
         self, experiments: Experiments, scene: Scene | None, stored_energy: float, uses_gaps: bool
     ):
+        """Compute the balances of all shots; arguments as of the class.
+
+        Momentum: excess `C^T M (v+ - v-)`, scale `sum |m v-|`. Energy: `T+ - T- - stored_energy`.
+        """
         self.experiments, self.scene = experiments, scene
         self.stored_energy, self.uses_gaps = stored_energy, uses_gaps
         self.total = len(experiments.shots)
         self.momenta: dict[int, list[_Defect]] = {}  # by the momentum that is conserved
         self.energies: list[_Defect] = []
         count, n = experiments.pre.shape
-        joint = np.tile(np.diag(np.repeat([0.0, 1.0], n)), (count, 1, 1))  # where nothing is known
+        # covariance of (v-, v+); where it is not known, v+ have errors of 1 m/s
+        joint = np.tile(np.diag(np.repeat([0.0, 1.0], n)), (count, 1, 1))
         if experiments.joint is not None:
             joint = diagonal_blocks(experiments.joint, 2 * n)
         balances = zip(experiments.balances(scene), experiments.each(scene, dense_mass), joint)
         for k, ((rows, pre, post), mass, covariance) in enumerate(balances):
             if np.isnan(post).any():
                 continue
-            for j, row in enumerate(rows):
+            for j, row in enumerate(rows):  # row @ v is a momentum
                 excess, scale, before = row @ (post - pre), np.abs(row) @ np.abs(pre), row @ pre
-                back = before < -ROUNDING * scale
-                ratio = 1 + (-excess if back else excess) / scale if scale else np.inf
+                is_negative = before < -ROUNDING * scale
+                ratio = 1 + (-excess if is_negative else excess) / scale if scale else np.inf
                 error = _error(np.append(-row, row), covariance)
                 defect = _Defect(k, excess, scale, before, ratio, error)
                 self.momenta.setdefault(j, []).append(defect)
@@ -114,16 +118,16 @@ class DataBalances:
             self.energies.append(_Defect(k, gain, t_minus, t_minus, ratio, error))
 
     def approaching(self, normals_of: Callable[[Scene], np.ndarray]) -> np.ndarray:
-        """Shots (K,) in which one of the contacts with these normals approaches."""
+        """True for shots (K,) in which one of the contacts with these normals approaches."""
         pairs = zip(self.experiments.each(self.scene, normals_of), np.asarray(self.experiments.pre))
         return np.array([_approaches(normals, pre) for normals, pre in pairs])
 
     def labels(self, shots: Iterable[int]) -> tuple[str, ...]:
-        """Of these shots."""
+        """Labels of these shots."""
         return tuple(self.experiments.shots[k] for k in shots)
 
     def listed(self, ratios: dict[int, float]) -> str:
-        """Shots with their ratios, or the range of the ratios of many."""
+        """Labels of shots with their ratios, as text; of many, their number and the range."""
         if len(ratios) <= LISTED:
             shots = self.experiments.shots
             return ", ".join(f"shot {shots[k]}: {r:.4f}" for k, r in ratios.items())
@@ -131,29 +135,41 @@ class DataBalances:
         return f"{len(ratios)} of {self.total} shots, {min(values):.4f} to {max(values):.4f}"
 
     def beyond(self, defects: list[_Defect], level: float, gains: bool = False) -> dict[int, float]:
-        """Shots whose balance fails by more than their noise, with ratios; gains: upwards only."""
+        """Ratios, by shot, of the balances that fail by more than the noise.
+
+        With sigma: an excess beyond a multiple of its standard error. Without: more than
+        `DEFECT_TOLERANCE` of the scale, if t tests show that the shots have an excess in common, in
+        proportion to its standard error, or to the momentum or energy before; or if half of the
+        defects are beyond `GROSS`, or there is one shot; or, of gains, those that are outliers.
+
+        Args:
+            defects: of one momentum, or of the energy, one for each shot.
+            level: how often honest shots may be reported together.
+            gains: only excesses > 0 count.
+        """
         _, excess, scale, before, _, error = np.array(defects).reshape(-1, 6).T
-        size, known = excess if gains else np.abs(excess), self.experiments.sigma is not None
+        size, has_sigma = excess if gains else np.abs(excess), self.experiments.sigma is not None
         sigmas = max(DEFECT_SIGMAS, float(ndtri(1 - 0.5 * level / max(len(defects), 1))))
-        beyond = size > (sigmas * error if known else DEFECT_TOLERANCE * scale)
+        beyond = size > (sigmas * error if has_sigma else DEFECT_TOLERANCE * scale)
         flagged = {d.k: d.ratio for d, far in zip(defects, beyond) if far}
-        if known or len(defects) < 2 or not flagged or np.mean(size > GROSS * scale) >= 0.5:
+        if has_sigma or len(defects) < 2 or not flagged or np.mean(size > GROSS * scale) >= 0.5:
             return flagged
-        alone = self._beyond_scatter(defects) if gains else set()
-        if alone:
-            return {k: ratio for k, ratio in flagged.items() if k in alone}
-        some = error > 0
-        weight = 1 / error[some]
-        shapes = np.sign(weight), weight * before[some]
-        chance = min(_chance(weight * excess[some], shape, gains) for shape in shapes)
+        outliers = self._gain_outliers(defects) if gains else set()
+        if outliers:
+            return {k: ratio for k, ratio in flagged.items() if k in outliers}
+        has_error = error > 0
+        weight = 1 / error[has_error]
+        # excess / error is compared with a constant, and with before / error
+        shapes = np.sign(weight), weight * before[has_error]
+        chance = min(_p_value(weight * excess[has_error], shape, gains) for shape in shapes)
         return flagged if chance < level / len(shapes) else {}
 
-    def _beyond_scatter(self, gains: list[_Defect]) -> set[int]:
-        """Shots that gain energy, and do so beyond the noise that the scatter of all shots shows.
+    def _gain_outliers(self, gains: list[_Defect]) -> set[int]:
+        """Indices of shots whose gain of energy is an outlier among all shots, without sigma.
 
-        Excesses over their standard errors with a sigma of 1 [m/s] scatter by the noise about what
-        the shots have in common, but for some: the shorter half of them has its length, of energy
-        and momentum. Student's t for each shot.
+        Excesses over their standard errors (of a sigma of 1 m/s) scatter by the noise about their
+        median; the noise is the root mean square of `_shorter_half` of energy and momenta, which
+        outliers hardly change. The limit is that of Student's t.
         """
         groups = [gains, *self.momenta.values()]
         values = [np.array([d.excess / d.error for d in each if d.error > 0]) for each in groups]
@@ -167,19 +183,20 @@ class DataBalances:
 
 
 def _error(gradient: np.ndarray, covariance: np.ndarray) -> float:
-    """Standard error of what has this gradient (2n,) in (v-, v+)."""
+    """Standard error `sqrt(g^T S g)` of a function with the gradient g (2n,) in (v-, v+)."""
     return float(np.sqrt(max(gradient @ covariance @ gradient, 0.0)))
 
 
 def wrong_unit(experiments: Experiments, scene: Scene | None) -> str:
-    """What speaks for a wrong unit, '' if nothing does: by the data alone, before any search."""
+    """The sentence of the finding `units`, by the data alone; '' where units seem right."""
     return next((found.line for found in _units(DataBalances(experiments, scene, 0.0, True))), "")
 
 
 def _units(data: DataBalances) -> Iterator[Finding]:
-    """Whether velocities after are those before but for a factor that a wrong unit leaves.
+    """Yield `units` where velocities after exceed those before by the factor of a wrong unit.
 
-    By the momentum that is conserved; where none is, by the energy where it grows.
+    The factor is the median ratio of the conserved momenta; where there are none, the median root
+    of the ratio of energies that grow.
     """
     ratios = [d.ratio for each in data.momenta.values() for d in each]
     gains = [np.sqrt(d.ratio) for d in data.energies if d.ratio > 1]
@@ -202,7 +219,7 @@ def _units(data: DataBalances) -> Iterator[Finding]:
 
 
 def _momentum(data: DataBalances) -> Iterator[Finding]:
-    """Shots that break a momentum beyond their noise, and the rms that this alone leaves."""
+    """Yield `momentum`: shots that break a balance of momentum, and the rms that this leaves."""
     level = DEFECT_LEVEL / max(len(data.momenta), 1)
     ratios = {k: r for each in data.momenta.values() for k, r in data.beyond(each, level).items()}
     if not ratios:
@@ -222,7 +239,7 @@ def _momentum(data: DataBalances) -> Iterator[Finding]:
 
 
 def _energy(data: DataBalances) -> Iterator[Finding]:
-    """Shots that gain energy beyond their noise."""
+    """Yield `energy_gain`: shots whose kinetic energy grows by more than their noise."""
     if ratios := data.beyond(data.energies, DEFECT_LEVEL, gains=True):
         yield Finding(
             "energy_gain",
@@ -233,7 +250,7 @@ def _energy(data: DataBalances) -> Iterator[Finding]:
 
 
 def _resting(data: DataBalances) -> Iterator[Finding]:
-    """Shots in which no contact approaches."""
+    """Yield `no_approach`: shots in which no contact approaches that takes part in the law."""
     if data.stored_energy:
         return
     closed, possible = map(data.approaching, (closed_normals, possible_normals))
@@ -252,14 +269,17 @@ def _resting(data: DataBalances) -> Iterator[Finding]:
 
 
 def _copies(data: DataBalances) -> Iterator[Finding]:
-    """Whether most shots of a scene are one, several times or scaled, with no sigma."""
+    """Yield `copies` where more than half of the shots are multiples of one, without sigma.
+
+    Rows (v-, v+) of length 1 are compared with their median.
+    """
     experiments = data.experiments
     if experiments.scenes is not None or experiments.sigma is not None:
         return
     rows = np.hstack([np.asarray(experiments.pre, float), np.asarray(experiments.post, float)])
     size = np.sqrt(np.nansum(rows**2, axis=1, keepdims=True))
     unit = np.nan_to_num(rows / np.where(size > 0, size, 1.0), nan=np.inf)
-    # what more than half have in common is the median
+    # the median is the row that more than half have in common, if there is one
     same = np.isclose(unit, np.median(unit, axis=0), rtol=0, atol=ROUNDING).all(axis=1)
     count, total = int(same.sum()), data.total
     if 2 * count > total > 1:
@@ -275,7 +295,7 @@ def _copies(data: DataBalances) -> Iterator[Finding]:
 
 
 def _approaches(normals: np.ndarray, before: np.ndarray) -> bool:
-    """Whether contacts of normals (n, c) approach at v- (n,), by more than rounding."""
+    """True where a contact of normals (n, c) approaches: `N^T v- < 0` by more than rounding."""
     return bool((normals.T @ before < -ROUNDING * np.abs(normals).T @ np.abs(before)).any())
 
 
@@ -283,24 +303,27 @@ DATA_CHECKS = (_units, _momentum, _energy, _resting, _copies)
 
 
 def _shorter_half(values: np.ndarray) -> float:
-    """Standard deviation by the shortest interval that holds more than half of the values."""
+    """Robust standard deviation: 1.4826 / 2 times the length of the shortest half of the values.
+
+    That is the shortest interval that holds more than half of them (Rousseeuw and Leroy, 1988).
+    """
     ordered = np.sort(values)
     count = len(ordered) // 2 + 1
     return _SIGMA_OVER_HALF * float(np.min(ordered[count - 1 :] - ordered[: 1 - count or None])) / 2
 
 
-def _chance(excess: np.ndarray, shape: np.ndarray, gains: bool) -> float:
-    """p-value of the hypothesis that excesses (N,) hold no part of this shape (N,).
+def _p_value(excess: np.ndarray, shape: np.ndarray, gains: bool) -> float:
+    """p-value of the hypothesis a = 0 in a regression of excesses (N,) on a shape (N,).
 
-    Equation: regression `excess = a shape + noise`, `t = a / error(a)`; P(T > t) of Student's t
-    with N - 1 degrees of freedom for `gains`, else P(|T| > |t|). 1 where it cannot be judged.
+    Equation: `excess = a shape + noise`, `t = a / error(a)`; P(T > t) of Student's t with N - 1
+    degrees of freedom for `gains`, else P(|T| > |t|). 1 where it cannot be judged.
     """
     squares, freedom = float(shape @ shape), len(excess) - 1
     if freedom < 1 or squares == 0 or not excess.any():
         return 1.0
     slope = float(shape @ excess) / squares
-    left = float(np.sum((excess - slope * shape) ** 2))
-    error = np.sqrt(left / freedom / squares)
+    unexplained = float(np.sum((excess - slope * shape) ** 2))
+    error = np.sqrt(unexplained / freedom / squares)
     t = slope / error if error else np.inf * np.sign(slope)
     above = float(stdtr(freedom, -t))
     return above if gains else 2 * min(above, 1 - above)

@@ -11,6 +11,7 @@ from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from jimpact.fits.estimate import Estimate
 from jimpact.fits.findings import Finding
@@ -36,10 +37,13 @@ _FROM_BEST = -1  # the branch of what was searched from the best minimum
 
 
 class Lowest(NamedTuple):
-    """The least sum of squares that is known with values fixed, where, from which start."""
+    """A minimum with some parameters fixed: |r|^2, at y, and the start that it descends from.
+
+    `branch` is the index of that start, `_FROM_BEST` of the best minimum.
+    """
 
     squares: float
-    y: np.ndarray
+    y: Float[np.ndarray, " Q"]
     branch: int = _FROM_BEST
 
 
@@ -47,40 +51,56 @@ Index = tuple[int, ...]
 
 
 class Grid(NamedTuple):
-    """Fixed values of one or several parameters in the solver's scale, in order: all pairs."""
+    """A grid of fixed values of the parameters `which`, in the solver's scale.
+
+    `values` are the rising coordinates on each axis; a cell is an index on each axis.
+    """
 
     which: tuple[int, ...]
     values: tuple[np.ndarray, ...]
 
     def at(self, cell: Index) -> list[float]:
-        """The values of a cell."""
+        """The values of the parameters at a cell."""
         return [float(values[k]) for values, k in zip(self.values, cell)]
 
-    def nearest(self, y: np.ndarray) -> Index:
-        """The cell next to y."""
+    def nearest(self, y: Float[np.ndarray, " Q"]) -> Index:
+        """The cell nearest to y."""
         return tuple(int(np.abs(v - y[i]).argmin()) for i, v in zip(self.which, self.values))
 
     def neighbours(self, cell: Index) -> list[Index]:
-        """Cells next to one, diagonal ones too."""
-        sides = [range(max(k - 1, 0), min(k + 2, len(v))) for k, v in zip(cell, self.values)]
-        return [near for near in product(*sides) if near != cell]
+        """Cells adjacent to one, diagonal ones too."""
+        axes = [range(max(k - 1, 0), min(k + 2, len(v))) for k, v in zip(cell, self.values)]
+        return [near for near in product(*axes) if near != cell]
 
 
 class Deviances:
-    """Deviances of a fit with some of its parameters fixed, in the solver's scale."""
+    """Deviances `D = (S - S_best) / s^2` of a fit, S = |r|^2 at its least with parameters fixed.
+
+    Attributes:
+        limit: deviance at the end of the interval, or of the region.
+        variance: s^2 of the noise.
+        error: (P,) standard errors in the solver's scale.
+        starts: minima that searches start from, the best one first.
+        best: the best of the minima known before; `lowest`: of all that have been computed.
+        in_a_valley: True where the Jacobian at the best minimum has not full rank.
+    """
 
     def __init__(self, fit: Estimate[Any], limit: float, show: Show):
+        """Start from the minima of the fit; `limit` is a deviance, `show` displays progress."""
         self.fit, self.problem, self.limit, self.show = fit, fit.problem, limit, show
-        # if the noise is undetermined, that of an exact fit up to rounding
-        known = np.isfinite(fit.noise) and fit.noise > 0
-        self.variance = float(fit.noise**2) if known else self.problem.exact_squares
+        has_noise = np.isfinite(fit.noise) and fit.noise > 0
+        # of an exact fit: that of rounding
+        self.variance = float(fit.noise**2) if has_noise else self.problem.exact_squares
         self.error = fit.standard_error / self.problem.steps_at(fit.value)
         self.starts: list[Lowest] = []
-        self.in_a_valley = fit.rank < len(fit.names)  # the best minimum
+        self.in_a_valley = fit.rank < len(fit.names)
         self.add_starts(fit.starts)
 
     def add_starts(self, minima: Sequence[FitMinimum]) -> None:
-        """Start from these minima, too: the lowest, and others near it that are apart."""
+        """Add minima to `starts`, and keep the best one and all others within the limit.
+
+        Of minima that differ by less than `SAME_VALUE` one is kept; in a valley, the best one only.
+        """
         new = [
             Lowest(end.sum_of_squares, self.problem.variables.point(end.value)) for end in minima
         ]
@@ -95,15 +115,16 @@ class Deviances:
             apart = all(np.abs(start.y - other.y).max() > SAME_VALUE for other in self.starts)
             if apart and self.of(start.squares) <= self.limit:
                 self.starts.append(start)
-        if self.in_a_valley:  # they are ends in it
+        if self.in_a_valley:  # the others are points of the same valley
             self.starts = [self.best]
 
     def minimize(
-        self, trials: Sequence[tuple[tuple[int, ...], Sequence[float], np.ndarray]]
+        self, trials: Sequence[tuple[tuple[int, ...], Sequence[float], Float[np.ndarray, " Q"]]]
     ) -> Ends:
-        """Minima over the other parameters, all side by side; `lowest` becomes the least of them.
+        """Least squares over the parameters that are not fixed, all trials side by side.
 
-        A trial says which parameters are fixed, at which values, and from which y (Q,) it begins.
+        A trial holds the indices of the fixed parameters, their values (scaled), and the start y.
+        `lowest` is updated.
         """
         points = np.array([y for _, _, y in trials])
         # of the Q entries of y the first P are parameters, and the others stay
@@ -120,65 +141,75 @@ class Deviances:
         return ends
 
     def _is_below(self, squares: float, other: float) -> bool:
-        """Whether a sum of squares is less than another one by more than rounding."""
+        """True if a sum of squares is less than another one by more than rounding."""
         return bool(squares < other * (1 - SAME) - self.problem.exact_squares)
 
     def of(self, squares: float) -> float:
-        """Sums of squares above the least, over the noise variance."""
+        """The deviance `(S - S_best) / s^2` of a sum of squares, at least 0."""
         return max((squares - self.best.squares) / self.variance, 0.0)
 
     def values(self, i: int, y: Any) -> Any:
-        """Values of the i-th parameter of scaled ones."""
+        """Values x_i of the i-th parameter from scaled values y_i."""
         return unscaled(
             y, float(self.problem.variables.scale[i]), bool(self.problem.variables.log[i])
         )
 
     def reach(self, i: int) -> tuple[float, float]:
-        """The bounds of the i-th parameter, scaled; infinite ones as far as starts reach."""
-        low, high, best = (
-            self.problem.variables.low[i],
-            self.problem.variables.high[i],
-            self.best.y[i],
-        )
+        """Scaled bounds of the i-th parameter; in the place of infinite ones, y_i -+ START_SCALES.
+
+        y_i is that of the best minimum.
+        """
+        variables, best = self.problem.variables, self.best.y[i]
+        low, high = variables.low[i], variables.high[i]
         low = low if np.isfinite(low) else best - START_SCALES
         return float(low), float(high if np.isfinite(high) else best + START_SCALES)
 
     def fill(self, grids: Sequence[Grid]) -> list[dict[Index, Lowest]]:
-        """Cells of grids, from the minima outwards until beyond the limit, many side by side.
+        """Minima by cell, for each grid: a flood fill from `starts` until deviances pass the limit.
 
         Each cell below the limit starts its neighbours from its own minimum, also those that were
-        reached from another start. One above may lie on a ridge: once more from the best.
+        reached from another start. One above may lie on a ridge: it is repeated from the best
+        minimum. A sweep computes all waiting cells of all grids side by side.
         """
-        known: list[dict[Index, Lowest]] = [{} for _ in grids]
-        ahead = {
+        minima: list[dict[Index, Lowest]] = [{} for _ in grids]
+        # y to start from, by index of the grid, cell, and index of the start (branch)
+        waiting = {
             (g, grid.nearest(start.y), branch): start.y
             for g, grid in enumerate(grids)
             for branch, start in enumerate(self.starts)
         }
-        while ahead:
+        while waiting:
             ends = self.minimize(
-                [(grids[g].which, grids[g].at(cell), y) for (g, cell, _), y in ahead.items()]
+                [(grids[g].which, grids[g].at(cell), y) for (g, cell, _), y in waiting.items()]
             )
-            trials, ahead = list(ahead), {}
+            trials, waiting = list(waiting), {}
             for (g, cell, branch), squares, y in zip(trials, ends.squares.tolist(), ends.y):
-                cells = known[g]
+                cells = minima[g]
                 if cell in cells and not squares < (1 - SAME) * cells[cell].squares:
-                    continue
+                    continue  # not lower than from another start
                 cells[cell] = Lowest(squares, y, branch)
-                if self.of(squares) > self.limit:
+                if self.of(squares) > self.limit:  # no further in this direction
                     if branch != _FROM_BEST:
-                        ahead[g, cell, _FROM_BEST] = self.best.y
+                        waiting[g, cell, _FROM_BEST] = self.best.y
                     continue
                 for near in grids[g].neighbours(cell):
                     if near not in cells or cells[near].branch != branch:
-                        ahead[g, near, branch] = y
-        return known
+                        waiting[g, near, branch] = y
+        return minima
 
 
 def profiles_of(
     fit: Estimate[Any], which: Sequence[int], level: float, points: int, progress: float | None
 ) -> tuple[Profile, ...]:
-    """Profiles of these parameters; points: starts of a search for more minima."""
+    """Profiles of the parameters of these indices, repeated where they find a lower minimum.
+
+    Args:
+        fit: by least squares.
+        which: indices of parameters.
+        level: of the confidence intervals.
+        points: number of starts of a search for more minima, after a fit from one start.
+        progress: bar on stderr; None: on a terminal.
+    """
     with progress_bar(progress) as show:
         lines = Lines(fit, fit.quantile(level) ** 2, show)
         if points and fit.start_count == 1:
@@ -192,11 +223,27 @@ def profiles_of(
     return profiles
 
 
+class _Crossing(NamedTuple):
+    """Two neighbouring fixed values (scaled), one below the limit of the deviance, one above.
+
+    `below` and `above` are `sqrt(D / limit) - 1` there.
+    """
+
+    inside: float
+    outside: float
+    below: float
+    above: float
+
+
 class Lines(Deviances):
-    """Deviances of one parameter each, and where they pass the limit of an interval."""
+    """Profiles: deviances over the values of one parameter, and where they pass the limit."""
 
     def grid(self, i: int) -> Grid:
-        """Values of the i-th parameter, the denser the nearer to a start."""
+        """Fixed values of the i-th parameter, scaled: its bounds, and around the minima.
+
+        Equation: at distances `d (a^k - 1) / (a - 1)`, k = 1, 2, .., to both sides of each start,
+        with a = `GROWTH`, `d = STEP sqrt(limit) error`, as far as no other start is nearer.
+        """
         low, high = self.reach(i)
         centres = np.array([start.y[i] for start in self.starts])
         first, widest = STEP * np.sqrt(self.limit) * self.error[i], FIRST_SHARE * (high - low)
@@ -204,16 +251,17 @@ class Lines(Deviances):
             first = widest
         count = np.log(1 + (GROWTH - 1) * (high - low) / first) / np.log(GROWTH)
         away = first * (GROWTH ** np.arange(1, count + 1) - 1) / (GROWTH - 1)
-        near = centres[:, None] + np.concatenate([-away, away])
-        owner = np.abs(near[..., None] - centres).argmin(axis=-1)
+        near = centres[:, None] + np.concatenate([-away, away])  # a row for each start
+        owner = np.abs(near[..., None] - centres).argmin(axis=-1)  # the nearest start
         near = near[(owner == np.arange(len(centres))[:, None]) & (near > low) & (near < high)]
         return Grid((i,), (np.unique([*centres, low, high, *near]),))
 
     def profiles(self, which: Sequence[int], level: float) -> tuple[Profile, ...]:
-        """The profiles of these parameters.
+        """Profiles of the parameters of these indices.
 
-        Where deviances pass the limit is found by regula falsi in their roots, all ends side by
-        side. Each value is searched from both sides, as minima may change places between them.
+        The values at which the deviance D passes the limit are found by regula falsi on `sqrt(D /
+        limit) - 1` (every third step by bisection), all ends side by side. Each value is solved
+        from the minima of both neighbours, as minima may change places between them.
         """
         grids = [self.grid(i) for i in which]
         lines = [
@@ -221,12 +269,13 @@ class Lines(Deviances):
             for grid, cells in zip(grids, self.fill(grids))
         ]
         for turn in range(ROUNDS):
-            trials = []
+            trials = []  # index of the line, fixed value, start y
             for n, line in enumerate(lines):
-                for inside, outside, p, q in self._crossings(line):
-                    share = np.clip(p / (p - q), 0.02, 0.98) if turn % 3 < 2 else 0.5
+                for inside, outside, below, above in self._crossings(line):
+                    falsi = np.clip(below / (below - above), 0.02, 0.98)  # not at the ends
+                    share = falsi if turn % 3 < 2 else 0.5
                     value = float(inside + share * (outside - inside))
-                    trials += [(n, value, line[side].y) for side in (inside, outside)]
+                    trials += [(n, value, line[end].y) for end in (inside, outside)]
             if not trials:
                 break
             ends = self.minimize([((which[n],), (value,), y) for n, value, y in trials])
@@ -235,10 +284,10 @@ class Lines(Deviances):
                 lines[n][value] = min(lines[n].get(value, end), end, key=lambda e: e.squares)
         return tuple(self.profile(i, line, level) for i, line in zip(which, lines))
 
-    def _crossings(self, line: dict[float, Lowest]) -> Iterator[tuple[float, float, float, float]]:
-        """Ends that are not settled: values inside and outside, and by how much they pass.
+    def _crossings(self, line: dict[float, Lowest]) -> Iterator[_Crossing]:
+        """Neighbouring values between which the deviance passes the limit, if not near enough yet.
 
-        That is the root of the deviance over that of the limit, less 1.
+        Near enough: `sqrt(D / limit) - 1` is within `END` at one of them, or they are close.
         """
         values, deviance = self.deviance(line)
         height, inside = np.sqrt(deviance / self.limit) - 1, values[deviance <= self.limit]
@@ -246,24 +295,32 @@ class Lines(Deviances):
         for k in np.flatnonzero((height[:-1] <= 0) != (height[1:] <= 0)):
             a, b = (k, k + 1) if height[k] <= 0 else (k + 1, k)
             if min(-height[a], height[b]) > END and abs(values[b] - values[a]) > least:
-                yield values[a], values[b], height[a], height[b]
+                yield _Crossing(values[a], values[b], height[a], height[b])
 
-    def deviance(self, line: dict[float, Lowest]) -> tuple[np.ndarray, np.ndarray]:
+    def deviance(
+        self, line: dict[float, Lowest]
+    ) -> tuple[Float[np.ndarray, " G"], Float[np.ndarray, " G"]]:
         """Fixed values in order, and their deviances."""
         values = sorted(line)
         return np.array(values), np.array([self.of(line[y].squares) for y in values])
 
     def profile(self, i: int, line: dict[float, Lowest], level: float) -> Profile:
-        """The profile of a parameter from all that was solved."""
+        """The profile of parameter i from the minima at its fixed values, `line`.
+
+        Each run of neighbouring values below the limit is a piece of the confidence interval.
+        """
         y, deviance = self.deviance(line)
         deviance = deviance - deviance.min()
         below = np.flatnonzero(deviance <= self.limit)
         low, high = self.problem.domains[i].tolist()
         intervals = tuple(
-            (self._end(i, y, deviance, piece[0], -1), self._end(i, y, deviance, piece[-1], 1))
+            (
+                self._end(i, y, deviance, int(piece[0]), -1),
+                self._end(i, y, deviance, int(piece[-1]), 1),
+            )
             for piece in np.split(below, np.flatnonzero(np.diff(below) > 1) + 1)
         )
-        is_own = np.array_equal(self.best.y, self.problem.variables.point(self.fit.value))
+        is_of_fit = np.array_equal(self.best.y, self.problem.variables.point(self.fit.value))
         return Profile(
             name=self.fit.names[i],
             value=self.values(i, y),
@@ -272,21 +329,38 @@ class Lines(Deviances):
             level=level,
             intervals=intervals,
             domain=(low, high),
-            better=None if is_own else self.problem.values_at(self.best.y),
+            better=None if is_of_fit else self.problem.values_at(self.best.y),
         )
 
-    def _end(self, i: int, y: np.ndarray, deviance: np.ndarray, k: int, step: int) -> float:
-        """Where the deviance passes the limit beyond the k-th fixed value, or the domain's end."""
+    def _end(
+        self,
+        i: int,
+        y: Float[np.ndarray, " G"],
+        deviance: Float[np.ndarray, " G"],
+        k: int,
+        step: int,
+    ) -> float:
+        """End of an interval: where the deviance D passes the limit, or the end of the domain.
+
+        By linear interpolation of sqrt(D) between the values k and k + step.
+
+        Args:
+            i: index of the parameter.
+            y: fixed values, scaled.
+            deviance: of each value.
+            k: index of the last value below the limit.
+            step: -1 for the lower end, 1 for the upper.
+        """
         beyond = k + step
         if not 0 <= beyond < len(y):
             return float(self.problem.domains[i][(step + 1) // 2])
-        p, q = np.sqrt(deviance[k]), np.sqrt(deviance[beyond])
-        share = (np.sqrt(self.limit) - p) / (q - p)
+        root, root_beyond = np.sqrt(deviance[k]), np.sqrt(deviance[beyond])
+        share = (np.sqrt(self.limit) - root) / (root_beyond - root)
         return float(self.values(i, y[k] + share * (y[beyond] - y[k])))
 
 
 def lower_minimum(names: tuple[str, ...], profiles: Sequence[Profile]) -> Iterator[Finding]:
-    """A minimum below that of the fit, which profiles have found."""
+    """Yield `lower_minimum` where profiles have found a minimum below that of the fit."""
     if profiles and (better := profiles[0].better) is not None:
         values = ", ".join(f"{name} {x:.4g}" for name, x in zip(names, better))
         line = f"A profile found a lower minimum than the fit ({values}): allow more `starts`."

@@ -46,12 +46,15 @@ _PARTS = {
 
 def versions() -> dict[str, str]:
     """Versions of jimpact, of what it computes with, and of Python."""
-    found = {name: import_module(name).__version__ for name in _PACKAGES}
-    return found | {"Python": f"{platform.python_version()}, {platform.system()}"}
+    numbers = {name: import_module(name).__version__ for name in _PACKAGES}
+    return numbers | {"Python": f"{platform.python_version()}, {platform.system()}"}
 
 
 def encoded(value: Any) -> Any:
-    """What a JSON file can hold, from which `decoded` makes the value again, bit by bit."""
+    """A value as JSON data, from which `decoded` makes it again, bit by bit.
+
+    Arrays, mappings, tuples and dataclasses become dictionaries that name their kind.
+    """
     if value is None or isinstance(value, bool | str | int):
         return value
     if isinstance(value, float):
@@ -73,7 +76,7 @@ def encoded(value: Any) -> Any:
 
 
 def decoded(data: Any) -> Any:
-    """What `encoded` has encoded."""
+    """The value of data that `encoded` has made: a dictionary names the kind of its content."""
     if not isinstance(data, dict):
         return data
     if "class" in data:
@@ -96,7 +99,10 @@ def _name_of(cls: type) -> str:
 
 
 def _class_of(place: str) -> Any:
-    """The class of a name; those that a build before 0.2 gave to a module of jimpact, too."""
+    """The class of a name that `_name_of` gave: 'ji.LZB', 'Solution' or 'module:Name'.
+
+    Names of jimpact's own modules, as builds before 0.2 gave them, count without the module.
+    """
     module, _, name = place.rpartition(":")
     if module and module.partition(".")[0] != "jimpact":
         return attrgetter(name)(import_module(module))
@@ -114,29 +120,32 @@ def _saved_fields(cls: Any) -> list[str]:
 
 
 def grouped(fields: dict[str, Any], parts: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields, encoded, in which those of its parts, by name, stand in these parts.
+    """Encoded fields, with those that belong to a class in `parts` moved into a field of that name.
 
-    Older files hold them beside the others.
+    Older files hold all of them side by side.
     """
-    rest, groups = dict(fields), {}
+    others, groups = dict(fields), {}
     for name, part in parts.items():
-        of_part = {key: rest.pop(key) for key in _saved_fields(part)}
+        of_part = {key: others.pop(key) for key in _saved_fields(part)}
         groups[name] = {"class": part.__name__, "fields": of_part}
-    return rest | groups
+    return others | groups
 
 
 def instance_of(cls: Any, fields: dict[str, Any]) -> Any:
-    """An instance of a class with these fields, which are all that it has."""
+    """An instance of a dataclass with these encoded fields; a TypeError unless it has just these.
+
+    Fields of older files get their present names.
+    """
     if not dataclasses.is_dataclass(cls):
         raise TypeError(f"{cls!r} is no class of a law, scene or result")
-    known = set(_saved_fields(cls))
-    fields = dict.fromkeys(known & _LATER) | fields
+    names = set(_saved_fields(cls))
+    fields = dict.fromkeys(names & _LATER) | fields
     if cls is FitProblem and "owner" in fields:
         fields["value"] = fields.pop("measured")  # its older name
         fields = grouped(fields, {"variables": Variables, "measurement": Measurement})
-    if known != set(fields):
+    if names != set(fields):
         name = getattr(cls, "__name__", cls)
-        raise TypeError(f"{name} has the fields {sorted(known)}, the file {sorted(fields)}")
+        raise TypeError(f"{name} has the fields {sorted(names)}, the file {sorted(fields)}")
     instance: Any = object.__new__(cls)  # as it was: its fields have been checked and converted
     for key, value in fields.items():
         object.__setattr__(instance, key, decoded(value))

@@ -21,7 +21,7 @@ LEVEL = 0.95  # of confidence intervals, where none is asked for
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Estimate(Generic[AnyLaw]):
-    """P parameters of a law, the minima that were found, and the linearized errors; see `Fit`."""
+    """P fitted parameters of a law, the minima of the search, and linearized errors; see `Fit`."""
 
     law: AnyLaw
     method: str
@@ -62,7 +62,7 @@ class Estimate(Generic[AnyLaw]):
 
     @property
     def rms(self) -> float:
-        """Of the residual."""
+        """Root mean square of the residual, of rad/s by kinetic energy [m/s]."""
         return self.problem.rms(self.residual)
 
     @property
@@ -78,7 +78,7 @@ class Estimate(Generic[AnyLaw]):
 
     @property
     def start_count(self) -> int:
-        """Starts, those that were given up included."""
+        """Number of starts, those that were given up included."""
         return sum(minimum.count for minimum in self.starts) + self.lost_starts
 
     @property
@@ -89,7 +89,7 @@ class Estimate(Generic[AnyLaw]):
 
     @property
     def aic(self) -> float:
-        """Akaike's criterion of a fit by least squares; NaN of other losses and of exact data.
+        """Akaike's information criterion of a fit by least squares; else, and of exact data, NaN.
 
         Equation: `chi^2 + 2 P`; where sigma is unknown `n log(|r|^2 / n) + 2 (P + 1)`, n values.
         """
@@ -103,16 +103,24 @@ class Estimate(Generic[AnyLaw]):
         return float(values * np.log(squares / values) + 2 * (len(self.names) + 1))
 
     def quantile(self, level: float) -> float:
-        """Half-width of an interval of this `level` in standard errors."""
+        """Half-width of a confidence interval of this `level`, in standard errors.
+
+        The quantile at `(1 + level) / 2` of the normal distribution where sigma is known, else of
+        Student's t.
+        """
         check_level(level)
         freedom, tail = self.degrees_of_freedom, 0.5 + 0.5 * level
         noise_is_known = self.problem.sigma is not None or freedom < 1
         return float(ndtri(tail) if noise_is_known else stdtrit(freedom, tail))
 
     def linearized_interval(self, i: int, q: float) -> tuple[tuple[float, float], ...]:
-        """Where parabolas at all minima let parameter `i` lie within `q` standard errors."""
+        """Pieces of the interval of parameter `i`, within `q` standard errors at each minimum.
+
+        Equation: `x -+ error sqrt(q^2 - (S - S_best) / s^2)` at a minimum x of sum of squares S, s
+        the noise; of what is fitted in its logarithm `x exp(-+ .. / x)`; cut at the bounds.
+        """
         low, high = self.bounds[0][i], self.bounds[1][i]
-        minima = [(self.value[i], self.standard_error[i], 0.0)]
+        minima = [(self.value[i], self.standard_error[i], 0.0)]  # the last one: S - S_best
         for minimum in self.starts[1:]:
             more = minimum.sum_of_squares - self.starts[0].sum_of_squares
             if minimum.standard_error is not None and more < (q * self.noise) ** 2:
@@ -133,7 +141,7 @@ class Estimate(Generic[AnyLaw]):
 
     @property
     def can_be_profiled(self) -> bool:
-        """Whether parameters can be fixed: least squares in a box, not of an admissible matrix."""
+        """True for least squares within bounds: not for an admissible matrix or a robust loss."""
         return self.loss == "squares" and self.problem.matrix is None
 
     @property

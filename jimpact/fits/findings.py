@@ -37,7 +37,7 @@ KINDS = {
 
 @dataclass(frozen=True)
 class Finding:
-    """What is wrong with data or fit, or has to be known of it.
+    """One result of a test of data or fit: its kind, the sentence for it, shots, numbers.
 
     `kind`, a key of `KINDS`, and `numbers` by name are for programs; `line` is for the report,
     `reservation` for a sentence that quotes the fit ('': nothing); `shots` are labels.
@@ -51,12 +51,15 @@ class Finding:
 
 
 def findings(checks: Sequence[Callable[[Any], Iterator[Finding]]], judged: Any) -> list[Finding]:
-    """What these checks find, one after the other."""
+    """All findings of these checks, in their order; `judged` is the argument of each check."""
     return [found for check in checks for found in check(judged)]
 
 
 def of_sentences(lines: Sequence[str], reservations: Sequence[str]) -> tuple[Finding, ...]:
-    """Findings of a file that holds sentences only, as a build before 0.2 saved them."""
+    """Findings from the sentences of a file of a build before 0.2, which had no kinds.
+
+    `lines` are those of the report, `reservations` those to quote with the values.
+    """
     starts = {"Lack of fit": "lack_of_fit", "The fitted law fails": "law_fails"}
     contain = {
         "minima fit equally well": "several_minima",
@@ -64,10 +67,10 @@ def of_sentences(lines: Sequence[str], reservations: Sequence[str]) -> tuple[Fin
     }
 
     def kind(line: str) -> str:
-        """The kind of a line, '' where nothing depends on it."""
-        known = [k for words, k in starts.items() if line.startswith(words)]
-        known += [k for words, k in contain.items() if words in line]
-        return next(iter(known), "")
+        """The kind of a sentence by its words; '' for kinds that no other result depends on."""
+        kinds = [k for words, k in starts.items() if line.startswith(words)]
+        kinds += [k for words, k in contain.items() if words in line]
+        return next(iter(kinds), "")
 
     quoted = (Finding("", "", reservation) for reservation in reservations)
     return (*(Finding(kind(line), line) for line in lines), *quoted)

@@ -136,8 +136,9 @@ def fit(
         problem = law
     else:
         problem = of_shots(law, scene, experiments, free, bounds, priors, ties)  # type: ignore[arg-type]
-    if problem.experiments is not None and (said := wrong_unit(problem.experiments, problem.scene)):
-        warnings.warn(said, stacklevel=2)  # before a search that may take long and find nothing
+    data = problem.experiments
+    if data is not None and (doubt := wrong_unit(data, problem.scene)):
+        warnings.warn(doubt, stacklevel=2)  # before a search that may take long and find nothing
     deadline = np.inf if search.limit is None else time.monotonic() + float(search.limit)
     with progress_bar(search.progress) as show:
         solver = Solver(method, steps, show, deadline)
@@ -163,7 +164,7 @@ def fit(
 
 
 def _check_derivatives(problem: FitProblem, solution: Solution) -> None:
-    """Raise a ValueError where derivatives are not finite, whichever shots are left out."""
+    """Raise a ValueError if derivatives of measured values at the minimum are not finite."""
     lost = np.flatnonzero(~np.isfinite(solution.starts[0].jacobian).all(axis=1))
     if len(lost):
         at = ", ".join(f"{name} = {x:g}" for name, x in zip(problem.names, solution.value))
@@ -175,7 +176,7 @@ def _check_derivatives(problem: FitProblem, solution: Solution) -> None:
 
 
 def _without(problem: FitProblem, lost: np.ndarray) -> FitProblem:
-    """The problem without these shots (K,), which it names."""
+    """The problem without the shots where `lost` (K,) is True, whose labels go to `left_out`."""
     assert problem.experiments is not None
     labels = (problem.experiments.shots[k] for k in np.flatnonzero(lost))
     used = np.broadcast_to(~lost[:, None], problem.measured.shape).astype(float)
@@ -185,15 +186,19 @@ def _without(problem: FitProblem, lost: np.ndarray) -> FitProblem:
 def as_fit(
     problem: FitProblem, solution: Solution, search: Search, robust: float | None = None
 ) -> Fit[Any]:
-    """The fit at the end of a search, with its errors.
+    """The `Fit` of a solution, with its errors.
 
-    `robust`: noise times the root of the degrees of freedom, of a loss that outliers move little.
+    Args:
+        problem: that was solved.
+        solution: its minima.
+        search: options of the search.
+        robust: noise times the root of the degrees of freedom after a robust loss, or None.
     """
     judged = Judged(replace(problem, scene=problem.to_scene(solution.value)), solution, robust)
     errors = judged.errors
     starts, limit = [], solution.starts[0].sum_of_squares + HARDLY_WORSE * errors.noise**2
     for end in solution.starts:
-        matters = not end.sum_of_squares > limit  # also where the noise is not known
+        matters = not end.sum_of_squares > limit  # also where the noise is NaN
         error = uncertainty(problem, end, errors.noise).standard_error if matters else None
         starts.append(FitMinimum(end.sum_of_squares, end.value, end.count, error))
     return Fit(
@@ -269,29 +274,31 @@ def fit_many(
     for k, data in enumerate(many):
         check_kind(f"many[{k}]", data, Experiments)
     first = of_shots(law, scene, many[0], *choice)
-    same = scene is not None and first.measurement.mixing is None
-    same &= getattr(first.law, "rtol", None) != COARSE_RTOL  # where the noise allows it
+    # problems of other shots follow from the first one, but where more depends on the data:
+    # scenes, errors of v-, and the coarse tolerance that their noise allows
+    follow = scene is not None and first.measurement.mixing is None
+    follow &= getattr(first.law, "rtol", None) != COARSE_RTOL
     problems = [first]
     for data in many[1:]:
-        only_shots = same and data.scenes is None and data.sigma_pre is None
+        only_shots = follow and data.scenes is None and data.sigma_pre is None
         other = first.of_other(data, scene) if only_shots else of_shots(law, scene, data, *choice)
         problems.append(other)
-    each: dict[int, Ends] = {}  # where its starts ended
+    each: dict[int, Ends] = {}  # of the starts of a data set
     with progress_bar(progress) as show:
         for members in _alike(problems):
             first = problems[members[0]]
             solver = Solver(max_steps=max_steps, show=show, workers=workers)
             points = start_points(first, starts, np.random.default_rng(seed))
             points = np.tile(points, (len(members), 1))
-            some = [problems[k] for k in members]
-            settled_problems, ends = settled(some, points, solver, FINE_OF_MANY)
+            group = [problems[k] for k in members]
+            settled_problems, ends = settled(group, points, solver, FINE_OF_MANY)
             for i, (k, problem) in enumerate(zip(members, settled_problems)):
                 each[k] = ends.rows(slice(i * starts, (i + 1) * starts))
                 problems[k] = problem
 
     @functools.cache
     def made(k: int) -> Fit[AnyLaw]:
-        """The fit of one; shots that cannot be used are left out in a new one."""
+        """The `Fit` of data set k; if it has unusable shots, fitted anew without these."""
         solution = solution_of(problems[k], each[k])
         search = Search(seed=seed, max_steps=max_steps, progress=False)
         if unusable(problems[k], solution).any():
@@ -306,7 +313,7 @@ def fit_many(
 
 
 def _alike(problems: Sequence[FitProblem]) -> list[list[int]]:
-    """Problems that share one program: their arrays have the same shapes."""
+    """Indices of problems, grouped by the shapes of their arrays: a group shares one program."""
     groups: dict[Any, list[int]] = {}
     for k, problem in enumerate(problems):
         leaves, structure = jax.tree.flatten(problem.for_compiled())
@@ -398,15 +405,16 @@ def bootstrap(
     z = np.random.default_rng(seed).normal(size=(samples, *fit.predicted.shape))
     errors = problem.measurement.errors_of(fit.noise * np.moveaxis(z, 0, -1))
     measured = fit.predicted + np.moveaxis(errors, -1, 0)
-    means = np.tile(problem.prior_mean, (samples, 1))  # as if they had been measured anew
+    # means of priors are drawn, too, as if they had been measured again
+    means = np.tile(problem.prior_mean, (samples, 1))
     z = np.random.default_rng((seed, 1)).normal(size=(samples, len(problem.priors)))
     for prior, drawn in zip(problem.priors, z.T):
         i = prior.parameter
         means[:, i] = fit.value[i] + fit.noise * prior.std * drawn
     dtype = problem.dtype
     pairs = zip(measured.astype(dtype), means)
-    again = [problem.measured_again(values, mean) for values, mean in pairs]
-    return _refits(fit, again, workers, progress)
+    resampled = [problem.measured_again(values, mean) for values, mean in pairs]
+    return _refits(fit, resampled, workers, progress)
 
 
 def leave_one_out(fit: Fit, *, workers: int | None = None, progress: float | None = None) -> Refits:
@@ -445,7 +453,7 @@ def leave_one_out(fit: Fit, *, workers: int | None = None, progress: float | Non
 def _refits(
     fit: Fit, problems: list[FitProblem], workers: int | None, progress: float | None
 ) -> Refits:
-    """Minima of these problems next to a fit."""
+    """`Refits` of B problems of changed data, each from the parameters of the fit."""
     points = np.tile(fit.problem.variables.point(fit.value), (len(problems), 1))
     with progress_bar(progress) as show:
         solver = Solver(show=show, workers=workers)

@@ -34,7 +34,10 @@ _FAILS = tuple(row.failure for row in STATUS)
 
 
 class MotionObservable(eqx.Module):
-    """The observable of a motion, or of K of them from several states (K, n)."""
+    """The observable of a fit to motions: `observe(motion)`, simulated with a law.
+
+    From one state q0, v0 (n,), or from K of them (K, n): K motions.
+    """
 
     system: System
     q0: jax.Array
@@ -43,13 +46,16 @@ class MotionObservable(eqx.Module):
     observe: Observe = eqx.field(static=True)
 
     def __call__(self, law: Law) -> Prediction:
-        """What is observed of the motion with this law, and the status of the motion."""
+        """`observe` of the motion, or of K motions, with this law; the status of one that fails.
+
+        Values are bad where the motion fails or they are not finite.
+        """
         parts = law if isinstance(law, LawInMotion) else LawInMotion(law)
         system = parts.in_system(self.system)
         start, speed = parts.start(system, self.q0, self.v0)
 
-        def one(q0: jax.Array, v0: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-            """What is observed of one motion, whether it fails, and its status."""
+        def one_motion(q0: jax.Array, v0: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+            """`observe` of the motion from one state, True if it fails, and its status code."""
             motion = simulate(system, parts.law, q0=q0, v0=v0, **self.options)
             seen = self.observe(parts.seen(motion, system))
             if not eqx.is_array(seen):
@@ -57,13 +63,16 @@ class MotionObservable(eqx.Module):
             return seen, jnp.asarray(_FAILS)[motion.status], motion.status
 
         if start.ndim == 1:
-            value, fails, status = one(start, speed)
+            value, fails, status = one_motion(start, speed)
             return Prediction(value, fails | ~jnp.isfinite(value), status[None])
         count = len(start)
         lanes = min(count, LANES)
+        # indices of motions, `lanes` in a row; the last row is filled up with the last motion
         rows = np.minimum(np.arange(-(-count // lanes) * lanes), count - 1).reshape(-1, lanes)
-        some = jax.lax.map(lambda at: jax.vmap(one)(start[at], speed[at]), jnp.asarray(rows))
-        value, fails, status = (x.reshape(-1, *x.shape[2:])[:count] for x in some)
+        groups = jax.lax.map(
+            lambda row: jax.vmap(one_motion)(start[row], speed[row]), jnp.asarray(rows)
+        )
+        value, fails, status = (x.reshape(-1, *x.shape[2:])[:count] for x in groups)
         bad = fails.reshape(-1, *[1] * (value.ndim - 1)) | ~jnp.isfinite(value)
         return Prediction(value, bad, status[jnp.argmax(fails)][None])
 

@@ -17,12 +17,12 @@ def check_level(level: float) -> None:
 
 
 def pieces_in_words(pieces: Iterable[tuple[float, float]], domain: tuple[float, float]) -> str:
-    """Pieces of an interval; an end of the domain is left out."""
+    """Pieces (low, high) of a confidence interval as text; ends of the domain are left out."""
     return " or ".join(_piece(*ends, domain) for ends in pieces)
 
 
 def _piece(low: float, high: float, domain: tuple[float, float]) -> str:
-    """One piece of an interval in words."""
+    """One piece of an interval as text: 'a to b', 'at least a', 'at most b' or 'anything'."""
     open_low, open_high = low <= domain[0], high >= domain[1]
     if open_low and open_high:
         return "anything"
@@ -64,12 +64,12 @@ class Profile:
 
     @property
     def open_ends(self) -> tuple[bool, bool]:
-        """Whether the data leave the parameter unbounded below, and above."""
+        """True where the interval reaches the lower, and the upper end of the domain."""
         return self.intervals[0][0] <= self.domain[0], self.intervals[-1][1] >= self.domain[1]
 
     @property
     def determines(self) -> bool:
-        """Whether the data exclude any value of the domain."""
+        """True if the interval excludes any value of the domain."""
         return len(self.intervals) > 1 or not all(self.open_ends)
 
     def __str__(self) -> str:
@@ -77,7 +77,7 @@ class Profile:
 
 
 def joined(pieces: Iterable[tuple[float, float]]) -> tuple[tuple[float, float], ...]:
-    """The same set in pieces apart from each other, in order.
+    """The union of intervals, as disjoint pieces in order.
 
     >>> from jimpact.fits.intervals import joined
     >>> joined([(3.0, 4.0), (0.0, 1.0), (0.5, 2.0)])

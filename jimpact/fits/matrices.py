@@ -3,15 +3,20 @@
 The set `{E : E >= 0, G^-1 (I + E) >= 0, G^-1 - E^T G^-1 E copositive}` is convex (each x >= 0
 asks `|E x| <= |x|` in the norm of G^-1). Residuals are linear in E, so a fit goes where it likes
 and then to the admissible matrix of the least sum of squares.
+
+Axes: S scenes, m contacts, E = m m entries, Q variables y of the solver, F = 2^m - 1 faces
+(supports) of the cone of approaches x >= 0, C conditions `slack(y) >= 0`. G is the Delassus matrix
+in units of `kinetic_norm`.
 """
 
 from itertools import product
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from jimpact.core.contact import decoupled, delassus_matrix, kinetic_norm
 from jimpact.core.law import Law
@@ -42,34 +47,46 @@ _WORST = 2  # new cuts of each scene and contact
 _FACES = ("E >= 0", "G^-1 (I + E) >= 0", "G^-1 - E^T G^-1 E copositive (energy)")
 
 
-_Share = tuple[jax.Array, jax.Array, jax.Array]  # of the way, whether it fell, passes
-# z, slacks at y and derivatives of the cuts that hold it, whether to go on, steps
-_Nearest = tuple[jax.Array, tuple[jax.Array, jax.Array], jax.Array, jax.Array]
+# share of the way, True if it fell, passes
+_Share = tuple[Float[Array, ""], Bool[Array, ""], Int[Array, ""]]
+
+
+class _Cut(NamedTuple):
+    """State of a search by cutting planes: the point z, and the Q active cuts that hold it.
+
+    `slacks` are those of the cuts at the first point y, `slopes` their derivatives.
+    """
+
+    z: Float[Array, " Q"]
+    slacks: Float[Array, " Q"]
+    slopes: Float[Array, "Q Q"]
+    goes_on: Bool[Array, ""]
+    steps: Int[Array, ""]
 
 
 class AdmissibleMatrices(eqx.Module):
-    """The y whose matrix `E = origin + map y` is admissible in S scenes and inside its bounds.
+    """The set of y whose matrix `E = origin + map y` is admissible in S scenes and within bounds.
 
     Source: Brogliato, Nonsmooth Mechanics (2016), Prop. 6.2 and 6.3.
     """
 
-    origin: jax.Array  # (m m,)
-    map: jax.Array  # (m m, Q)
-    inverse: jax.Array  # G^-1 (S, m, m), the identity for open contacts
-    closed: jax.Array  # (S, m) zeros and ones
-    bounds: jax.Array | None  # (2, Q) of y
-    center: jax.Array  # y strictly inside
+    origin: Float[Array, " E"]
+    map: Float[Array, "E Q"]
+    inverse: Float[Array, "S m m"]  # G^-1, the identity for open contacts
+    closed: Float[Array, "S m"]  # ones, zeros for open contacts
+    bounds: Float[Array, "2 Q"] | None  # of y
+    center: Float[Array, " Q"]  # y strictly inside
 
-    def matrices(self, y: jax.Array) -> jax.Array:
-        """E (S, m, m), with zeros for open contacts."""
+    def matrices(self, y: Float[Array, " Q"]) -> Float[Array, "S m m"]:
+        """`E = origin + map y` of each scene, with zeros for open contacts."""
         m = self.closed.shape[1]
         e = (self.origin + self.map @ y).reshape(m, m)
         return e[None] * (self.closed[:, :, None] * self.closed[:, None, :])
 
-    def elementwise(self, y: jax.Array) -> jax.Array:
-        """All that must be >= 0 and is linear in y: E, impulses, distances from the bounds.
+    def elementwise(self, y: Float[Array, " Q"]) -> Float[Array, " L"]:
+        """Slacks of the conditions linear in y: `E`, `G^-1 (I + E)`, `y - low`, `high - y`.
 
-        1 where there is no bound.
+        They must be >= 0; 1 where there is no bound.
         """
         e = self.matrices(y)
         identity = jnp.eye(e.shape[1], dtype=e.dtype)[None]
@@ -86,15 +103,18 @@ class AdmissibleMatrices(eqx.Module):
         scenes, m = self.closed.shape
         return scenes * (2**m - 1)
 
-    def worst(self, y: jax.Array) -> jax.Array:
-        """Approaches x >= 0 (S, F, m) among which each face has that of the least lost energy.
+    def worst(self, y: Float[Array, " Q"]) -> Float[Array, "S F m"]:
+        """Approaches x >= 0 of length 1, one for each face, that lose the least energy.
 
-        The minimizer with a given support is an eigenvector of the smallest eigenvalue there
-        (see `jimpact.theory.restitution_matrices`); the others are valid approaches all the same.
+        On each face, of the approaches with a given support, the minimizer of `x^T Q x` with `Q =
+        G^-1 - E^T G^-1 E` is an eigenvector of the smallest eigenvalue of that block of Q, if it
+        is positive (see `jimpact.theory.restitution_matrices`). Otherwise its positive part is an
+        approach all the same, with a condition of its own.
         """
         m = self.closed.shape[1]
         q = self._dissipation(y)
-        faces = jnp.asarray(list(product((0, 1), repeat=m))[1:], q.dtype)
+        faces = jnp.asarray(list(product((0, 1), repeat=m))[1:], q.dtype)  # (F, m) supports
+        # larger than all eigenvalues: contacts outside of the support do not take part
         above = (m + 1.0) * (jnp.abs(q).max() + jnp.abs(self.inverse).max())
         inside = faces[:, :, None] * faces[:, None, :]
         outside = above * (1 - faces)[:, :, None] * jnp.eye(m, dtype=q.dtype)[None]
@@ -105,17 +125,20 @@ class AdmissibleMatrices(eqx.Module):
         x = x / jnp.where(norm > 0, norm, 1.0)
         return jax.lax.stop_gradient(x)
 
-    def _dissipation(self, y: jax.Array) -> jax.Array:
-        """`Q = G^-1 - E^T G^-1 E` (S, m, m)."""
+    def _dissipation(self, y: Float[Array, " Q"]) -> Float[Array, "S m m"]:
+        """`G^-1 - E^T G^-1 E` of each scene."""
         e = self.matrices(y)
         return self.inverse - jnp.swapaxes(e, 1, 2) @ self.inverse @ e
 
     @full_precision
-    def nearest(self, y: jax.Array, hessian: jax.Array, gradient: jax.Array) -> jax.Array:
+    def nearest(
+        self, y: Float[Array, " Q"], hessian: Float[Array, "Q Q"], gradient: Float[Array, " Q"]
+    ) -> Float[Array, " Q"]:
         """The admissible z of the least `g^T (z - y) + (z - y)^T H (z - y) / 2`.
 
         By cutting planes: conditions on the energy are concave, so that they lie below all their
-        tangents. Those at the last z, the worst ones, join those that hold this z.
+        tangents. Each step solves the quadratic program with the linear conditions, the cuts that
+        were active before, and the tangents at z of the conditions that are violated most.
         """
         size, dtype = y.shape[0], y.dtype
         largest = jnp.max(jnp.diagonal(hessian))
@@ -123,50 +146,63 @@ class AdmissibleMatrices(eqx.Module):
         hessian = hessian + weight * jnp.eye(size, dtype=dtype)
         rounding = _SHORT * jnp.finfo(dtype).eps * jnp.abs(self.inverse).max()
         slack, rows = self.conditions(y)
-        first = len(slack) - self.faces
-        linear = slack[:first], rows[:first]
-        worst = min(len(slack) - first, _WORST * self.closed.size)
+        linear_count = len(slack) - self.faces  # those on the energy come last
+        linear = slack[:linear_count], rows[:linear_count]
+        worst = min(self.faces, _WORST * self.closed.size)  # number of new cuts
 
-        def closer(state: _Nearest) -> _Nearest:
-            """One step."""
-            z, held, _, step = state
-            energy, tangent = (x[first:] for x in self.conditions(z))
+        def add_cuts(state: _Cut) -> _Cut:
+            """Cut at z, solve the quadratic program, and keep the cuts of the largest multipliers.
+
+            It ends where z satisfies all conditions on the energy: it is then the best of a set
+            that contains the admissible one.
+            """
+            z = state.z
+            energy, tangent = (x[linear_count:] for x in self.conditions(z))
             which = jnp.argsort(energy)[:worst]
-            new = energy[which] + tangent[which] @ (y - z), tangent[which]
-            slacks, slopes = (jnp.concatenate(parts) for parts in zip(linear, held, new))
-            move, pressure, solved = _quadratic(hessian, gradient, slacks, slopes)
-            holding = first + jnp.argsort(-pressure[first:])[:size]
-            held = slacks[holding], slopes[holding]
-            inside = (energy.min() >= -rounding) & (step > 0)  # the best of a larger set
+            new = energy[which] + tangent[which] @ (y - z), tangent[which]  # the tangents at y
+            parts = zip(linear, (state.slacks, state.slopes), new)
+            slacks, slopes = map(jnp.concatenate, parts)
+            move, multipliers, solved = _quadratic(hessian, gradient, slacks, slopes)
+            active = linear_count + jnp.argsort(-multipliers[linear_count:])[:size]
+            inside = (energy.min() >= -rounding) & (state.steps > 0)
             goes_on = solved & ~inside
-            return jnp.where(goes_on, y + move, z), held, goes_on, step + 1
+            z = jnp.where(goes_on, y + move, z)
+            return _Cut(z, slacks[active], slopes[active], goes_on, state.steps + 1)
 
-        none = jnp.ones(size, dtype), jnp.zeros((size, size), dtype)
-        start = (y, none, jnp.asarray(True), jnp.asarray(0))
-        end = jax.lax.while_loop(lambda s: s[2] & (s[3] < _CUTS), closer, start)
+        no_cuts = jnp.ones(size, dtype), jnp.zeros((size, size), dtype)
+        start = _Cut(y, *no_cuts, jnp.asarray(True), jnp.asarray(0))
+        z = jax.lax.while_loop(lambda s: s.goes_on & (s.steps < _CUTS), add_cuts, start).z
         # cutting planes leave rounding
-        share = self.share(end[0])
-        inside = self.center + (1 - _SHORT * jnp.finfo(dtype).eps) * share * (end[0] - self.center)
-        return jnp.where(share < 1, inside, end[0])
+        share = self.share(z)
+        inside = self.center + (1 - _SHORT * jnp.finfo(dtype).eps) * share * (z - self.center)
+        return jnp.where(share < 1, inside, z)
 
-    def share(self, y: jax.Array) -> jax.Array:
-        """How much of the way from the center to y is admissible, at most 1."""
+    def share(self, y: Float[Array, " Q"]) -> Float[Array, ""]:
+        """The largest s <= 1 with which `center + s (y - center)` is admissible.
+
+        First by the linear conditions; then it is shortened until the approaches of `worst`, which
+        change with s, gain no energy.
+        """
         slack, target = self.elementwise(self.center), self.elementwise(y)
-        crossed = (target < 0) & (target < slack)  # others, y does not change
+        crossed = (target < 0) & (target < slack)  # the others do not change along the ray
         share = jnp.where(crossed, slack / jnp.where(crossed, slack - target, 1.0), 1.0).min()
 
-        def closer(state: _Share) -> _Share:
-            """The share after one more look at the worst approaches."""
+        def shortened(state: _Share) -> _Share:
+            """The share at which the approaches that are worst at the last one gain no energy."""
             share, _, passes = state
             x = self.worst(self.center + share * (y - self.center))
             nearer = jnp.minimum(share, self._energy_share(y, x).min())
             return nearer, nearer < share, passes + 1
 
         first = (share, jnp.asarray(True), jnp.asarray(0))
-        return jax.lax.while_loop(lambda s: s[1] & (s[2] < _SCALINGS), closer, first)[0]
+        return jax.lax.while_loop(lambda s: s[1] & (s[2] < _SCALINGS), shortened, first)[0]
 
-    def _energy_share(self, y: jax.Array, x: jax.Array) -> jax.Array:
-        """Where on the ray the energy ratio of approaches x reaches 1; above the true end."""
+    def _energy_share(self, y: Float[Array, " Q"], x: Float[Array, "S F m"]) -> Float[Array, "S F"]:
+        """Shares s of the ray from the center to y at which `|E(s) x| = |x|`, of approaches x.
+
+        Equation: `E(s) x = u + s w`, u = E(center) x, w = E(y) x - u, in the norm of G^-1: the
+        positive root of `|w|^2 s^2 + 2 (u, w) s = |x|^2 - |u|^2`; inf where there is none.
+        """
         start = jnp.einsum("sij,sfj->sfi", self.matrices(self.center), x)
         rate = jnp.einsum("sij,sfj->sfi", self.matrices(y), x) - start
         a, b = _square(self.inverse, rate), jnp.einsum("sfi,sij,sfj->sf", start, self.inverse, rate)
@@ -176,12 +212,16 @@ class AdmissibleMatrices(eqx.Module):
         above, below = jnp.where(b > 0, c, root - b), jnp.where(b > 0, root + b, a)
         return jnp.where(below > 0, above / jnp.where(below > 0, below, 1.0), jnp.inf)
 
-    def conditions(self, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Slacks (C,), >= 0 but for rounding, of all conditions, and their derivatives (C, Q)."""
-        x = self.worst(y)  # at qn- = -x the energy lost is x^T Q x / 2
+    def conditions(self, y: Float[Array, " Q"]) -> tuple[Float[Array, " C"], Float[Array, "C Q"]]:
+        """Slacks of all conditions, >= 0 where admissible, and their derivatives.
+
+        First those of `elementwise`, then `x^T Q x` of the worst approach on each face, twice the
+        energy that is lost, with `Q = G^-1 - E^T G^-1 E`.
+        """
+        x = self.worst(y)
 
         def slacks(y: jax.Array) -> tuple[jax.Array, jax.Array]:
-            """Slacks, to be differentiated, and once more as they are."""
+            """The slacks (C,) at y, to be differentiated, and again as they are."""
             lost = _square(self._dissipation(y), x)
             value = jnp.concatenate([self.elementwise(y), lost.reshape(-1)])
             return value, value
@@ -191,30 +231,51 @@ class AdmissibleMatrices(eqx.Module):
 
 
 def _quadratic(
-    hessian: jax.Array, gradient: jax.Array, slack: jax.Array, rows: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """`min d^T H d / 2 + g^T d` with `slack + A d >= 0`: d, multipliers, whether solved."""
+    hessian: Float[Array, "Q Q"],
+    gradient: Float[Array, " Q"],
+    slack: Float[Array, " C"],
+    rows: Float[Array, "C Q"],
+) -> tuple[Float[Array, " Q"], Float[Array, " C"], Bool[Array, ""]]:
+    """Solve `min d^T H d / 2 + g^T d` with `slack + A d >= 0`, A the rows, by its dual LCP.
+
+    Equation: `0 <= l  perp  A H^-1 A^T l + slack - A H^-1 g >= 0`, `d = H^-1 (A^T l - g)`; the rows
+    of A are scaled to length 1.
+
+    Returns:
+        d, the multipliers l, True if the LCP is solved.
+    """
     length = jnp.sqrt(jnp.sum(rows**2, axis=1))
     depends = length > _FLAT * length.max()  # others are rounding
     scale = jnp.where(depends, 1 / jnp.where(depends, length, 1.0), 0.0)
     rows, slack = rows * scale[:, None], jnp.where(depends, slack * scale, 1.0)
     factor = jax.scipy.linalg.cho_factor(hessian)
-    free = -jax.scipy.linalg.cho_solve(factor, gradient)
-    response = jax.scipy.linalg.cho_solve(factor, rows.T)
+    unconstrained = -jax.scipy.linalg.cho_solve(factor, gradient)
+    response = jax.scipy.linalg.cho_solve(factor, rows.T)  # H^-1 A^T
     # positive semidefinite; the multipliers need not be unique, the step is
-    dual = solve_lcp(rows @ response, slack + rows @ free, symmetric=False)
-    return free + response @ dual.z, dual.z * scale, dual.code == CODE["ok"]
+    dual = solve_lcp(rows @ response, slack + rows @ unconstrained, symmetric=False)
+    return unconstrained + response @ dual.z, dual.z * scale, dual.code == CODE["ok"]
 
 
-def _square(a: jax.Array, x: jax.Array) -> jax.Array:
-    """`x^T A x` of x (S, F, m)."""
+def _square(a: Float[Array, "S m m"], x: Float[Array, "S F m"]) -> Float[Array, "S F"]:
+    """The quadratic forms `x^T A x`."""
     return jnp.einsum("sfi,sij,sfj->sf", x, a, x)
 
 
 def matrix_region(
-    law: Law, scenes: list[Scene], variables: Variables, start: np.ndarray, ties: Ties
+    law: Law,
+    scenes: list[Scene],
+    variables: Variables,
+    start: Float[np.ndarray, " P"],
+    ties: Ties,
 ) -> AdmissibleMatrices | None:
-    """The y whose (m, m) `RestitutionMatrix` is admissible in each scene; None for other laws.
+    """The set of y whose `RestitutionMatrix` is admissible in each scene; None for other laws.
+
+    Args:
+        law: at its start values.
+        scenes: with m contacts each.
+        variables: y of the fit.
+        start: values, which must be admissible.
+        ties: of the fit.
 
     Raises:
         ValueError: redundant contacts, too many contacts, a start that is not admissible, fixed
@@ -225,6 +286,7 @@ def matrix_region(
     if any(tie.field == "matrix" for tie in ties):
         raise ValueError("Argument `ties` must not tie a `matrix` that has to stay admissible.")
     owner = variables.owner
+    # E = origin + moves y: each entry moves with the variable that owns it
     moves = np.where(owner[:, None] == np.arange(len(owner)), variables.scale, 0.0)
     origin, start = np.where(owner < 0, variables.fixed, 0.0), variables.point(start)
     bounds = np.stack([variables.low, variables.high])
@@ -248,8 +310,8 @@ def matrix_region(
     return eqx.tree_at(lambda r: r.center, region, jnp.asarray(center, dtype))
 
 
-def admissible_start(scenes: list[Scene]) -> np.ndarray:
-    """A matrix E (m, m) that is admissible in all scenes.
+def admissible_start(scenes: list[Scene]) -> Float[np.ndarray, "m m"]:
+    """A matrix E that is admissible in all scenes.
 
     `I / 2` where it will do (chains); else one from which all conditions are far.
 
@@ -277,12 +339,12 @@ def admissible_start(scenes: list[Scene]) -> np.ndarray:
 def _region(
     scenes: list[Scene],
     dtype: Any,
-    origin: np.ndarray,
-    mix: np.ndarray,
-    bounds: np.ndarray | None,
-    center: np.ndarray,
+    origin: Float[np.ndarray, " E"],
+    mix: Float[np.ndarray, "E Q"],
+    bounds: Float[np.ndarray, "2 Q"] | None,
+    center: Float[np.ndarray, " Q"],
 ) -> AdmissibleMatrices:
-    """The region of these scenes; the conditions of equal ones count once."""
+    """The admissible set of `E = origin + mix y` in these scenes; of equal ones only one counts."""
     m = scenes[0].contacts
     if m > LARGEST:
         raise ValueError(
@@ -295,12 +357,15 @@ def _region(
 
 
 def encloses(law: Law, contacts: int) -> bool:
-    """Whether a fit keeps this law's matrix admissible."""
+    """True if a fit keeps the matrix of this law admissible."""
     return isinstance(law, RestitutionMatrix) and law.admissible and law.matrix.shape[0] == contacts
 
 
-def _inverse(scene: Scene) -> np.ndarray:
-    """G^-1 with a further row that marks closed contacts."""
+def _inverse(scene: Scene) -> Float[np.ndarray, "rows m"]:
+    """G^-1 and one more row: 1 for closed contacts, 0 for open ones, which are decoupled.
+
+    Equation: `G_ij = W_ij / (s_i s_j)`, W the Delassus matrix, s the `kinetic_norm`.
+    """
     w = decoupled(delassus_matrix(scene), scene.closed)
     g = np.asarray(as_matrix(scaled(w, 1 / kinetic_norm(scene))))
     smallest = np.linalg.eigvalsh(g)[0]
@@ -316,14 +381,16 @@ def _inverse(scene: Scene) -> np.ndarray:
 _conditions = quick_jit(AdmissibleMatrices.conditions)
 
 
-def _host_conditions(region: AdmissibleMatrices, y: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Slacks and their derivatives on the host."""
+def _host_conditions(
+    region: AdmissibleMatrices, y: Any
+) -> tuple[Float[np.ndarray, " C"], Float[np.ndarray, "C Q"]]:
+    """`AdmissibleMatrices.conditions` on the host, in double precision."""
     slack, rows = _conditions(region, jnp.asarray(y, region.center.dtype))
     return np.asarray(slack, float), np.asarray(rows, float)
 
 
 def _kinds(region: AdmissibleMatrices) -> tuple[slice, slice, slice]:
-    """Where the conditions named in `_FACES` are in a list of all."""
+    """Slices of the list of all conditions for each kind in `_FACES`, in their order."""
     entries = len(region.origin)
     impulses = entries * (1 + len(region.inverse))
     return slice(entries), slice(entries, impulses), slice(-region.faces, None)
@@ -334,23 +401,25 @@ def _rounding(region: AdmissibleMatrices) -> float:
     return _ROUNDING[str(region.center.dtype)] * float(np.abs(np.asarray(region.inverse)).max())
 
 
-def _inner_point(region: AdmissibleMatrices, start: np.ndarray) -> np.ndarray | None:
-    """y near the start, from which all conditions are half as far as possible, or farther.
+def _inner_point(
+    region: AdmissibleMatrices, start: Float[np.ndarray, " Q"]
+) -> Float[np.ndarray, " Q"] | None:
+    """A y near the start whose least slack is at least half of the largest possible; None: none.
 
-    By cutting planes: the least condition, concave in y, lies below all tangents so far, and the
-    next y is where these leave most. None: there is no such y.
+    Kelley's cutting planes: the least slack is concave in y, so it lies below all tangents so far;
+    the next y maximizes t under these (a linear program), in a box of 1 around the start.
     """
     from scipy.optimize import linprog  # late: slow to import
 
     free = np.any(np.asarray(region.map) != 0, axis=0)
     box = [*((x - moves, x + moves) for x, moves in zip(start, free)), (None, 1.0)]
-    y, most, planes = start, np.inf, np.zeros((0, len(start) + 2))
+    y, most, planes = start, np.inf, np.zeros((0, len(start) + 2))  # rows: A, 1 of t, right side
     for _ in range(_CUTS):
         slack, rows = _host_conditions(region, y)
         moving = np.any(rows[:, free] != 0, axis=1)
         if slack[moving].min() > max(0.5 * most, _rounding(region)):
             return y
-        # t <= slack + rows (z - y)
+        # t <= slack + rows (z - y) for the next point z
         new = np.column_stack([-rows, np.ones(len(rows)), slack - rows @ y])[moving]
         planes = np.vstack([planes, new])
         cost = np.append(np.zeros(len(start)), -1.0)
@@ -361,8 +430,8 @@ def _inner_point(region: AdmissibleMatrices, start: np.ndarray) -> np.ndarray | 
     return None
 
 
-def boundary(region: AdmissibleMatrices | None, y: np.ndarray) -> tuple[str, ...]:
-    """The conditions that the E of y is at the edge of (other than by fixed entries), in words."""
+def boundary(region: AdmissibleMatrices | None, y: Float[np.ndarray, " Q"]) -> tuple[str, ...]:
+    """Names of the admissibility conditions that are active at y, other than by fixed entries."""
     if region is None:
         return ()
     slack, rows = _host_conditions(region, y)

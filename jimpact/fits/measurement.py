@@ -7,9 +7,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from jimpact.fits.covariances import whitening
 from jimpact.fits.observables import Prediction
+from jimpact.fits.solve import AnyArray
 from jimpact.tools.compiling import full_precision
 
 # A trial whose outcome is meaningless gets a residual far above any honest one, so that a solver
@@ -20,7 +22,7 @@ PENALTY = 1e3  # times the largest measured value
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """Measured values (K, n), or of any other shape, and their errors.
+    """Measured values (K, n) of K shots, or of any other shape, and their errors.
 
     Equation: `residual = L (predicted - value) / sigma` with `L^-1 L^-T` the correlation of the
     errors of a shot, or of all shots; L = 1 of independent ones.
@@ -29,115 +31,146 @@ class Measurement:
         value: what was measured; NaN where no value was.
         weight: 1 / sigma, shaped like `value`; 0 where no value was measured.
         unit: the largest measured value.
-        size: norm of the weights times `unit`: residuals over it are of order 1.
-        mixing: L (K, n, n), or (K, n, K, n); None: errors are independent.
-        sigma: standard errors, or None where they are not known; unknown on the device.
+        size: `unit |weight|`: residuals over it are of order 1.
+        mixing: L (K, n, n) of each shot, or (K, n, K, n) of all; None: errors are independent.
+        sigma: standard errors, or None where they are not known, and on the device.
     """
 
-    value: Any
-    weight: Any
-    unit: Any
-    size: Any
-    mixing: Any = None
+    value: Float[AnyArray, "*value"]
+    weight: Float[AnyArray, "*value"]
+    unit: Float[AnyArray, ""]
+    size: Float[AnyArray, ""]
+    mixing: Float[AnyArray, "K n n"] | Float[AnyArray, "K n K n"] | None = None
     sigma: Any = field(default=None, metadata={"static": True})
 
     @classmethod
     def of(
-        cls, value: np.ndarray, sigma: Any, weight: np.ndarray, unit: Any, mixing: Any = None
+        cls,
+        value: Float[AnyArray, "*value"],
+        sigma: Any,
+        weight: Float[AnyArray, "*value"],
+        unit: Any,
+        mixing: Any = None,
     ) -> "Measurement":
-        """That of weighed values."""
+        """The measurement of values of these weights; its `size` follows from them."""
         unit = np.asarray(float(unit) or 1.0)
         return cls(value, weight, unit, np.asarray(unit * np.linalg.norm(weight)), mixing, sigma)
 
     @property
-    def here(self) -> np.ndarray:
-        """Where a value was measured, shaped like `value`."""
-        return ~np.isnan(self.value)
+    def is_measured(self) -> Bool[np.ndarray, "*value"]:
+        """True where a value was measured."""
+        return np.asarray(~np.isnan(self.value))
 
-    def residual(self, prediction: Prediction) -> jax.Array:
-        """(R,) of a prediction, 0 where no value was measured; large where the law failed."""
+    def residual(self, prediction: Prediction) -> Float[Array, " R"]:
+        """`L (predicted - value) / sigma` of R values; 0 where no value was measured.
+
+        Where the prediction is meaningless, it is off by `PENALTY` times the largest value.
+        """
         bad = jnp.broadcast_to(prediction.bad, self.value.shape)
         error = jnp.where(bad, 0.0, prediction.value) - jnp.where(bad, 0.0, self.value)
         error = jnp.where(bad, PENALTY * self.unit, error)
         error = jnp.where(self.weight > 0, error, 0.0)  # its derivatives may be NaN
         return _mixed(error * self.weight, self.mixing, jnp).reshape(-1)
 
-    def weighed(self, factor: np.ndarray) -> "Measurement":
-        """With factors, shaped like `value`, on the independent errors; 0 leaves a value out."""
+    def weighed(self, factor: Float[np.ndarray, "*value"]) -> "Measurement":
+        """The measurement with residuals `factor` times as large; 0 leaves a value out.
+
+        The factors belong to the independent residuals: L becomes `diag(factor) L`.
+        """
         used, mixing, weight = factor > 0, self.mixing, self.weight * factor
-        if mixing is not None:  # which comes before the factors
+        if mixing is not None:  # factors times L, instead of weights times factors
             weight, scale = self.weight * used, np.where(used, factor, 1.0)
             if mixing.ndim == 4:  # of all shots: those left out leave the covariance, too
-                mixing = _without(mixing, used & self.here)
+                mixing = _without(np.asarray(mixing, float), used & self.is_measured)
             mixing = scale.reshape(scale.shape + (1,) * (mixing.ndim - 2)) * mixing
         value = np.where(used, self.value, np.nan)
         return Measurement.of(value, self.sigma, weight, self.unit, mixing)
 
-    def with_covariance(self, covariance: np.ndarray) -> "Measurement":
-        """With this covariance (K, n, n) of the values of each shot, or (K, n, K, n) of all."""
-        here = self.here
-        sigma, mixing = whitening(covariance, here)
+    def with_covariance(
+        self, covariance: Float[np.ndarray, "K n n"] | Float[np.ndarray, "K n K n"]
+    ) -> "Measurement":
+        """The measurement with this covariance of the values of each shot, or of all shots.
+
+        Equation: sigma is the root of its diagonal; `L = F^-1`, F the Cholesky factor of the
+        correlation.
+        """
+        measured = self.is_measured
+        sigma, mixing = whitening(covariance, measured)
         # factors that a weight already has (shots left out) stay
-        old = np.where(here, np.asarray(self.sigma, float), 1.0)
-        weight, sigma = self.weight * old / sigma, np.where(here, sigma, np.nan)
+        old = np.where(measured, np.asarray(self.sigma, float), 1.0)
+        weight, sigma = self.weight * old / sigma, np.where(measured, sigma, np.nan)
         return Measurement.of(self.value, sigma, weight, self.unit, mixing)
 
-    def filled(self, shots: np.ndarray) -> "Measurement":
-        """The shots of these indices, of which those after the last one have no weight."""
+    def filled(self, shots: Int[np.ndarray, " M"]) -> "Measurement":
+        """M >= K shots by their indices: all K of them, then copies, which have no weight."""
         count = len(self.value)
         parts = self.value, self.weight, self.mixing
         value, weight, mixing = jax.tree.map(lambda x: np.asarray(x)[shots], parts)
         weight[count:] = 0.0
-        if mixing is not None and mixing.ndim == 4:
+        if mixing is not None and mixing.ndim == 4:  # (M, n, K, n) so far
             mixing = mixing[:, :, shots]
             mixing[count:] = 0.0  # or a copy would count as the shot
         return replace(self, value=value, weight=weight, mixing=mixing)
 
-    def independent(self, errors: np.ndarray) -> np.ndarray:
-        """Errors (K, n, ...) of what was measured, in units of sigma and as independent ones."""
-        return _mixed(np.nan_to_num(errors) * self._weight_of(errors), self.mixing)
+    def independent(self, errors: Any) -> Float[np.ndarray, "..."]:
+        """Errors `L e / sigma` (K, n, ...) of variance 1, independent of each other, of errors e.
 
-    def errors_of(self, independent: np.ndarray) -> np.ndarray:
-        """The errors (K, n, ...) that are these as independent ones; NaN where not measured."""
+        NaN counts as 0. Further axes hold derivatives, or samples.
+        """
+        errors = np.asarray(np.nan_to_num(errors))
+        return np.asarray(_mixed(errors * self._weight_of(errors), self.mixing))
+
+    def errors_of(self, independent: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        """The inverse of `independent`: `e = sigma L^-1 u` (K, n, ...) of independent errors u.
+
+        NaN where no value was measured.
+        """
         weight = self._weight_of(independent)
         back = None if self.mixing is None else _inverse(np.asarray(self.mixing, float))
         errors = _mixed(independent, back)
         return np.where(weight > 0, errors / np.where(weight > 0, weight, 1.0), np.nan)
 
-    def _weight_of(self, errors: np.ndarray) -> np.ndarray:
-        """The weights, with as many axes as these errors."""
+    def _weight_of(self, errors: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        """The weights, with axes of length 1 behind, as many axes as these errors have."""
         more = (1,) * (errors.ndim - self.value.ndim)
         return np.asarray(self.weight, float).reshape((*self.value.shape, *more))
 
     def log_of_norm(self) -> float:
-        """`sum log(sigma sqrt(2 pi)) - log det L`: of the density of the errors, sigma known."""
-        here = self.here
-        sigma, other = np.broadcast_to(self.sigma, here.shape), np.zeros(here.shape)
+        """`sum log(sigma sqrt(2 pi)) - log det L`: minus the logarithm of the density at error 0.
+
+        It needs a known sigma. L is triangular: log det L is the sum over its diagonal.
+        """
+        measured = self.is_measured
+        shape = measured.shape
+        sigma, log_diagonal = np.broadcast_to(self.sigma, shape), np.zeros(shape)
         if self.mixing is not None:
-            size = here.size if self.mixing.ndim == 4 else here.shape[1]
-            own = np.diagonal(self.mixing.reshape(-1, size, size), axis1=1, axis2=2)
-            other = np.log(own.reshape(here.shape))
-        return float(np.sum(np.log(sigma[here] * math.sqrt(2 * math.pi)) - other[here]))
+            size = measured.size if self.mixing.ndim == 4 else shape[1]
+            diagonal = np.diagonal(self.mixing.reshape(-1, size, size), axis1=1, axis2=2)
+            log_diagonal = np.log(diagonal.reshape(shape))
+        log_sigma = np.log(sigma[measured] * math.sqrt(2 * math.pi))
+        return float(np.sum(log_sigma - log_diagonal[measured]))
 
 
 @full_precision
 def _mixed(errors: Any, mixing: Any, xp: Any = np) -> Any:
-    """Weighted errors (K, n, ...) mixed within each shot, or between all shots."""
+    """`L e` of weighted errors e (K, n, ...), L = `mixing` of each shot or of all; e if None."""
     if mixing is None:
         return errors
     axes = "kij,kj...->ki..." if mixing.ndim == 3 else "kilj,lj...->ki..."
     return xp.einsum(axes, mixing, errors)
 
 
-def _inverse(mixing: np.ndarray) -> np.ndarray:
-    """The inverse of mixing within shots (K, n, n), or between all (K, n, K, n)."""
+def _inverse(mixing: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """`L^-1` of L (K, n, n) of each shot, or (K, n, K, n) of all, in the same shape."""
     if mixing.ndim == 3:
         return np.linalg.inv(mixing)
     size = mixing.shape[0] * mixing.shape[1]
     return np.linalg.inv(mixing.reshape(size, size)).reshape(mixing.shape)
 
 
-def _without(mixing: np.ndarray, here: np.ndarray) -> np.ndarray:
-    """Mixing between shots where only the values `here` (K, n) take part."""
-    back = _inverse(np.asarray(mixing, float)).reshape(here.size, here.size)
-    return whitening((back @ back.T).reshape(mixing.shape), here)[1]
+def _without(
+    mixing: Float[np.ndarray, "K n K n"], used: Bool[np.ndarray, "K n"]
+) -> Float[np.ndarray, "K n K n"]:
+    """L of all shots where only the values `used` take part: that of their part of `L^-1 L^-T`."""
+    factor = _inverse(mixing).reshape(used.size, used.size)
+    return whitening((factor @ factor.T).reshape(mixing.shape), used)[1]

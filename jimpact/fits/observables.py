@@ -34,7 +34,7 @@ _CONTACT = jax.jit(contact_of)  # remembers the shapes that it has seen; only th
 
 
 class Prediction(NamedTuple):
-    """What a law predicts: values, where they are meaningless, and status codes (S,)."""
+    """Predictions of a law: values, `bad` where they are meaningless, and status codes (S,)."""
 
     value: jax.Array
     bad: jax.Array
@@ -49,7 +49,7 @@ class Shots(eqx.Module):
     bodies: int = eqx.field(static=True)
 
     def __call__(self, law: Law) -> Prediction:
-        """Velocities after every shot, and the status of its impact."""
+        """v+ (K, n) after the impact of each shot, and its status code; bad if it is `UNUSABLE`."""
         law, scenes = placed(law, self.scenes)
         out = jax.vmap(impact, in_axes=(None, 0, 0))(law, scenes, self.pre)
         unusable = jnp.asarray([CODE[name] for name in UNUSABLE], out.status.dtype)
@@ -73,17 +73,18 @@ class Observed(eqx.Module):
 
 
 def filled_count(count: int) -> int:
-    """How many shots a program has that serves so many."""
+    """Number of shots of the program for `count` shots: the next of 4, 8, 16, ..."""
     return FEWEST if count <= FEWEST else 2 ** math.ceil(math.log2(count))
 
 
 def tolerated(
     law: AnyLaw, scene: Scene | None, data: Experiments
 ) -> tuple[AnyLaw, tuple[str, ...]]:
-    """The law at a tolerance that the noise of the data allows, and a sentence that says so.
+    """The law with `rtol = COARSE_RTOL` where the noise of the data allows it, and a note.
 
-    Of a law without `rtol` that errs by more than signs do (`Law.accuracy`), where `sigma` is
-    known.
+    It does where `sigma` is known, and in each shot the smallest noise of a gap velocity,
+    `sqrt(sum (N_ij sigma_i)^2)`, times `PART_OF_NOISE` is at least `COARSE_RTOL` of the fastest
+    one. Laws with an `rtol`, more accurate ones and less accurate ones stay as they are.
     """
     if data.sigma is None or getattr(law, "rtol", COARSE_RTOL) is not None:
         return law, ()

@@ -61,7 +61,7 @@ def entry_of(name: str) -> tuple[str, str | None]:
 
 
 def places(argument: str, name: str, shape: tuple[int, ...]) -> list[int]:
-    """Where in the flattened field of this shape the entries of a name are, counted from 0."""
+    """Indices (from 0) of a name's entries in the flattened field, which has this shape."""
     _, entry = entry_of(name)
     if entry is None:
         return list(range(int(np.prod(shape, dtype=int))))
@@ -78,18 +78,18 @@ def places(argument: str, name: str, shape: tuple[int, ...]) -> list[int]:
 
 
 def domain_of(law: Law, field: str) -> Domain:
-    """What values a parameter may have."""
+    """The range of values that a parameter of the law may have."""
     return parameters_of(law)[field].domain
 
 
 def scaled(x: Any, scale: Any, log: Any, xp: Any = np) -> Any:
-    """y of values x, by NumPy or JAX."""
+    """Scaled variables y of values x: `x / scale`, or `log(x)`; `xp` is NumPy or jax.numpy."""
     with np.errstate(divide="ignore"):
         return xp.where(log, xp.log(xp.where(log, x, 1.0)), x / scale)
 
 
 def unscaled(y: Any, scale: Any, log: Any, xp: Any = np) -> Any:
-    """Values x of y."""
+    """Values x of scaled variables y: `scale y`, or `exp(y)`; `xp` is NumPy or jax.numpy."""
     return xp.where(log, xp.exp(xp.where(log, y, 0.0)), y * scale)
 
 
@@ -103,9 +103,9 @@ class Parameters:
 
     fields: tuple[str, ...]
     names: tuple[str, ...]
-    groups: tuple[tuple[int, ...], ...]
-    log: np.ndarray  # (P,) whether a parameter is fitted in its logarithm
-    ratios: bool = False  # whether the stiffness of contact 1 is held: only ratios matter
+    groups: tuple[tuple[int, ...], ...]  # for each parameter, the entries that share its value
+    log: np.ndarray  # (P,) True where a parameter is fitted in its logarithm
+    ratios: bool = False  # True where the stiffness of contact 1 is held: only ratios matter
 
     @property
     def first(self) -> list[int]:
@@ -125,12 +125,12 @@ def free_parameters(
 
     `absolute`: forces or times were measured, which show a common factor of all stiffnesses.
     """
-    known, fixed = free_parameters_of(law), ""
+    available, fixed = free_parameters_of(law), ""  # `fixed`: the stiffness that the note is about
     if free is DEFAULT_FREE:
         free = default_free(law, absolute)
-        if "stiffness" in known and "stiffness" not in free:
+        if "stiffness" in available and "stiffness" not in free:
             fixed = "stiffness"
-    labels = _labels(law, free)
+    labels = _labels(law, free)  # by field: 0 is fixed, equal numbers share one value
     if not absolute and _only_ratios(law, labels) and labels.get("stiffness", np.zeros(1)).all():
         shared = labels["stiffness"] == labels["stiffness"].flat[0]
         if shared.all():
@@ -145,7 +145,7 @@ def free_parameters(
     for tie in ties:
         if tie.field in labels:
             labels[tie.field].flat[list(tie.at)] = 0
-    names, groups, start = [], [], 0
+    names, groups, start = [], [], 0  # start: the number of the first entry of a field
     for field, label in labels.items():
         for value in dict.fromkeys(label[label > 0].tolist()):
             names.append(_name(field, np.argwhere(label == value), label.size))
@@ -155,18 +155,19 @@ def free_parameters(
         raise ValueError("Argument `free` must name a parameter to fit, but leaves none free.")
     log = np.array([domain_of(law, entry_of(name)[0]).log for name in names])
     note = f"{fixed} is fixed at its start: with equal exponents only stiffness ratios matter."
-    found = Parameters(tuple(labels), tuple(names), tuple(groups), log, fixed == "stiffness[1]")
-    return found, [note] if fixed else []
+    ratios = fixed == "stiffness[1]"
+    parameters = Parameters(tuple(labels), tuple(names), tuple(groups), log, ratios)
+    return parameters, [note] if fixed else []
 
 
 def _labels(law: Law, free: Any) -> dict[str, np.ndarray]:
-    """Of each field that `free` names: 0 where fixed, equal numbers where a value is shared."""
-    known, labels = free_parameters_of(law), {}
+    """Labels by field, shaped like it: 0 for fixed entries, equal numbers for a shared value."""
+    available, labels = free_parameters_of(law), {}
     choices = free if isinstance(free, Mapping) else dict.fromkeys(as_names("free", free), True)
     for name, choice in choices.items():
         field, entry = entry_of(name)
-        if field not in known:
-            raise ValueError(_unknown_field(law, name, list(known)))
+        if field not in available:
+            raise ValueError(_unknown_field(law, name, list(available)))
         shape = np.shape(value_of(law, field))
         if entry is None:
             labels[field] = _as_labels(field, choice, shape)
@@ -181,7 +182,7 @@ def _labels(law: Law, free: Any) -> dict[str, np.ndarray]:
 
 
 def _name(field: str, members: np.ndarray, size: int) -> str:
-    """restitution (one value for all), restitution[2], restitution[1=3] (shared), matrix[1,2]."""
+    """A name: restitution (all entries), restitution[2], restitution[1=3] (shared), matrix[1,2]."""
     if len(members) == size and (size > 1 or members.shape[1] == 0):
         return field
     return f"{field}[{'='.join(','.join(str(i + 1) for i in index) for index in members)}]"
@@ -196,12 +197,13 @@ def as_names(argument: str, names: Any) -> tuple[str, ...]:
 
 
 def default_free(law: Law, absolute: bool = False) -> tuple[str, ...]:
-    """The fields that are fitted by default: how the contacts bounce, or else all.
+    """The fields that are fitted by default: restitution, stiffness, matrix, speed; or else all.
 
     A single stiffness of which only ratios matter is left out; `absolute`: see `free_parameters`.
     """
-    known = free_parameters_of(law)
-    fields = [name for name in (*DEFAULT_FREE, "matrix", *OF_SPEED) if name in known] or list(known)
+    available = free_parameters_of(law)
+    first = [name for name in (*DEFAULT_FREE, "matrix", *OF_SPEED) if name in available]
+    fields = first or list(available)
     single = "stiffness" in fields and np.size(value_of(law, "stiffness")) == 1
     if single and not absolute and _only_ratios(law, {}):
         fields.remove("stiffness")
@@ -209,7 +211,7 @@ def default_free(law: Law, absolute: bool = False) -> tuple[str, ...]:
 
 
 def _unknown_field(law: Law, field: str, known: list[str]) -> str:
-    """What is wrong with a field that is not free."""
+    """The error message for a name in `free` that is no free parameter of the law."""
     name = type(plain_law(law)).__name__
     if isinstance(value_of(law, field), (float, tuple)):
         return (
@@ -249,7 +251,7 @@ def _as_labels(field: str, choice: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _only_ratios(law: Law, labels: Mapping[str, np.ndarray]) -> bool:
-    """Whether a common factor of all stiffnesses is invisible, in the fit too."""
+    """True where a common factor of all stiffnesses changes nothing, whatever is fitted of them."""
     stay_equal = "exponent" not in labels or len(set(labels["exponent"].flat)) == 1
     return law.only_stiffness_ratios and stay_equal
 
@@ -268,7 +270,7 @@ def _check_name(argument: str, name: str, known: Any) -> None:
 
 
 def bounds_of(parameters: Parameters, law: Law, bounds: Mapping[str, Any] | None) -> Limits:
-    """Lower and upper bounds (P,): the user's, or else the field's domain."""
+    """Bounds (P,), (P,): the user's, else the field's domain; the narrowest of a shared value."""
     chosen, fields = dict(bounds or {}), sorted(set(parameters.of_fields))
     for name in chosen:
         _check_name("bounds", entry_of(name)[0], fields)
@@ -291,7 +293,7 @@ def bounds_of(parameters: Parameters, law: Law, bounds: Mapping[str, Any] | None
 
 
 def _default_bounds(law: Law, field: str) -> np.ndarray:
-    """(2, size) ends of the domain of a field, or of what is searched of it."""
+    """Default bounds (2, size) of a field: its domain, of a stiffness `LOG_RANGE` to each side."""
     values, domain = np.ravel(np.asarray(value_of(law, field), float)), domain_of(law, field)
     if domain.log:
         return np.stack([values / LOG_RANGE, values * LOG_RANGE])
@@ -325,7 +327,7 @@ def _bound_pair(field: str, pair: Any, law: Law) -> Limits:
 
 
 class Prior(NamedTuple):
-    """What is known of a parameter (by its number) besides the data: normally distributed."""
+    """A normal distribution of a parameter (by its index) that is known besides the data."""
 
     parameter: int
     mean: float
@@ -370,7 +372,7 @@ def mean_and_std(name: str, pair: Any, low: float, high: float) -> tuple[float, 
 
 
 class Tie(NamedTuple):
-    """What follows from other values, by a function: the entries `at` of a flattened field."""
+    """A constraint: the entries `at` of a flattened field are a function of other values."""
 
     name: str
     field: str
@@ -378,7 +380,7 @@ class Tie(NamedTuple):
     function: Callable[["Values"], Any]
 
     def overlaps(self, field: str, at: Iterable[int]) -> bool:
-        """Whether it ties some of these entries."""
+        """True if it ties one of these entries of a field."""
         return self.field == field and not set(at).isdisjoint(self.at)
 
 
@@ -386,11 +388,11 @@ Ties = tuple[Tie, ...]
 
 
 class Values:
-    """What a tie's function is given: values of a law by name, those that are tied included."""
+    """The argument of a tie's function: values of a law by name, those that are tied included."""
 
     def __init__(self, law: Law, ties: Ties):
         self.law, self.ties = law, ties
-        self.waiting: list[str] = []  # ties that have begun, each needed by the one before
+        self.waiting: list[str] = []  # ties being evaluated, each needed by the one before
 
     def __getitem__(self, name: str) -> Any:
         """The value of an entry, or of a whole field in its shape."""
@@ -403,7 +405,7 @@ class Values:
         return flat.reshape(value.shape) if entry is None else flat[at[0]]
 
     def _follow(self, tie: Tie) -> Any:
-        """The value of what is tied, by its function."""
+        """The value of a tie's function, flattened; it evaluates other ties that it needs."""
         if tie.name in self.waiting:
             circle = [*self.waiting[self.waiting.index(tie.name) :], tie.name]
             way = f"{circle[0]} needs {', which needs '.join(circle[1:])}"
@@ -423,7 +425,7 @@ class Values:
 
 
 def tied(law: AnyLaw, ties: Ties) -> AnyLaw:
-    """The law with the tied entries as their functions say."""
+    """The law with its tied entries set to the values of their functions."""
     values = Values(law, ties)
     for field in dict.fromkeys(tie.field for tie in ties):
         law = with_parameter(law, field, values[field])
@@ -431,8 +433,8 @@ def tied(law: AnyLaw, ties: Ties) -> AnyLaw:
 
 
 def checked_ties(law: Law, ties: Mapping[str, Any] | None) -> Ties:
-    """The user's ties, tried at the law's own values."""
-    found: Ties = ()
+    """The user's ties, checked, with their functions evaluated at the law's start values."""
+    checked: Ties = ()
     for name, function in (ties or {}).items():
         if not callable(function):
             raise ValueError(
@@ -441,14 +443,14 @@ def checked_ties(law: Law, ties: Mapping[str, Any] | None) -> Ties:
             )
         at = tuple(places("ties", name, _value(law, name).shape))
         tie = Tie(name, entry_of(name)[0], at, function)
-        for other in found:
+        for other in checked:
             if other.overlaps(tie.field, at):
                 raise ValueError(
                     f"Argument `ties` must tie an entry once, but {other.name} and {name} overlap."
                 )
-        found = (*found, tie)
-    start = tied(law, found)
-    for tie in found:
+        checked = (*checked, tie)
+    start = tied(law, checked)
+    for tie in checked:
         value, domain = tied_value(start, tie), domain_of(start, tie.field)
         if not bool(np.asarray(domain.holds(value))):
             low, high = domain.bounds
@@ -456,7 +458,7 @@ def checked_ties(law: Law, ties: Mapping[str, Any] | None) -> Ties:
                 f"Argument `ties` must keep `{tie.name}` in [{low:g}, {high:g}], but its function "
                 f"gives {value.tolist()} at the start."
             )
-    return found
+    return checked
 
 
 def tied_value(law: Law, tie: Tie) -> jax.Array:
@@ -469,21 +471,21 @@ def tied_names(law: Law, ties: Ties) -> list[str]:
     names = []
     for tie in ties:
         shape = np.shape(value_of(law, tie.field))
-        whole = tie.name == tie.field and shape
-        members = [np.array([np.unravel_index(i, shape)]) for i in tie.at] if whole else []
+        is_array = tie.name == tie.field and shape  # of which each entry has a name
+        members = [np.array([np.unravel_index(i, shape)]) for i in tie.at] if is_array else []
         names += [_name(tie.field, each, 0) for each in members] or [tie.name]
     return names
 
 
 def _value(law: Law, name: str) -> Any:
-    """The field of a name, a parameter that is an array."""
-    known, (field, _) = free_parameters_of(law), entry_of(name)
-    if field not in known:
+    """The value of the field that `name` belongs to; a ValueError unless it is a parameter."""
+    available, (field, _) = free_parameters_of(law), entry_of(name)
+    if field not in available:
         raise ValueError(
             f"Argument `ties` must use parameters of {type(law).__name__}, one of "
-            f"{', '.join(known)}, but uses {name!r}.{suggestion(field, known)}"
+            f"{', '.join(available)}, but uses {name!r}.{suggestion(field, available)}"
         )
-    return jnp.asarray(known[field].value)
+    return jnp.asarray(available[field].value)
 
 
 # ---------------------------------------------------------------------------- parts of a scene
@@ -502,11 +504,11 @@ class LawInScene(Law):
     tilt: OptionalValues = parameter(low=-np.pi, high=np.pi, default=None)
 
     def impulses(self, contact: Contact) -> Impulses:
-        """Those of the law, in a contact of a scene with these parts."""
+        """Impulses of the law, in a contact of a scene with these parts."""
         return self.law.impulses(contact)
 
     def in_scene(self, scene: Scene) -> Scene:
-        """The scene with these parts."""
+        """The scene with these parts in the place of its own."""
         if self.mass is not None:
             scene = eqx.tree_at(lambda s: s.mass, scene, self.mass)
         if self.gaps is not None:
@@ -555,38 +557,38 @@ def with_parts_of_scene(law: Law, scene: Scene | None, own_scenes: bool, free: A
     planar = scene.tangents is not None and scene.tangents.shape == scene.normals.shape
     flat = jnp.zeros(scene.contacts, scene.mass.dtype) if planar else None
     mass = scene.mass if scene.mass.ndim == 1 else None
-    known = {
+    values = {  # the part of the scene, None: it has none that could be fitted; what it must have
         "mass": (mass, "that of `scene` is (n,)"),
         "gaps": (scene.gaps, "`scene` has gaps"),
         "tilt": (flat, "`scene` has one tangent for each contact"),
     }
     for name in parts:
-        value, where = known[name]
+        value, where = values[name]
         if value is None:
             raise ValueError(f"Argument `free` may name `{name}` only where {where}.")
-    return LawInScene(law, **{name: known[name][0] for name in parts})
+    return LawInScene(law, **{name: values[name][0] for name in parts})
 
 
 def limits_with_scene(
     parameters: Parameters, law: LawInScene, limits: Limits, priors: tuple[Prior, ...]
 ) -> Limits:
-    """Limits of all parameters, those of the scene no farther away than their priors allow.
+    """Limits of all parameters; parts of the scene stay within `REACH` deviations of their priors.
 
     Raises:
         ValueError: a part of the scene without a prior, or far from it at the start.
     """
-    known = {prior.parameter: prior for prior in priors}
+    prior_of = {prior.parameter: prior for prior in priors}
     low, high = (end.copy() for end in limits)
     start = entries(law, parameters.fields)[parameters.first]
     for i, (name, field) in enumerate(zip(parameters.names, parameters.of_fields)):
         if field not in OF_A_SCENE:
             continue
-        if i not in known:
+        if i not in prior_of:
             raise ValueError(
                 f"Argument `priors` must have (mean, standard deviation) for `{name}`, a part of "
                 "the scene that is fitted with the law."
             )
-        _, mean, std = known[i]
+        _, mean, std = prior_of[i]
         low[i], high[i] = max(low[i], mean - REACH * std), min(high[i], mean + REACH * std)
         if not low[i] <= start[i] <= high[i]:
             raise ValueError(

@@ -34,18 +34,18 @@ class LawInMotion(Law):
     floor: OptionalValues = parameter(per_contact=False, default=None)
 
     def impulses(self, contact: Contact) -> Impulses:
-        """Those of the law."""
+        """Impulses of the law."""
         return self.law.impulses(contact)
 
     def in_system(self, system: System) -> System:
-        """The system with this gravity."""
+        """The system with the potential of this gravity in the place of its own."""
         if self.gravity is None:
             return system
         weight = system.body.gravity(self.gravity)
         return eqx.tree_at(lambda s: s.potential, system, weight)
 
     def start(self, system: System, q0: jax.Array, v0: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """The start, seen from the floor, in the place of what the motion has."""
+        """Fitted start q0, v0, else the given one; heights in q0 are above the fitted floor."""
         q0 = q0 if self.q0 is None else self.q0
         v0 = v0 if self.v0 is None else self.v0
         if self.floor is None:
@@ -53,7 +53,7 @@ class LawInMotion(Law):
         return q0 - jnp.broadcast_to(self.floor * _up(system), q0.shape), v0
 
     def seen(self, motion: Motion, system: System) -> Motion:
-        """The motion with places as they were measured, not from the floor."""
+        """The motion with heights as they were measured: those above the floor, plus its height."""
         if self.floor is None:
             return motion
         rise = (self.floor * _up(system))[None, :]
@@ -62,7 +62,7 @@ class LawInMotion(Law):
 
 
 def _up(system: System) -> jax.Array:
-    """(n,) how coordinates change where everything is lifted by a metre."""
+    """(n,) change of the coordinates q where all bodies are lifted by one metre."""
     directions = system.body.base_directions
     assert directions is not None  # `with_parts_of_motion` has seen to it
     return directions[:, -1]
@@ -72,6 +72,12 @@ def with_parts_of_motion(
     law: Law, system: System, q0: jax.Array, v0: jax.Array, free: Iterable[str]
 ) -> Law:
     """The law with the parts of the motion that `free` names; the law itself, if it names none.
+
+    Args:
+        law: to fit.
+        system: that moves.
+        q0, v0: start (n,), or starts (K, n).
+        free: names, of the law's parameters or of `OF_A_MOTION`.
 
     Raises:
         ValueError: parts that the motion does not have.
@@ -90,14 +96,20 @@ def with_parts_of_motion(
             "Argument `free` may name `floor` only of bodies over a floor at rest, but the system "
             f"is of a {type(system.body).__name__}{where}."
         )
-    known: dict[str, Any] = {"q0": q0, "v0": v0, "floor": jnp.zeros((), q0.dtype)}
+    values: dict[str, Any] = {"q0": q0, "v0": v0, "floor": jnp.zeros((), q0.dtype)}
     if "gravity" in wanted:
-        known["gravity"] = _acceleration(system, q0.reshape(-1, q0.shape[-1])[0])
-    return LawInMotion(law, **{name: known[name] for name in wanted})
+        values["gravity"] = _acceleration(system, q0.reshape(-1, q0.shape[-1])[0])
+    return LawInMotion(law, **{name: values[name] for name in wanted})
 
 
 def _acceleration(system: System, q: jax.Array) -> jax.Array:
-    """g of a system under its weight, by the forces at a place."""
+    """The acceleration of gravity g () of a system, from its forces at q (n,) [m/s^2].
+
+    Equation: `g = f^T w / w^T w`, f the gradient of its potential, w that of the weight with g = 1.
+
+    Raises:
+        ValueError: f is not g w: there are other forces, or none.
+    """
     refused = ValueError(
         "Argument `free` may name `gravity` only of a system whose one potential is its weight: "
         "give it `gravity=`."

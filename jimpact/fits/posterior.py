@@ -2,7 +2,7 @@
 
 import sys
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -83,27 +83,11 @@ def posterior(
     each = _priors(problem, dict(priors or {}), numpyro.distributions)
 
     inner = None if problem.matrix is None else _Inner(problem, problem.matrix)
-
-    def model() -> None:
-        """The model that numpyro samples."""
-        if inner is None:
-            x = jnp.stack([numpyro.sample(name, prior) for name, prior in each.items()])
-        else:
-            flat = numpyro.distributions.ImproperUniform(
-                numpyro.distributions.constraints.real_vector, (), (len(each),)
-            )
-            x, change = inner.values(numpyro.sample(_FREE, flat))
-            log_priors = [prior.log_prob(x[i]) for i, prior in enumerate(each.values())]
-            numpyro.factor("prior", change + sum(log_priors))
-            for i, name in enumerate(each):
-                numpyro.deterministic(name, x[i])
-        numpyro.factor("data", problem.log_density(x))
-
     first = dict(zip(problem.names, _inside(start, problem.domains)))
     if inner is not None:
         first = {_FREE: inner.free(start)}
     kernel = numpyro.infer.NUTS(
-        model,
+        _model(problem, each, inner, numpyro),
         forward_mode_differentiation=True,
         dense_mass=len(each) > 1,
         init_strategy=numpyro.infer.init_to_value(values=first),
@@ -118,16 +102,43 @@ def posterior(
         progress_bar=shown,
     )
 
-    values, said = _drawn(sampler, seed, shown)
-    draws = arviz.from_dict(posterior=values, sample_stats=said)
+    values, statistics = _drawn(sampler, seed, shown)
+    draws = arviz.from_dict(posterior=values, sample_stats=statistics)
     if inner is not None:
         del draws.posterior[_FREE]
     _warn(draws, arviz)
     return draws
 
 
+def _model(
+    problem: FitProblem, priors: dict[str, Any], inner: "_Inner | None", numpyro: Any
+) -> Callable[[], None]:
+    """The model for numpyro: x (P,) from the priors, with the log density of the data at x.
+
+    Of an admissible matrix (`inner`) z (P,) is sampled in the place of x; the log density is then
+    that of the priors at x(z), plus the logarithm of the determinant of dx/dz.
+    """
+
+    def model() -> None:
+        """Sample x, or z, and add the logarithms of the densities."""
+        if inner is None:
+            x = jnp.stack([numpyro.sample(name, prior) for name, prior in priors.items()])
+        else:
+            flat = numpyro.distributions.ImproperUniform(
+                numpyro.distributions.constraints.real_vector, (), (len(priors),)
+            )
+            x, log_determinant = inner.values(numpyro.sample(_FREE, flat))
+            log_priors = [prior.log_prob(x[i]) for i, prior in enumerate(priors.values())]
+            numpyro.factor("prior", log_determinant + sum(log_priors))
+            for i, name in enumerate(priors):
+                numpyro.deterministic(name, x[i])
+        numpyro.factor("data", problem.log_density(x))
+
+    return model
+
+
 def _arviz() -> Any:
-    """ArviZ; one whose results are built in another way is refused before anything is sampled."""
+    """The module arviz; an ImportError if it is missing or too new, before anything is sampled."""
     arviz = needed("arviz", HOW)
     if int(arviz.__version__.split(".")[0]) >= TOO_NEW:
         raise ImportError(
@@ -137,44 +148,51 @@ def _arviz() -> Any:
 
 
 def _drawn(sampler: Any, seed: int, shown: bool) -> tuple[Any, Any]:
-    """Draws by name, and what numpyro's `sampler` says of them; each (chains, samples)."""
+    """Draws by name, and the sampler's fields such as 'diverging'; each (chains, samples)."""
 
     def drawn(key: jax.Array) -> tuple[Any, Any]:
-        """Both of them."""
+        """Run the sampler with a random key: draws and fields."""
         sampler.run(key)
         return sampler.get_samples(True), sampler.get_extra_fields(True)
 
     # as one program a short run takes half of the time (16 for 29 s); a progress bar needs several
     run = drawn if shown else jax.jit(drawn, compiler_options=known_options())
-    values, said = jax.tree.map(np.asarray, run(jax.random.PRNGKey(seed)))
-    return values, said
+    values, statistics = jax.tree.map(np.asarray, run(jax.random.PRNGKey(seed)))
+    return values, statistics
 
 
 class _Inner:
-    """All admissible matrices as the space of z (P,), and how volumes change on the way."""
+    """The map of z in R^P onto the admissible matrices: `y = y_0 + L(d) tanh(|z| / L(d)) d`.
+
+    d = z / |z|, y_0 is the center of the region, L(d) how far it reaches from there.
+    """
 
     def __init__(self, problem: FitProblem, region: Any):
         self.problem, self.region, self.count = problem, region, len(problem.names)
         self.reach = jax.jit(self._reach)
 
     def _reach(self, direction: jax.Array) -> jax.Array:
-        """L: how far the region reaches from its center."""
+        """L (): how far the region reaches from its center in a direction (P,) of length 1."""
         ahead = jnp.zeros_like(self.region.center).at[: self.count].set(_AFAR * direction)
         return _AFAR * self.region.share(self.region.center + ahead)
 
     def values(self, z: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """x (P,) of z, and the logarithm of the determinant of dx/dz, up to a constant."""
+        """x (P,) of z, and the logarithm of the determinant of dx/dz, up to a constant.
+
+        Equation: with r = |z|, m = L tanh(r / L): `det = dm/dr (m / r)^(P - 1)`, `dm/dr = 1 /
+        cosh(r / L)^2`; the dependence of L on d does not change it.
+        """
         r = jnp.sqrt(jnp.sum(z**2) + jnp.finfo(z.dtype).tiny)
         reach = self.reach(z / r)
         move = reach * jnp.tanh(r / reach)
         y = self.region.center.at[: self.count].add(move * z / r)
         x = y[: self.count] * self.problem.variables.scale[: self.count]
-        # of dmove/dr = 1 / cosh^2, in a form that does not overflow
+        # log(1 / cosh^2), in a form that does not overflow
         slope = -2 * (jnp.logaddexp(r / reach, -r / reach) - jnp.log(2.0))
         return x, slope + (self.count - 1) * jnp.log(move / r)
 
     def free(self, start: np.ndarray) -> jax.Array:
-        """z of values x, a little inside."""
+        """z (P,) of values x: `|z| = L artanh(|y - y_0| / L)`, at most `1 - _INSIDE` of the way."""
         move = (jnp.asarray(self.problem.variables.point(start)) - self.region.center)[: self.count]
         size = jnp.linalg.norm(move)
         if size == 0:
@@ -184,18 +202,21 @@ class _Inner:
 
 
 def _inside(start: np.ndarray, domains: np.ndarray) -> np.ndarray:
-    """The start moved away from the ends of the domains."""
+    """The start (P,), at least the share `_INSIDE` of the width from the ends of `domains`."""
     low, high = domains.T
     width = np.where(np.isfinite(high - low), high - low, np.maximum(np.abs(start), 1.0))
     return np.clip(start, low + _INSIDE * width, high - _INSIDE * width)
 
 
 def _priors(problem: FitProblem, chosen_priors: dict[str, Any], kinds: Any) -> dict[str, Any]:
-    """A distribution of numpyro a parameter: chosen, or of the fit, or flat."""
+    """The numpyro distribution of each parameter, by name: chosen, or that of the fit, or flat.
+
+    `kinds` is the module `numpyro.distributions`.
+    """
     parameters, priors = problem.parameters, {}
-    own = {i: Normal(mean, std) for i, mean, std in problem.priors}
+    of_fit = {i: Normal(mean, std) for i, mean, std in problem.priors}
     for i, (name, field) in enumerate(zip(problem.names, parameters.of_fields)):
-        chosen = chosen_priors.get(name, chosen_priors.get(field, own.get(i)))
+        chosen = chosen_priors.get(name, chosen_priors.get(field, of_fit.get(i)))
         low, high = problem.domains[i].tolist()
         priors[name] = _prior(name, chosen, low, high, bool(parameters.log[i]), kinds)
     for name in chosen_priors:
@@ -204,7 +225,13 @@ def _priors(problem: FitProblem, chosen_priors: dict[str, Any], kinds: Any) -> d
 
 
 def _prior(name: str, chosen: Any, low: float, high: float, log: bool, kinds: Any) -> Any:
-    """The numpyro distribution of one parameter."""
+    """The numpyro distribution of one parameter in its domain [low, high].
+
+    Flat where none is chosen (`log`: in the logarithm); the normal one is truncated to the domain.
+
+    Raises:
+        ValueError: a distribution that reaches beyond the domain, or of another kind.
+    """
     if chosen is None:
         if np.isfinite([low, high]).all():
             return kinds.LogUniform(low, high) if log else kinds.Uniform(low, high)
@@ -240,7 +267,7 @@ def _prior(name: str, chosen: Any, low: float, high: float, log: bool, kinds: An
 
 
 def _warn(draws: Any, arviz: Any) -> None:
-    """Say where the draws are not to be trusted."""
+    """Warn of transitions that diverged, and of chains that disagree (r-hat above `MIXED`)."""
     diverging = int(np.asarray(draws.sample_stats["diverging"]).sum())
     if diverging:
         warnings.warn(

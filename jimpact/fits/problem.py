@@ -149,15 +149,14 @@ class FitProblem:
             law: start values.
             scene: of all shots; None: they carry their own.
             experiments: measured shots.
-            free: as in `fit`.
-            bounds: as in `fit`.
-            priors: as in `fit`.
-            ties: as in `fit`.
+            free, bounds, priors, ties: as in `fit`.
         """
         problem = of_shots(law, scene, experiments, free, bounds, priors, ties)
         if problem.measurement.mixing is None:
             return problem
-        return problem.with_errors_before(outcome_at(problem, problem.start).slopes[0])
+        slopes = outcome_at(problem, problem.start).slopes
+        assert slopes is not None  # as errors are correlated by `mixing`
+        return problem.with_errors_before(slopes[0])
 
     @classmethod
     def from_observable(
@@ -179,10 +178,7 @@ class FitProblem:
                 residual is an observable of which zeros were measured.
             measured: what was measured of it, of the same shape; NaN where no value was measured.
             sigma: standard errors, scalar or of the same shape; None: one common, unknown.
-            free: as in `fit`.
-            bounds: as in `fit`.
-            priors: as in `fit`.
-            ties: as in `fit`.
+            free, bounds, priors, ties: as in `fit`.
 
         Raises:
             ValueError: no measured value, sigma <= 0, an observable of another shape, and as `fit`.
@@ -210,8 +206,8 @@ class FitProblem:
             sigma = np.where(np.isnan(post), 1.0, sigma)
             check_values("sigma", sigma, low=0.0, open_low=True)
         # a stiffness that the user names is one that the function sees
-        own = isinstance(observe, eqx.Module)
-        observable = observe if own else Observed(observe, free is not DEFAULT_FREE)
+        is_observable = isinstance(observe, eqx.Module)
+        observable = observe if is_observable else Observed(observe, free is not DEFAULT_FREE)
         weight = np.where(np.isnan(post), 0.0, 1 / (1.0 if sigma is None else sigma))
         measurement = Measurement.of(post, sigma, weight, np.nanmax(np.abs(post)))
         problem = _build(law, observable, measurement, (free, bounds, priors, ties))
@@ -224,7 +220,7 @@ class FitProblem:
         return problem
 
     def of_other(self, data: Experiments, scene: Scene | None) -> "FitProblem":
-        """The same of other shots, which is many times quicker than to make it from them.
+        """The same problem of other shots; many times quicker than to make it anew.
 
         Errors of v- count as if there were none; the law and its tolerance stay.
 
@@ -239,7 +235,7 @@ class FitProblem:
         )
 
     def weighed(self, factor: np.ndarray) -> "FitProblem":
-        """With factors on the independent errors.
+        """The problem with the residuals multiplied by factors.
 
         Args:
             factor: shaped like `measured`; 0 leaves a value out.
@@ -247,7 +243,7 @@ class FitProblem:
         return replace(self, measurement=_in(self.dtype, self.measurement.weighed(factor)))
 
     def measured_again(self, measured: np.ndarray, prior_mean: np.ndarray) -> "FitProblem":
-        """With other measured values of the same errors, and other means of the priors.
+        """The problem with other measured values of the same errors, and other means of priors.
 
         Args:
             measured: shaped like that of the problem.
@@ -257,7 +253,7 @@ class FitProblem:
         return replace(self, measurement=measurement, prior_mean=prior_mean)
 
     def with_errors_before(self, slopes: np.ndarray | None) -> "FitProblem":
-        """With the errors of v-, if there are any, passed on to v+ by slopes.
+        """The problem with the errors of v-, if there are any, passed on to v+.
 
         Args:
             slopes: `dv+/dv-` of the shots (K or more, n, n); None: nothing changes.
@@ -270,10 +266,10 @@ class FitProblem:
         return replace(self, measurement=_in(self.dtype, changed))
 
     def for_compiled(self) -> "FitProblem":
-        """The same as an argument of compiled functions, which serve many problems.
+        """The problem as an argument of compiled functions, which serve many problems.
 
-        What only the host needs is None. The number of shots is raised to one of few (4, 8, 16,
-        ..) by copies of the last one, of no weight.
+        What only the host needs is None. The number of shots is raised to `filled_count` by copies
+        of the last one, of no weight.
         """
         measurement = replace(self.measurement, sigma=None)  # its weights have it
         bare = replace(self, **_ONLY_ON_HOST, measurement=measurement)
@@ -285,14 +281,15 @@ class FitProblem:
         return replace(bare, observe=observe, measurement=bare.measurement.filled(shots))
 
     def least_squares(self) -> LeastSquares:
-        """The problem as a solver knows it."""
+        """The problem as solvers need it: residual, box and projection in the variables y (Q,)."""
         bare, low = self.for_compiled(), self.variables.low
         shape, q, dtype = bare.measured.shape, len(low), low.dtype
-        listed = isinstance(self.observe, Shots) or self.measured.ndim == 2
+        is_table = isinstance(self.observe, Shots) or self.measured.ndim == 2
         statuses = shape[0] if isinstance(self.observe, Shots) else 1
-        rest: Any = (np.zeros(shape, dtype), np.zeros(statuses, np.int32))
-        if bare.measurement.mixing is not None:  # dv+/dv- of each shot
-            rest += (np.zeros((*shape, shape[-1]), dtype),)
+        # zeros shaped like predictions, status codes, and dv+/dv- of each shot
+        outcomes: Any = (np.zeros(shape, dtype), np.zeros(statuses, np.int32))
+        if bare.measurement.mixing is not None:
+            outcomes += (np.zeros((*shape, shape[-1]), dtype),)
         residual = np.zeros(math.prod(shape) + q, dtype)
         project = None
         if self.matrix is not None:
@@ -303,8 +300,8 @@ class FitProblem:
             high=self.variables.high,
             size=self.measurement.size,
             project=project,
-            zeros=(residual, np.zeros((len(residual), q), dtype), rest),
-            short=listed and shape[1] <= FEW,
+            zeros=(residual, np.zeros((len(residual), q), dtype), outcomes),
+            short=is_table and shape[1] <= FEW,
         )
 
     # ------------------------------------------------------------------ functions of x
@@ -337,9 +334,9 @@ class FitProblem:
         return law.in_scene(self.scene)
 
     def residual(self, x: Any) -> jax.Array:
-        """(R,) `(observed - measured) / sigma` at x (P,), then those of the priors.
+        """Residuals `(observed - measured) / sigma` (R,) at x (P,), then those of the priors.
 
-        Where the law fails, a large number.
+        A large number where the law fails.
         """
         x = jnp.asarray(x, self.dtype)
         which = np.array([prior.parameter for prior in self.priors], int)
@@ -349,7 +346,7 @@ class FitProblem:
     def _of_data(self, x: Any) -> jax.Array:
         """The residual of what was measured."""
         residual = self.measurement.residual(self.observe(self.law_in_scene(x)))
-        return residual[np.flatnonzero(self.measurement.here)]
+        return residual[np.flatnonzero(self.measurement.is_measured)]
 
     def jacobian(self, x: Any) -> jax.Array:
         """(R, P) derivatives of `residual` at x (P,), by forward mode."""
@@ -391,10 +388,11 @@ class FitProblem:
         of the shots comes last: one program compiles an impact once.
         """
         mixing = self.measurement.mixing
+        # n velocities before, of which errors are passed on
         count, passed = y.shape[0], 0 if mixing is None else mixing.shape[-1]
 
         def outcome(both: jax.Array) -> tuple[tuple[jax.Array, jax.Array], Any]:
-            """Residual and prediction of y and a change of v-, and all not differentiated."""
+            """Residual and prediction at (y, change of v-), to be differentiated, and as values."""
             moved = self
             if passed:
                 pre = self.observe.pre.at[:, :passed].add(both[count:])  # type: ignore[attr-defined]
@@ -414,7 +412,7 @@ class FitProblem:
         return jnp.sum(self._scaled_residual(y)[0] ** 2)
 
     def _scaled_residual(self, y: jax.Array) -> tuple[jax.Array, Prediction]:
-        """Residual (R + Q,) over `size`, of the priors last, and what the law predicts."""
+        """Residual (R + Q,) over `size` at y (Q,), of the priors last, and the prediction."""
         x = self.variables.parameters(y)
         prediction = self.observe(forward_only(self.law_in_scene(x)))
         of_priors = (x - self.prior_mean) * self.prior_weight
@@ -440,25 +438,25 @@ class FitProblem:
 
     @property
     def values(self) -> int:
-        """How many independent values were measured or are priors."""
-        here, data = self.measurement.here, self.experiments
-        lost = 0 if data is None else np.array(data.lost)[here.any(axis=1)].sum()
-        return int(here.sum() - lost) + len(self.priors)
+        """Number of independent values: measured ones, less those that corrections took; priors."""
+        measured, data = self.measurement.is_measured, self.experiments
+        lost = 0 if data is None else np.array(data.lost)[measured.any(axis=1)].sum()
+        return int(measured.sum() - lost) + len(self.priors)
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """Of the shots, or of the rows of what was measured."""
+        """Labels of the shots, or of the rows of what was measured."""
         if self.experiments is not None:
             return self.experiments.shots
         return tuple(str(k + 1) for k in range(len(np.atleast_1d(self.measured))))
 
     def of_data(self, rows: np.ndarray) -> np.ndarray:
-        """Those of rows (R, ...), as of a residual, that are of what was measured, in its shape."""
+        """The part of rows (R, ...) of a residual that belongs to `measured`, in its shape."""
         count = self.measured.size
         return rows[:count].reshape((*self.measured.shape, *rows.shape[1:]))
 
     def derivatives(self, minimum: Any) -> np.ndarray:
-        """Of what was measured in the parameters (K, n, P); NaN where it was not measured.
+        """Derivatives (K, n, P) of predictions in the parameters; NaN where nothing was measured.
 
         Args:
             minimum: with its `jacobian` and `value`.
@@ -470,8 +468,8 @@ class FitProblem:
         """The root mean square of errors of what was measured, of rad/s by kinetic energy [m/s]."""
         data = self.experiments
         natural_error = 1.0 if data is None else data.natural_errors(self.scene)
-        known = (errors / natural_error)[np.isfinite(errors)]
-        return float(np.sqrt(np.mean(known**2))) if known.size else np.nan
+        finite = (errors / natural_error)[np.isfinite(errors)]
+        return float(np.sqrt(np.mean(finite**2))) if finite.size else np.nan
 
     @property
     def precision(self) -> str:
@@ -487,18 +485,18 @@ class FitProblem:
 
 
 def outcome_at(problem: FitProblem, x: Any) -> Ends:
-    """Residual, derivatives and predictions at x (P,), by the program that searches."""
+    """Residual, Jacobian and predictions at x (P,): a solve of one step with all of y fixed."""
     point = problem.variables.point(np.asarray(x))[None]
     once, every = Solver(max_steps=1), np.ones(point.shape, bool)
     return minimize([problem.least_squares()], point, once, fixed=every)
 
 
 def of_shots(
-    law: Law, scene: Scene | None, experiments: Experiments, free: Any = DEFAULT_FREE, *known: Any
+    law: Law, scene: Scene | None, experiments: Experiments, free: Any = DEFAULT_FREE, *choice: Any
 ) -> FitProblem:
-    """`FitProblem.from_shots`, but errors of v- count as if v+ had them, until a law is found.
+    """`FitProblem.from_shots`, but the errors of v- are passed on with `dv+/dv- = I` at first.
 
-    `known`: bounds, priors and ties.
+    `choice`: bounds, priors and ties.
     """
     check_kind("law", law, Law)
     check_kind("experiments", experiments, Experiments)
@@ -506,15 +504,15 @@ def of_shots(
         check_kind("scene", scene, Scene)
     check_concrete("law", law)
     check_concrete("scene", scene)
-    law, of_tolerance = tolerated(law, scene, experiments)
+    law, note_on_rtol = tolerated(law, scene, experiments)
     observe, alike, measurement = _measured_shots(experiments, scene)
     law = with_parts_of_scene(law, scene, experiments.scenes is not None, free)
     masses = experiments.each(scene, dense_mass)
     energy = max(0.5 * v @ mass @ v for mass, v in zip(masses, np.asarray(experiments.pre))) or 1.0
-    problem = _build(law, observe, measurement, (free, *known), energy)
+    problem = _build(law, observe, measurement, (free, *choice), energy)
     problem = replace(
         problem,
-        notes=(*problem.notes, *of_tolerance),
+        notes=(*problem.notes, *note_on_rtol),
         experiments=experiments,
         scene=scene,
     )
@@ -530,22 +528,23 @@ def of_shots(
 def _measured_shots(
     data: Experiments, scene: Scene | None
 ) -> tuple[Shots, list[Scene], Measurement]:
-    """The observable of shots; their scenes, made alike, of a common one only this; v+."""
+    """The observable of shots, their scenes made alike in shape (one if it is common), and v+."""
     (count, n), pre, post = data.pre.shape, np.asarray(data.pre), np.asarray(data.post)
     sigma = None if data.sigma is None else np.asarray(data.sigma)
     errors = data.natural_errors(scene) if sigma is None else sigma
     unit = max(np.abs(pre).max(), np.nanmax(np.abs(post)))
     measurement = Measurement.of(post, sigma, np.where(np.isnan(post), 0.0, 1 / errors), unit)
-    own = data.each(scene, lambda s: s)
-    alike, extra = stackable(own if data.scenes is not None else own[:1])
-    each = np.arange(count) if len(alike) == count else np.zeros(count, int)
-    scenes = jax.tree.map(lambda *x: np.stack(x)[each], *alike)
+    of_shots = data.each(scene, lambda s: s)
+    # with `extra` coordinates at the end, which move so that their open contacts separate
+    alike, extra = stackable(of_shots if data.scenes is not None else of_shots[:1])
+    of_shot = np.arange(count) if len(alike) == count else np.zeros(count, int)
+    scenes = jax.tree.map(lambda *x: np.stack(x)[of_shot], *alike)
     filled = np.pad(pre, ((0, 0), (0, extra)), constant_values=measurement.unit)
     return Shots(scenes, filled, n), alike, measurement  # type: ignore[arg-type]
 
 
 def _in(dtype: Any, tree: Any) -> Any:
-    """The tree with all numbers of this type, in arrays on the host."""
+    """The tree with its floating-point arrays in this type, on the host."""
     return jax.tree.map(lambda x: np.asarray(x, dtype) if eqx.is_inexact_array(x) else x, tree)
 
 
@@ -556,7 +555,7 @@ def _build(
     choice: tuple[Any, ...],
     energy: float = 1.0,
 ) -> FitProblem:
-    """The problem of a measurement; `choice`: free, bounds, priors, ties."""
+    """The problem of a measurement; `choice`: free, bounds, priors, ties; `energy`: a scale [J]."""
     leaves = jax.tree.leaves((law, observe, measurement.value))
     dtype = np.result_type(*(x.dtype for x in leaves if eqx.is_inexact_array(x)))
     free, bounds, prior, tie = (*choice, *[None] * 4)[:4]

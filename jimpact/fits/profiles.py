@@ -17,7 +17,7 @@ _BEYOND = 1.3  # how far a contour's picture goes, in half-widths of the region 
 
 
 def _check_profiled(fit: Fit, level: float, points: int) -> None:
-    """Raise an error unless these are arguments of profiles or contours of a fit."""
+    """Raise an error unless the fit can be profiled, and level and points are in their ranges."""
     check_level(level)
     as_whole("points", points, 3)
     check_kind("fit", fit, Fit)
@@ -146,18 +146,16 @@ def contour(
         deviances, width = Deviances(fit, limit, show), _BEYOND * np.sqrt(limit)
         values = []
         for i in pair:
-            pieces, scale = (
-                fit.linearized_interval(i, width),
-                np.asarray(fit.problem.variables.scale)[i],
-            )
+            pieces = fit.linearized_interval(i, width)
+            scale = np.asarray(fit.problem.variables.scale)[i]
             outer = np.array([pieces[0][0], pieces[-1][1]])
             outer = scaled(outer, scale, fit.problem.parameters.log[i])
             low, high = np.clip(outer, *deviances.reach(i)).tolist()
             values.append(np.linspace(low, high, points))
         (cells,) = deviances.fill([Grid(pair, (values[0], values[1]))])
     squares = np.full((points, points), np.inf)
-    for cell, known in cells.items():
-        squares[cell] = known.squares
+    for cell, minimum in cells.items():
+        squares[cell] = minimum.squares
     deviance = np.maximum((squares - deviances.lowest.squares) / deviances.variance, 0.0)
     if deviance.min() > limit:
         raise ValueError(

@@ -48,7 +48,7 @@ def joined_words(parts: Sequence[str]) -> str:
 
 
 def _values_in_words(fit: "Fit") -> str:
-    """Values with their errors, what they assume, and what the data do not determine."""
+    """Part of a sentence: values with errors, what they assume, what the data do not determine."""
     seen, data = fit.determined, _data_name(fit)
     determined = np.flatnonzero(seen)
     others = " and ".join(_full_name(fit, int(i)) for i in np.flatnonzero(~seen))
@@ -69,7 +69,7 @@ def _values_in_words(fit: "Fit") -> str:
 
 
 def _objection(fit: "Fit") -> str:
-    """Why the law is not one for these data; an empty text if nothing speaks against it."""
+    """An objection to the law, as a verb phrase: it does not fit, or fails in shots; else ''."""
     data = _data_name(fit)
     if fit.shows_lack_of_fit:
         return f"does not fit {data}"
@@ -85,7 +85,7 @@ def _objection(fit: "Fit") -> str:
 
 
 def _assumptions(fit: "Fit") -> list[str]:
-    """What is taken for granted of several contacts: common values, stiffnesses, exponents."""
+    """Assumptions on several contacts, as phrases: common values, stiffnesses, exponents."""
     if fit.experiments is None:
         return []
     law, fitted = fit.problem.law, set(fit.problem.parameters.fields)
@@ -99,14 +99,14 @@ def _assumptions(fit: "Fit") -> list[str]:
         if value is None or name in fitted:
             continue
         values = np.unique(np.asarray(value, float))
-        known = {1.5: " (Hertz)", 1.0: " (linear)"}.get(values[0], "") if name == "exponent" else ""
-        same = words.format(values[0]) + known
+        kinds = {1.5: " (Hertz)", 1.0: " (linear)"} if name == "exponent" else {}
+        same = words.format(values[0]) + kinds.get(values[0], "")
         assumed.append(same if len(values) == 1 else f"the {name} of each contact")
     return assumed
 
 
 def _data_name(fit: "Fit") -> str:
-    """What was fitted, as in "these 4 shots"."""
+    """A noun for the data: "these data", "this shot", or "these 4 shots"."""
     if fit.experiments is None:
         return "these data"
     return "this shot" if fit.shot_count == 1 else f"these {fit.shot_count} shots"
@@ -120,7 +120,7 @@ def _full_name(fit: "Fit", i: int) -> str:
 
 
 def _with_error(fit: "Fit", i: int) -> str:
-    """A parameter with its error, and the interval where that is one-sided or of several pieces."""
+    """Text of parameter i: value and error; its profile's interval if one-sided or in pieces."""
     value, error, name = fit.value[i], fit.standard_error[i], _full_name(fit, i)
     if np.isnan(error):
         return f"{name} = {value:.5g}, its error unknown"
@@ -134,7 +134,7 @@ def _with_error(fit: "Fit", i: int) -> str:
 
 
 def _headline(fit: "Fit") -> str:
-    """The law, how many values were measured, the method."""
+    """First line of the report: the law, the number of measured values, the method."""
     measured, law = np.isfinite(fit.problem.measured), type(fit.law).__name__
     values = int(measured.sum())
     if fit.experiments is None:
@@ -148,7 +148,7 @@ def _headline(fit: "Fit") -> str:
 
 
 def _prior(fit: "Fit", i: int) -> str:
-    """The prior of a parameter, and whether it alone determines the value; '' without one."""
+    """Text of the prior of parameter i, with 'alone' where the data add nothing; '' without one."""
     for prior in fit.problem.priors:
         if prior.parameter == i:
             alone = " alone" if fit.from_prior[i] else ""
@@ -169,22 +169,23 @@ def named_values(fit: "Fit", values: np.ndarray) -> str:
 
 
 def _parameters(fit: "Fit") -> list[str]:
-    """The table of parameters."""
+    """Lines of the table of parameters: value, standard error, interval, notes; then of ties."""
     width = max(9, *(len(name) for name in fit.names))
     heads = f"{'parameter':{width}s} {'value':>12s} {'std. error':>12s}   95 % interval"
     lines = [heads + " (profile)" * bool(fit.profiles)]
     seen = fit.determined
     for i, (name, pieces) in enumerate(zip(fit.names, fit.intervals())):
         error = fit.standard_error[i]
-        known = "unknown" if np.isnan(error) else f"{error:.3g}"
-        known = "undetermined" if np.isinf(error) else known
+        error_text = "unknown" if np.isnan(error) else f"{error:.3g}"
+        error_text = "undetermined" if np.isinf(error) else error_text
         interval = "-"
         if np.isfinite(error) or fit.profiles:
             interval = pieces_in_words(pieces, (fit.bounds[0][i], fit.bounds[1][i]))
         note = "at its bound" if fit.at_bound[i] else ""
         note = ", ".join(filter(None, [note if seen[i] else UNSEEN, _prior(fit, i)]))
         value = marked(fit.value[i], seen[i], ".6g")
-        lines.append(f"{name:{width}s} {value:>12s} {known:>12s}   {interval}   {note}".rstrip())
+        cells = f"{name:{width}s} {value:>12s} {error_text:>12s}   {interval}   {note}"
+        lines.append(cells.rstrip())
     lines += [f"{name} = {with_error(*pair)} is tied" for name, pair in fit.tied.items()]
     freedom = fit.degrees_of_freedom
     if fit.problem.sigma is None and 0 < freedom <= FEW_DEGREES:
@@ -201,9 +202,9 @@ def _parameters(fit: "Fit") -> list[str]:
 
 
 def _correlations(fit: "Fit") -> list[str]:
-    """Pairs of parameters that the data determine and that errors move together, the worst first.
+    """Lines for pairs of determined parameters with correlated errors, the largest sizes first.
 
-    A pair of size 1 would be one combination that the data do not see.
+    A correlation of size 1 would be a combination that the data do not determine.
     """
     pairs = itertools.combinations(np.flatnonzero(fit.determined).tolist(), 2)
     sizes = {pair: float(fit.correlation[pair]) for pair in pairs}
@@ -218,7 +219,7 @@ def _correlations(fit: "Fit") -> list[str]:
 
 
 def _quality(fit: "Fit") -> list[str]:
-    """Residuals, noise, how many parameters the data determine, the solver."""
+    """Lines on the quality of the fit: residuals, chi^2 or noise, rank, solver."""
     unit, one = (" m/s", "velocity") if fit.experiments is not None else ("", "value")
     exact = fit.starts[0].sum_of_squares <= fit.problem.exact_squares
     rms = "0 (the values are reproduced)" if exact else f"{fit.rms:.4g}{unit}"
@@ -240,7 +241,7 @@ def _quality(fit: "Fit") -> list[str]:
             f"noise          {fit.noise:.4g}{unit} a {one}, estimated with "
             f"{degrees(fit.degrees_of_freedom)}"
         )
-    total, bounded = len(fit.names), int(fit.determined.sum())
+    total, bounded = len(fit.names), int(fit.determined.sum())  # bounded by intervals
     fewer = f"; the errors leave {total - bounded} unbounded" if bounded < fit.rank == total else ""
     state = "converged" if fit.converged else "NOT converged"
     rank = f"{fit.rank} of {counted(total, 'parameter')}"
@@ -252,7 +253,7 @@ def _quality(fit: "Fit") -> list[str]:
 
 
 def _sigma_sources(fit: "Fit") -> list[str]:
-    """What went into the stated errors besides sigma."""
+    """Lines on further errors in the stated sigma: resolution, and velocities before."""
     data, lines = fit.experiments, []
     if data is not None and data.resolution is not None:
         steps = np.unique(np.asarray(data.resolution)[data.measured])
@@ -265,12 +266,12 @@ def _sigma_sources(fit: "Fit") -> list[str]:
 
 
 def _section(title: str, lines: tuple[str, ...]) -> list[str]:
-    """A list below its title; no lines if it is empty."""
+    """A titled list, a line for each entry; no lines if it is empty."""
     return [title, *(f"  - {line}" for line in lines)] if lines else []
 
 
 def _minima(fit: "Fit") -> list[str]:
-    """Where the starts ended."""
+    """Lines on the minima that starts ended in: sum of squares, number of starts, values."""
     total, lost, count = fit.start_count, fit.lost_starts, len(fit.starts)
     given_up = f"{lost} of {counted(total, 'start')} {'was' if lost == 1 else 'were'} given up."
     unfinished = [given_up] if lost else []
@@ -289,7 +290,7 @@ def _minima(fit: "Fit") -> list[str]:
 
 
 def _shots(fit: "Fit") -> list[str]:
-    """The table of the first shots."""
+    """Lines of the table of the first shots: velocities before, measured and fitted; status."""
     data = fit.experiments
     if data is None:
         return []
@@ -306,8 +307,8 @@ def _shots(fit: "Fit") -> list[str]:
         label = data.shots[k] if i == 0 else ""
         status = STATUS[int(fit.status[k])].name if fit.status[k] and i == 0 else ""
         value = "-" if np.isnan(measured[k, i]) else formatted(measured[k, i], ".6g")
-        own, law = (formatted(x[k, i], ">12.6g") for x in (before, fitted))
-        row = f"{label:>8s} {i + 1:>5d} {own} {value:>12s} {law}"
+        pre, law = (formatted(x[k, i], ">12.6g") for x in (before, fitted))
+        row = f"{label:>8s} {i + 1:>5d} {pre} {value:>12s} {law}"
         unit = f" {data.units[i]}" if mixed else ""
         lines.append(f"{row}{unit}   {status}".rstrip())
     if shots > shown:
@@ -319,7 +320,7 @@ def _shots(fit: "Fit") -> list[str]:
 
 
 def verdict(fit: "Fit") -> str:
-    """`Fit.verdict`."""
+    """The sentence of `Fit.verdict`: values, what speaks against the law, and reservations."""
     law = type(fit.law).__name__
     if not fit.converged:
         return f"No answer: the search for the parameters of {law} has not converged."
@@ -334,7 +335,7 @@ def verdict(fit: "Fit") -> str:
 
 
 def report(fit: "Fit") -> str:
-    """The report: the verdict, then a block each."""
+    """The report, blocks of lines: verdict, head, tables of parameters, quality, minima, shots."""
     blocks = [
         [fit.verdict],
         [_headline(fit)],
@@ -350,7 +351,7 @@ def report(fit: "Fit") -> str:
 
 
 def as_record(fit: "Fit") -> dict[str, Any]:
-    """`Fit.to_dict`."""
+    """A fit as a dictionary of JSON data, for `Fit.to_dict`."""
     as_they_are = (
         *("method", "rms", "noise", "degrees_of_freedom", "rank", "identifiability"),
         *("findings", "warnings", "verdict", "reservations", "seed", "converged", "covariance"),
@@ -383,13 +384,17 @@ def as_record(fit: "Fit") -> dict[str, Any]:
 
 
 def save_fit(fit: "Fit", path: str | Path) -> Path:
-    """`Fit.save`."""
+    """Write a fit to a JSON file, for `Fit.save`: its format, versions, and encoded fields.
+
+    Raises:
+        ValueError: a fit to something else than shots, or with ties.
+    """
     if fit.experiments is None:
         raise ValueError("Argument `fit` must be to shots to be saved: functions cannot be.")
     if fit.problem.ties:
         raise ValueError("Argument `fit` must have no ties to be saved: functions cannot be.")
-    known = dataclasses.replace(fit, known_findings=fit.findings, known_profiles=fit.profiles)
-    record = {"format": FORMAT, "versions": versions(), "result": encoded(known)["fields"]}
+    complete = dataclasses.replace(fit, known_findings=fit.findings, known_profiles=fit.profiles)
+    record = {"format": FORMAT, "versions": versions(), "result": encoded(complete)["fields"]}
     path = Path(path)
     path.write_text(json.dumps(record, allow_nan=False, indent=1) + "\n", encoding="utf-8")
     return path
@@ -440,7 +445,7 @@ def load_fit(path: str | Path) -> "Fit":
 
 
 def _of_this_build(result: dict[str, Any]) -> dict[str, Any]:
-    """The fields of a fit, encoded, from those that an older build saved.
+    """Encoded fields of a fit as this build names them, from those that an older build saved.
 
     Before 0.2 there were sentences in the place of findings; then fields of `search` and `errors`
     stood beside the others.

@@ -61,7 +61,7 @@ class Predicted(NamedTuple):
     units: tuple[str, ...]
 
     def __str__(self) -> str:
-        """A row for each velocity; a status where it is not ok."""
+        """Table of predictions, a row for each velocity of the first shots; status if not ok."""
         columns = (
             *(Column("shot"), Column("coordinate"), Column("velocity", ".5g")),
             *(Column("standard_error", ".2g", "std. error"), Column("low", ".5g")),
@@ -82,7 +82,7 @@ class Predicted(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
-    """What `fit` finds, in numbers: see `Fit`, which can be printed and saved.
+    """The result of `fit` in numbers; see `Fit`, which can be printed and saved.
 
     Findings and profiles are computed when they are asked for.
     """
@@ -96,14 +96,14 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
 
     @cached_property
     def findings(self) -> tuple[Finding, ...]:
-        """What is wrong with data or fit, by kind, shots and numbers."""
+        """Results of the tests of data and fit, by kind, shots and numbers."""
         if self.known_findings is not None:
             return self.known_findings
         return (*self._findings_of_search, *lower_minimum(self.names, self.profiles))
 
     @cached_property
     def _findings_of_search(self) -> tuple[Finding, ...]:
-        """The findings without what profiles find."""
+        """The findings without those of profiles, which need these first."""
         if self.known_findings is not None:
             return self.known_findings
         assert self.judged is not None
@@ -111,7 +111,7 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
 
     @cached_property
     def profiles(self) -> tuple[Profile, ...]:
-        """Of all parameters, where intervals are theirs; else none."""
+        """Profiles of all parameters if `wants_profiles`, or if it is None and they are needed."""
         if self.known_profiles is not None:
             return self.known_profiles
         if not (self._needs_profiles if self.wants_profiles is None else self.wants_profiles):
@@ -121,7 +121,7 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
 
     @property
     def _needs_profiles(self) -> bool:
-        """True where standard errors may mislead, and profiles cost no more than the fit did.
+        """True where standard errors may mislead, and profiles cost no more than the fit.
 
         Not after lack of fit: no interval of such a law means anything, and its valleys are rough.
         """
@@ -133,7 +133,7 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What is wrong with data or fit, in words."""
+        """The sentences of the findings."""
         return tuple(each.line for each in self.findings if each.line)
 
     @property
@@ -142,12 +142,12 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
         return tuple(each.reservation for each in self.findings if each.reservation)
 
     def found(self, kind: str) -> bool:
-        """Whether there is a finding of this kind, one of `jimpact.fits.findings.KINDS`."""
+        """True if there is a finding of this kind, one of `jimpact.fits.findings.KINDS`."""
         return any(each.kind == kind for each in self.findings)
 
     @property
     def table(self) -> Table:
-        """A row a parameter: value, standard error, ends of its 95 % interval, whether seen."""
+        """A row for each parameter: value, standard error, ends of its 95 % interval, flags."""
         names = ("value", "standard_error", "low_95", "high_95", "at_bound", "determined")
         ends = self.confidence_interval().T
         columns = (self.value, self.standard_error, *ends, self.at_bound, self.determined)
@@ -161,7 +161,7 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
 
     @property
     def determined(self) -> np.ndarray:
-        """(P,) which parameters the data say anything about; the values of others are starts."""
+        """True (P,) for parameters that the data bound at all; the values of others are starts."""
         seen = ~np.isinf(self.standard_error)
         for i, each in enumerate(self.profiles):
             seen[i] &= each.determines
@@ -169,7 +169,7 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
 
     @property
     def from_prior(self) -> np.ndarray:
-        """(P,) which parameters are known from their priors alone: the data add hardly anything."""
+        """True (P,) for parameters known by their priors alone: data hardly reduce their errors."""
         std = np.full(len(self.names), np.inf)
         for prior in self.problem.priors:
             std[prior.parameter] = prior.std
@@ -177,13 +177,13 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
 
     @property
     def tied(self) -> dict[str, tuple[float, float]]:
-        """What is tied to parameters, by name: values with their standard errors."""
+        """Values of tied entries with their standard errors, by name."""
         problem, ties = self.problem, self.problem.ties
         if not ties:
             return {}
 
         def values(x: jax.Array) -> jax.Array:
-            """The tied entries of parameters x."""
+            """The tied entries at parameters x (P,)."""
             law = problem.law_in_scene(x)
             return jnp.concatenate([tied_value(law, tie) for tie in ties])
 
@@ -192,17 +192,17 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
         return dict(zip(names, zip(np.asarray(values(x), float).tolist(), errors.tolist())))
 
     def errors_of(self, slope: np.ndarray) -> np.ndarray:
-        """Standard errors of what depends on the parameters.
+        """Standard errors (...) of functions of the parameters, by linear propagation.
 
-        Equation: `sqrt(J C J^T)`; inf where it depends on what the data do not determine.
+        Equation: `sqrt(J C J^T)`; inf where a function depends on what the data do not determine.
 
         Args:
-            slope: its derivatives (..., P) in the parameters.
+            slope: J, derivatives (..., P) of the functions in the parameters.
         """
         seen = self.determined
-        known = slope[..., seen]
+        determined_slope = slope[..., seen]
         covariance = self.covariance[np.ix_(seen, seen)]
-        variance = np.einsum("...p,pq,...q->...", known, covariance, known)
+        variance = np.einsum("...p,pq,...q->...", determined_slope, covariance, determined_slope)
         blind = (np.abs(slope[..., ~seen]) > 0).any(axis=-1)
         return np.where(blind, np.inf, np.sqrt(variance))
 
@@ -246,19 +246,26 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
                 "Argument `scene` must be left out where parts of the scene were fitted: they hold "
                 "for that of the fit only."
             )
-        own = self.problem.scene if scene is None else scene
-        largest = own if scenes is None else max(scenes, key=lambda each: each.contacts)
+        common = self.problem.scene if scene is None else scene
+        largest = common if scenes is None else max(scenes, key=lambda each: each.contacts)
         self._check_scene(largest, len(units))
-        problem = self.problem.of_other(data, own)
-        there = solution_of(problem, outcome_at(problem, self.value))
-        error = self.errors_of(problem.derivatives(there.starts[0]))
-        value, noise = there.predicted, np.broadcast_to(self._noise_of(sigma), data.pre.shape)
+        problem = self.problem.of_other(data, common)
+        outcome = solution_of(problem, outcome_at(problem, self.value))
+        error = self.errors_of(problem.derivatives(outcome.starts[0]))
+        value, noise = outcome.predicted, np.broadcast_to(self._noise_of(sigma), data.pre.shape)
         half = quantile * np.hypot(error, noise)
-        band, status = (value - half, value + half), np.asarray(there.status)
-        return Predicted(value, error, status, noise, *band, tuple(units))
+        return Predicted(
+            velocity=value,
+            standard_error=error,
+            status=np.asarray(outcome.status),
+            noise=noise,
+            low=value - half,
+            high=value + half,
+            units=tuple(units),
+        )
 
     def _check_scene(self, scene: Any, size: int) -> None:
-        """Raise unless this is a scene for the law that was fitted and velocities of this size."""
+        """Raise unless `scene` has `size` velocities and the contacts of the law's parameters."""
         check_kind("scene", scene, Scene)
         values = [x.value for x in parameters_of(self.law).values() if x.domain.per_contact]
         counts = {np.shape(value)[0] for value in values if np.ndim(value) == 1}
@@ -270,7 +277,10 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
             )
 
     def _noise_of(self, sigma: Any) -> np.ndarray:
-        """Standard errors of measured velocities: of these, or as in the fit (rms)."""
+        """Standard errors of measured velocities: sigma, stretched as in the fit; None: of the fit.
+
+        The latter are the root mean squares (n,) over its shots.
+        """
         if sigma is not None:
             stretched = 1.0 if self.problem.sigma is None else self.noise
             return stretched * np.asarray(sigma, float)
@@ -306,5 +316,5 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
 
     @property
     def shows_lack_of_fit(self) -> bool:
-        """Whether a test rejects the law."""
+        """True if a test rejects the law."""
         return self.found("lack_of_fit")

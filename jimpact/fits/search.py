@@ -7,6 +7,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
+from jaxtyping import Bool, Float, Int
 from scipy.special import chdtrc
 
 from jimpact.fits.observables import Shots
@@ -66,14 +67,21 @@ LEAST_SLOPE = 1e-7  # mean psi' of residuals that all are outliers, in the place
 MEDIAN = 1.4826  # sigma of a normal distribution over the median of its absolute values
 
 
-def _huber(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """psi(u) / u and psi'(u)."""
+def _huber(
+    u: Float[np.ndarray, "*value"],
+) -> tuple[Float[np.ndarray, "*value"], Float[np.ndarray, "*value"]]:
+    """`psi(u) / u` and `psi'(u)` of Huber's loss at residuals u: `psi = max(-h, min(u, h))`."""
     inside = np.abs(u) <= HUBER
     return np.where(inside, 1.0, HUBER / np.where(inside, 1.0, np.abs(u))), inside.astype(float)
 
 
-def _student(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """psi(u) / u and psi'(u)."""
+def _student(
+    u: Float[np.ndarray, "*value"],
+) -> tuple[Float[np.ndarray, "*value"], Float[np.ndarray, "*value"]]:
+    """`psi(u) / u` and `psi'(u)` of Student's t with f degrees of freedom at residuals u.
+
+    Equation: `psi = -d log(density) / du = (f + 1) u / (f + u^2)`.
+    """
     below = STUDENT + u**2
     return (STUDENT + 1) / below, (STUDENT + 1) * (STUDENT - u**2) / below**2
 
@@ -83,7 +91,7 @@ LOSSES = {"huber": _huber, "student": _student}
 
 @dataclass(frozen=True)
 class Search:
-    """How `fit` searches for the parameters, if not as it does by default.
+    """Options of `fit` for the search of the parameters: method, loss, limits, progress.
 
     Args:
         method: 'levenberg-marquardt'; or gradient descent: 'adam', 'sgd', 'lbfgs' or an optax
@@ -119,7 +127,7 @@ class Search:
         return f" Give ji.Search({value!r})." if isinstance(value, str) else ""
 
     def __post_init__(self) -> None:
-        """Refuse a word that is not known, and numbers out of range."""
+        """Raise a ValueError for an unknown method or loss, and for numbers out of range."""
         as_whole("max_steps", step_limit(self.method, self.max_steps), 1)
         as_whole("seed", self.seed, 0)
         check_values("limit", self.limit, low=0.0)
@@ -131,50 +139,57 @@ DEFAULT_SEARCH = Search()
 
 @dataclass(frozen=True, eq=False)
 class FitMinimum:
-    """A minimum that starts ended in: sum of squared (weighted) residuals, values, how many.
+    """A minimum: sum of squared (weighted) residuals, parameters, number of starts that end in it.
 
-    `standard_error` is None where it fits so much worse that it does not matter. A search knows the
-    `residual` (R,) of what was measured, then that of the priors, and its `jacobian` (R, P) in the
-    scaled parameters.
+    `standard_error` is None where it fits so much worse that it does not matter. `residual` is that
+    of what was measured, then that of the priors; `jacobian` its derivatives in the scaled
+    parameters; None in the results of `fit`.
     """
 
     sum_of_squares: float
-    value: np.ndarray
+    value: Float[np.ndarray, " P"]
     count: int
-    standard_error: np.ndarray | None = None
-    jacobian: np.ndarray = None  # type: ignore[assignment]  # of a result: what a search knows
-    residual: np.ndarray = None  # type: ignore[assignment]
+    standard_error: Float[np.ndarray, " P"] | None = None
+    jacobian: Float[np.ndarray, "R P"] = None  # type: ignore[assignment]
+    residual: Float[np.ndarray, " R"] = None  # type: ignore[assignment]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Solution:
-    """All distinct minima, and what the law of the best predicts; see `Fit`."""
+    """All distinct minima, and what the law predicts at the best; `Fit` says what each field is."""
 
     starts: tuple[FitMinimum, ...]
-    predicted: np.ndarray
-    status: np.ndarray
-    slopes: np.ndarray | None = None
+    predicted: Float[np.ndarray, "*value"]
+    status: Int[np.ndarray, " K"]
+    slopes: Float[np.ndarray, "M n n"] | None = None  # of the K shots, then of copies (`filled`)
     converged: bool
     stuck: bool = False
-    at_bound: np.ndarray
+    at_bound: Bool[np.ndarray, " P"]
     steps: int
     lost_starts: int
 
     @property
-    def value(self) -> np.ndarray:
-        """The parameters (P,) of the best."""
+    def value(self) -> Float[np.ndarray, " P"]:
+        """The parameters of the best minimum."""
         return self.starts[0].value
 
 
 def solution_of(
-    problem: FitProblem, ends: Ends, counts: np.ndarray | None = None, lost: int = 0
+    problem: FitProblem, ends: Ends, counts: Int[np.ndarray, " S"] | None = None, lost: int = 0
 ) -> Solution:
-    """The distinct minima among ends; counts: of the starts that an end is for."""
+    """The distinct minima among the ends of S solves, the best one first.
+
+    Args:
+        problem: that was solved.
+        ends: of the solves.
+        counts: number of starts that each end stands for; None: one each.
+        lost: starts that were given up before.
+    """
     counts = np.ones(len(ends.y), int) if counts is None else counts
     count, measured = len(problem.names), problem.measured
-    # without what filled up, and parameters that have no prior
+    # a residual has R rows: measured values, copies that fill up the shots, Q priors; those in use
     first_prior = ends.residual.shape[1] - len(problem.variables.low)
-    own = [*range(measured.size), *(first_prior + prior.parameter for prior in problem.priors)]
+    used = [*range(measured.size), *(first_prior + prior.parameter for prior in problem.priors)]
     groups, minima = _groups(problem, ends), []
     best = groups[0][0]
     end = ends.rows(best)
@@ -183,14 +198,14 @@ def solution_of(
         kept = [i for i in group if ends.converged[i] or i == best]
         for i in kept[:1]:
             squares, value = float(ends.squares[i]), problem.values_at(ends.y[i])
-            slope, residual = ends.jacobian[i][own, :count], ends.residual[i][own]
+            jacobian, residual = ends.jacobian[i][used, :count], ends.residual[i][used]
             starts = int(counts[kept].sum())
-            minima.append(FitMinimum(squares, value, starts, None, slope, residual))
-    rows = slice(len(measured)) if measured.ndim else ...
+            minima.append(FitMinimum(squares, value, starts, None, jacobian, residual))
+    shots = slice(len(measured)) if measured.ndim else ...  # without copies
     return Solution(
         starts=tuple(minima),
-        predicted=end.predicted[rows],
-        status=end.status[rows],
+        predicted=end.predicted[shots],
+        status=end.status[shots],
         slopes=end.slopes,
         converged=bool(end.converged),
         stuck=bool(end.stuck),
@@ -201,13 +216,19 @@ def solution_of(
 
 
 def find_minima(problem: FitProblem, starts: int | None, seed: int, solver: Solver) -> Solution:
-    """All starts to where their minima can be told apart, and the best of these to its end.
+    """The distinct minima of a problem by multistart; the best one is solved to full accuracy.
 
-    Two thirds of the starts are those of `start_points`. The law is only piecewise smooth, so that
-    the sum of squares has side minima close to a minimum: the others begin around the best. Where
-    their number is left open, they are the lowest of many such points, further ones around the
-    best follow as long as they lower the sum of squares, and all is done again with other and
-    twice as many points if sigma contradicts what was found, as long as that helps.
+    Two thirds of the start points are random in the box. The law is only piecewise smooth, so that
+    the sum of squares has side minima close to a minimum: the others lie around the best end. With
+    `starts` None, start points are the lowest of many points, further ones around the best follow
+    as long as they lower the sum of squares, and the search is repeated with twice as many other
+    points where chi^2 rejects the best minimum, as long as that helps.
+
+    Args:
+        problem: least squares.
+        starts: number of start points, or None; one: the law's own values.
+        seed: of the random points.
+        solver: options.
     """
     rng = np.random.default_rng(seed)
     if starts == 1:
@@ -216,18 +237,19 @@ def find_minima(problem: FitProblem, starts: int | None, seed: int, solver: Solv
             problem, minimize([problem.least_squares()], points, solver, what="starts")
         )
 
-    def again(ends: Ends, turn: int) -> Ends | None:
-        """From twice as many points as before, where sigma contradicts what was found."""
+    def repeated(ends: Ends, turn: int) -> Ends | None:
+        """Ends of twice as many other starts; None unless chi^2 rejects the best end so far."""
         least, freedom = np.nanmin(ends.squares), problem.values - len(problem.names)
         if problem.sigma is None or freedom < 1 or chdtrc(freedom, least) > REJECTED:
             return None
         return _rough_ends(problem, None, rng, solver, STARTS * 2 ** (turn + 1))
 
     ends = _rough_ends(problem, starts, rng, solver)
-    ends = _extended(ends, 0 if starts else TURNS - 1, len(problem.names), again)
+    ends = _extended(ends, 0 if starts else TURNS - 1, len(problem.names), repeated)
     best = _groups(problem, ends)[0][:1]
     fine = minimize([problem.least_squares()], ends.y[best], solver, what="minima")
     fine = fine._replace(steps=fine.steps + ends.steps[best])
+    # in the place of the rough end
     for leaf, value in zip(jax.tree.leaves(ends), jax.tree.leaves(fine)):
         leaf[best] = value
     total = len(ends.y)
@@ -242,38 +264,48 @@ def _rough_ends(
     solver: Solver,
     most: int = STARTS,
 ) -> Ends:
-    """Where starts end, and others around the best, so far that minima can be told apart.
+    """Ends of random starts, then of starts around the best end, solved to the accuracy `COARSE`.
 
-    `most` is how many there are of each kind where their number is left open.
+    That is enough to tell minima apart.
+
+    Args:
+        problem: least squares.
+        starts: their number; None: `most`, chosen among many points by their sums of squares, and
+            up to `ROUNDS` rounds around the best.
+        rng: of the points.
+        solver: options; Levenberg-Marquardt takes at most `ROUGH_STEPS`.
+        most: number of starts in each round where `starts` is None.
     """
     count, noise = starts or most, 0.0 if problem.sigma is None else 1.0
-    far, log = count - count // 3, problem.parameters.log
+    random, log = count - count // 3, problem.parameters.log  # two thirds of the starts
     scanned = starts is None and bool(len(log) > 1 or log.any())
     if solver.method == "levenberg-marquardt":
         solver = solver._replace(max_steps=min(ROUGH_STEPS, solver.max_steps))
 
-    def rough(points: np.ndarray) -> Ends:
-        """To where minima can be told apart."""
+    def rough(points: Float[np.ndarray, "S Q"]) -> Ends:
+        """Ends of solves from these points, to the accuracy `COARSE`."""
         return minimize([problem.least_squares()], points, solver, COARSE, noise, "starts")
 
     def around(ends: Ends, _: int) -> Ends | None:
-        """From points around the best; None: the data see none of the parameters."""
-        points = _near(problem, ends, SCANNED if scanned else count - far, noise, rng)
+        """Ends of starts around the best end; None if no such point is lower than those near it."""
+        points = _near(problem, ends, SCANNED if scanned else count - random, noise, rng)
         if scanned:
-            points = _lowest(problem, points, count - far)
+            points = _lowest(problem, points, count - random)
         return rough(points) if len(points) else None
 
-    ends = rough((_first_points if scanned else start_points)(problem, far, rng))
+    ends = rough((_first_points if scanned else start_points)(problem, random, rng))
     rounds = 1 if starts else ROUNDS
-    return _extended(ends, rounds if count > far else 0, len(log), around)
+    return _extended(ends, rounds if count > random else 0, len(log), around)
 
 
 def _extended(
     ends: Ends, rounds: int, parameters: int, search: Callable[[Ends, int], Ends | None]
 ) -> Ends:
-    """Ends with those of further rounds, as long as these lower the least sum of squares.
+    """The ends, and those of up to `rounds` further searches, `search(ends, number of the round)`.
 
-    By more than the noise of a value.
+    It stops where a search gives None, and after k rounds in a row that do not lower the least sum
+    of squares by the variance of a residual, 1 / R of it; k = parameters / `IDLE_PARAMETERS`,
+    rounded up.
     """
     idle = 0  # rounds without a gain, one after the other
     for k in range(rounds):
@@ -288,23 +320,34 @@ def _extended(
     return ends
 
 
-def _box(problem: FitProblem) -> np.ndarray:
-    """Ends (2, P) of y between which starts lie."""
+def _box(problem: FitProblem) -> Float[np.ndarray, "2 P"]:
+    """Lowest and highest values of the variables y of random starts.
+
+    The bounds; where there is none, and for ratios (fitted in their logarithm), `START_SCALES` or
+    `log(START_FACTOR)` to each side of the law's own value at most. A restitution starts above
+    `START_RESTITUTION`.
+    """
     log, count = problem.parameters.log, len(problem.names)
-    own = problem.variables.point(problem.start)[:count]
+    start = problem.variables.point(problem.start)[:count]
     low, high = (
         np.array(end, float)[:count] for end in (problem.variables.low, problem.variables.high)
     )
     reach = np.where(log, np.log(START_FACTOR), START_SCALES)
-    low = np.where(log | np.isinf(low), np.maximum(low, own - reach), low)
-    high = np.where(log | np.isinf(high), np.minimum(high, own + reach), high)
+    low = np.where(log | np.isinf(low), np.maximum(low, start - reach), low)
+    high = np.where(log | np.isinf(high), np.minimum(high, start + reach), high)
     elastic = np.array(problem.parameters.of_fields) == "restitution"
     low = np.where(elastic & (high > START_RESTITUTION), np.maximum(low, START_RESTITUTION), low)
     return np.stack([low, high])
 
 
-def start_points(problem: FitProblem, starts: int, rng: np.random.Generator) -> np.ndarray:
-    """Starts y (S, Q): the law's own values, then a Latin hypercube inside the bounds."""
+def start_points(
+    problem: FitProblem, starts: int, rng: np.random.Generator
+) -> Float[np.ndarray, "S Q"]:
+    """Start points y: the law's own values, then S - 1 points of a Latin hypercube in `_box`.
+
+    Equation: `y_ki = low_i + (high_i - low_i) (slice_ki + u_ki) / S`, each slice 0 .. S - 1 once
+    for each variable, u uniform in [0, 1).
+    """
     low, high = _box(problem)
     slices = rng.permuted(np.tile(np.arange(starts), (len(low), 1)), axis=1).T
     points = np.tile(problem.variables.point(problem.start), (starts, 1))
@@ -312,10 +355,16 @@ def start_points(problem: FitProblem, starts: int, rng: np.random.Generator) -> 
     return points
 
 
-def _first_points(problem: FitProblem, count: int, rng: np.random.Generator) -> np.ndarray:
-    """The law's own y, the lowest of many points, and those of each ratio where few are free."""
+def _first_points(
+    problem: FitProblem, count: int, rng: np.random.Generator
+) -> Float[np.ndarray, "S Q"]:
+    """Start points y: the law's own, and the lowest `count - 1` points of a Latin hypercube.
+
+    With up to `SCANS` free ratios (fitted in their logarithm) also the lowest `count / 2` points
+    of a line on which one ratio changes by up to `SCAN_FACTOR`.
+    """
     ratios = np.flatnonzero(problem.parameters.log)
-    corners = 2 ** len(problem.parameters.log)
+    corners = 2 ** len(problem.parameters.log)  # of the box of parameters
     points = start_points(problem, min(max(SCANNED, SCANNED_A_CORNER * corners), MOST_SCANNED), rng)
     chosen = [points[:1], _lowest(problem, points[1:], count - 1)]
     for i in ratios if len(ratios) <= SCANS else ():
@@ -329,22 +378,26 @@ def _first_points(problem: FitProblem, count: int, rng: np.random.Generator) -> 
     return np.concatenate(chosen)
 
 
-def _lowest(problem: FitProblem, points: np.ndarray, count: int) -> np.ndarray:
-    """Of points (S, Q) the lowest that are lower than their nearest neighbours, at most so many."""
+def _lowest(
+    problem: FitProblem, points: Float[np.ndarray, "S Q"], count: int
+) -> Float[np.ndarray, "L Q"]:
+    """The points with lower sums of squares than their P + 1 nearest neighbours, lowest first.
+
+    At most `count` of them. The impacts are computed with a coarse tolerance and few steps.
+    """
     law, parameters = problem.law, len(problem.names)
     if getattr(law, "rtol", SCAN_RTOL) is None:
         law = replace(law, rtol=SCAN_RTOL)  # type: ignore[call-arg]
     if isinstance(problem.observe, Shots) and hasattr(law, "max_steps"):
         steps = min(SCAN_STEPS * problem.observe.bodies, law.max_steps)
         law = replace(law, max_steps=steps)  # type: ignore[call-arg]
-    squares, many = (
-        np.empty(len(points)),
-        stacked([replace(problem, law=law).for_compiled()], len(points)),
-    )
-    for rows, some in in_parts(_squares, (many, points), SCAN_LANES, np.arange(len(points))):
-        squares[rows] = np.nan_to_num(some, nan=np.inf)
-    width = np.ptp(points[:, :parameters], axis=0)
+    many = stacked([replace(problem, law=law).for_compiled()], len(points))
+    squares = np.empty(len(points))
+    for rows, part in in_parts(_squares, (many, points), SCAN_LANES, np.arange(len(points))):
+        squares[rows] = np.nan_to_num(part, nan=np.inf)
+    width = np.ptp(points[:, :parameters], axis=0)  # distances are in units of it
     apart = (points[:, None] - points)[..., :parameters] / np.where(width > 0, width, 1.0)
+    # indices (S, P + 1) of the neighbours of each point, without itself
     nearest = np.argsort(np.sum(apart**2, axis=-1), axis=1)[:, 1 : parameters + 2]
     lowest = np.flatnonzero(squares < squares[nearest].min(axis=1))
     return points[lowest[np.argsort(squares[lowest])][:count]]
@@ -352,16 +405,18 @@ def _lowest(problem: FitProblem, points: np.ndarray, count: int) -> np.ndarray:
 
 @quick_jit
 def _squares(problems: Any, points: jax.Array) -> jax.Array:
-    """Compiled `|r|^2` (S,) over `size` of problems at y (S, Q)."""
+    """`|r|^2` (S,) of S problems at y (S, Q), r scaled by `size` as in `LeastSquares`."""
     return eqx.filter_vmap(lambda problem, y: problem.squares(y))(problems, points)
 
 
 def _near(
     problem: FitProblem, ends: Ends, count: int, noise: float, rng: np.random.Generator
-) -> np.ndarray:
-    """Points (count, Q) in bounds, as far off as standard errors and more, around the best.
+) -> Float[np.ndarray, "S Q"]:
+    """Random points y around the best end, and by turns around others that fit as well.
 
-    Minima that fit as well take turns: another one may lie next to each.
+    Equation: `y = y_best + min(a error, START_SCALES) z`, cut at the bounds, with z standard
+    normal, a between `NEAR_SPREAD` and `FAR_SPREAD` (log-uniform), and the standard errors
+    `error^2 = s^2 diag((J^T J)^+)`, where s^2 is the mean squared residual, `noise^2` at least.
     """
     measured = int(np.sum(problem.measurement.weight > 0))
     variance = max(np.nanmin(ends.squares) / measured, noise**2)
@@ -373,7 +428,7 @@ def _near(
     curvature = np.swapaxes(jacobian, 1, 2) @ jacobian
     inverse = np.linalg.pinv(curvature, rcond=least, hermitian=True)
     error = np.sqrt(variance * np.diagonal(inverse, axis1=1, axis2=2))
-    centre = np.arange(count) % len(best)
+    centre = np.arange(count) % len(best)  # by turns: the index in `best` of each point's centre
     spread = np.exp(rng.uniform(np.log(NEAR_SPREAD), np.log(FAR_SPREAD), (count, 1)))
     z = rng.normal(size=(count, len(error[0])))
     move = np.minimum(spread * error[centre], START_SCALES) * z
@@ -381,10 +436,11 @@ def _near(
 
 
 def _groups(problem: FitProblem, ends: Ends) -> list[list[int]]:
-    """Ends in the same minimum, best minimum first.
+    """Indices of ends, grouped by the minimum they are in, the best minimum first.
 
-    Of equally good ends a converged one comes first, then the earliest start: the first start is
-    the user's own.
+    Two ends are one minimum if both sums of squares and parameters are equal, up to `SAME_COST` and
+    `_same_values`. In a group a converged end comes first among equally good ones, then the
+    earliest start: the first start is the law's own.
     """
     squares, y, least = ends.squares, ends.y[:, : len(problem.names)], np.nanmin(ends.squares)
     unit, exact = SAME_COST / ends.jacobian.shape[1], problem.exact_squares
@@ -403,8 +459,14 @@ def _groups(problem: FitProblem, ends: Ends) -> list[list[int]]:
     return groups
 
 
-def _same_values(problem: FitProblem, ends: Ends, first: int, apart: np.ndarray) -> bool:
-    """Whether values (P,) so far apart from those of an end are the same."""
+def _same_values(
+    problem: FitProblem, ends: Ends, first: int, apart: Float[np.ndarray, " P"]
+) -> bool:
+    """True if scaled parameters that differ by `apart` from the end `first` are the same minimum.
+
+    Along each right singular direction v of its Jacobian, of singular value s_v, they may differ by
+    `max(SAME_ERRORS noise / s_v, SAME_VALUE)`: by a share of a standard error.
+    """
     if np.abs(apart).max() < SAME_VALUE:
         return True
     jacobian = ends.jacobian[first][:, : len(apart)]
@@ -419,12 +481,15 @@ def _same_values(problem: FitProblem, ends: Ends, first: int, apart: np.ndarray)
 
 
 def settled(
-    problems: list[FitProblem], points: np.ndarray, solver: Solver, stop: float = 0.0
+    problems: list[FitProblem],
+    points: Float[np.ndarray, "S Q"],
+    solver: Solver,
+    stop: float = 0.0,
 ) -> tuple[list[FitProblem], Ends]:
-    """Minima next to points (S, Q), equally many of each problem.
+    """Minima from points, as by `minimize`, and the problems with the errors that hold there.
 
-    Errors of v- are passed on by the law of each problem's best minimum, until both agree. `stop`:
-    as of `minimize`.
+    Errors of v- are passed on to v+ by the derivatives `dv+/dv-` of each problem's best minimum,
+    which in turn moves with these errors: both are computed by turns until the minimum stays.
     """
     each, start = len(points) // len(problems), points
     for _ in range(SETTLING):
@@ -448,27 +513,30 @@ def settled(
 def robust_minimum(
     problem: FitProblem, solution: Solution, loss: str, solver: Solver
 ) -> tuple[FitProblem, Solution, float]:
-    """Least squares again and again, with weights `psi(u) / u` of the last residuals u.
+    """M-estimate of a loss, by iteratively reweighted least squares: problem, solution, and noise.
 
-    Equation: the covariance is `s^2 mean(psi^2) / mean(psi')^2 (J^T J)^-1` (Huber, 1981).
+    Equation: weights `psi(u) / u` of the last residuals `u = r / s`, s = 1 or, of unknown sigma,
+    `MEDIAN median|r|`. The covariance is `s^2 mean(psi^2) / mean(psi')^2 (J^T J)^-1` (Huber, 1981);
+    the noise returned is `s |psi| / mean(psi')`, a noise times the root of the degrees of freedom.
     """
-    here = ~np.isnan(problem.measured)
+    measured = ~np.isnan(problem.measured)
     for _ in range(LOSS_ROUNDS):
         problem = problem.with_errors_before(solution.slopes)
         error = problem.measurement.independent(problem.measured - solution.predicted)
         scale = 1.0
         if problem.sigma is None:
-            scale = max(MEDIAN * float(np.median(np.abs(error[here]))), np.finfo(float).tiny)
-        share, slope = LOSSES[loss](error / scale)
-        factor, before = np.sqrt(share), problem.variables.point(solution.value)
+            median = float(np.median(np.abs(error[measured])))
+            scale = max(MEDIAN * median, np.finfo(float).tiny)
+        weight, slope = LOSSES[loss](error / scale)  # psi(u) / u, psi'(u)
+        factor, before = np.sqrt(weight), problem.variables.point(solution.value)
         weighed = problem.weighed(factor)
         solution = solution_of(weighed, minimize([weighed.least_squares()], before[None], solver))
         if np.abs(problem.variables.point(solution.value) - before).max() <= SETTLED:
             break
     else:
         solution = replace(solution, converged=False)
-    psi = (share * error / scale)[here]
-    noise = scale * np.sqrt(np.sum(psi**2)) / max(slope[here].mean(), LEAST_SLOPE)
+    psi = (weight * error / scale)[measured]
+    noise = scale * np.sqrt(np.sum(psi**2)) / max(slope[measured].mean(), LEAST_SLOPE)
     # weighted as in the problem, without the factors of the loss
     starts = solution_of(problem, outcome_at(problem, solution.value)).starts
     return problem, replace(solution, starts=starts), float(noise)

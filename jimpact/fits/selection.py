@@ -35,7 +35,7 @@ _TIERS = ("fits", "lack of fit", "worse", "fails")
 
 @dataclass(frozen=True, eq=False)
 class LawFit:
-    """A law at its best: its `fit`, how it predicts shots left out, and what is against it.
+    """The fit of a law, its error in shots left out, and the verdict of the tests.
 
     `left_out_error` is the root mean square error of shots predicted from the others [m/s], NaN of
     fewer than two shots; `aicc` is NaN where it is meaningless (see `fit_laws`); `verdict` is
@@ -51,16 +51,16 @@ class LawFit:
 
     @property
     def adequate(self) -> bool:
-        """Whether no objection was found."""
+        """True if no test speaks against the law."""
         return self.tier == "fits"
 
     @property
     def parameters(self) -> int:
-        """How many are fitted."""
+        """Number of fitted parameters."""
         return len(self.fit.names)
 
     def to_dict(self) -> dict[str, Any]:
-        """What a JSON file can hold."""
+        """The record of a law as JSON data."""
         names = ("parameters", "left_out_error", "aicc", "adequate", "verdict", "fit")
         return as_data({"rms": self.fit.rms} | {name: getattr(self, name) for name in names})
 
@@ -90,12 +90,12 @@ class LawFits(Tabular):
 
     @property
     def best(self) -> LawFit:
-        """The first one."""
+        """The first law: the simplest adequate one, if there is one."""
         return next(iter(self.entries.values()))
 
     @property
     def verdict(self) -> str:
-        """Which law, in one sentence."""
+        """A sentence on the simplest adequate law, or the nearest one, with its values."""
         best = self.best
         which = f"No law fits; the nearest is {best.name} ({best.verdict})"
         if best.adequate:
@@ -106,7 +106,7 @@ class LawFits(Tabular):
 
     @property
     def table(self) -> Table:
-        """A row a law."""
+        """A row for each law: parameters, rms, error of shots left out, AICc, verdict."""
         rows = [
             [name, x.parameters, x.fit.rms, x.left_out_error, x.aicc, x.verdict]
             for name, x in self.entries.items()
@@ -114,12 +114,13 @@ class LawFits(Tabular):
         return Table(_COLUMNS, rows)
 
     def to_dict(self) -> dict[str, Any]:
-        """What a JSON file can hold."""
+        """The comparison as JSON data."""
         record = {"best": self.best.name, "verdict": self.verdict, "left_out": self.left_out}
         speed = {"speed": self.speed, "speed_fit": self.speed_fit}
         return record | as_data({"laws": self.entries} | speed)
 
     def __str__(self) -> str:
+        """The table with the values of the parameters, and notes on other laws and the speed."""
         fits = [entry.fit for entry in self.entries.values()]
         rows = [(*row, named_values(x, x.value)) for row, x in zip(self.table.rows, fits)]
         notes = ["rms and error of shots left out in m/s; simplest adequate law first."]
@@ -129,17 +130,17 @@ class LawFits(Tabular):
         if self.speed is not None:
             notes.append(f"Restitution that depends on the speed ({self.best.name}): {self.speed}")
         if self.speed_fit is not None:
-            tier, against = _against(self.speed_fit)
+            tier, against = _verdict_alone(self.speed_fit)
             so = "the data then fit" if tier == "fits" else f"still {against}"
-            found = zip(self.speed_fit.names, self.speed_fit.value, self.speed_fit.standard_error)
-            values = ", ".join(f"{name} = {x:.4g} ± {error:.2g}" for name, x, error in found)
+            fitted = zip(self.speed_fit.names, self.speed_fit.value, self.speed_fit.standard_error)
+            values = ", ".join(f"{name} = {x:.4g} ± {error:.2g}" for name, x, error in fitted)
             notes.append(f"With it {values}: {so}.")
         columns = (*_COLUMNS, Column("values"))
         return str(Table(columns, rows, head=[self.verdict, ""], notes=notes))
 
 
 class NestedTest(NamedTuple):
-    """Whether further parameters are needed: F, or chi^2 where sigma is known and fits.
+    """A test of further parameters: by F, or by chi^2 where sigma is known and fits.
 
     `statistic` of `more` parameters, and of the `degrees_of_freedom` left (None: chi^2); the
     p-value `chance`; `names` of the further parameters.
@@ -153,10 +154,11 @@ class NestedTest(NamedTuple):
 
     @property
     def needed(self) -> bool:
-        """Whether data of the simpler law would show this less than once in a hundred times."""
+        """True if the p-value is below 1 %: the simpler law hardly yields such data."""
         return self.chance < WORSE
 
     def __str__(self) -> str:
+        """The test in a sentence: statistic, degrees of freedom, p-value."""
         needed, rest = "needed" if self.needed else "not needed", self.degrees_of_freedom
         kind, freedom = "chi^2", degrees(self.more)
         if rest is not None:
@@ -167,12 +169,12 @@ class NestedTest(NamedTuple):
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """What a JSON file can hold."""
+        """The test as JSON data."""
         return as_data(self._asdict() | {"needed": self.needed, "words": str(self)})
 
 
 def nested_test(simple: Fit, full: Fit) -> NestedTest:
-    """Whether the data need the parameters that one fit has beyond another one.
+    """Test by F or chi^2 if the data need the parameters that one fit has beyond another one.
 
     Equation: `F = (S - S_full) / q / (S_full / f)`, S sums of squares, q further parameters that
     the data determine, f degrees of freedom of the full fit; with sigma, unless the full fit
@@ -214,17 +216,20 @@ def nested_test(simple: Fit, full: Fit) -> NestedTest:
     gain = max(simple.starts[0].sum_of_squares - full.starts[0].sum_of_squares, 0.0)
     if full.problem.sigma is not None and full.noise <= 1:
         return NestedTest(gain, more, None, float(chdtrc(more, gain)), names)
-    return NestedTest(*_f_test(gain, more, full), names)
+    return _f_test(gain, more, full, names)
 
 
-def _f_test(gain: float, more: int, full: Fit) -> tuple[float, int, int, float]:
-    """F of a fit whose `more` parameters lower the sum of squares by `gain`, and its p-value."""
-    rest = full.degrees_of_freedom
-    if rest < 1:
-        return np.nan, more, rest, 1.0
-    left = max(full.starts[0].sum_of_squares, full.problem.exact_squares)
-    ratio = gain / more / (left / rest)
-    return ratio, more, rest, float(fdtrc(more, rest, ratio))
+def _f_test(gain: float, more: int, full: Fit, names: tuple[str, ...] = ()) -> NestedTest:
+    """F test of `more` parameters that lower the sum of squares by `gain` to that of `full`.
+
+    Equation: `F = (gain / more) / (S_full / f)`, f degrees of freedom left; p-value 1 without any.
+    """
+    freedom = full.degrees_of_freedom
+    if freedom < 1:
+        return NestedTest(np.nan, more, freedom, 1.0, names)
+    squares = max(full.starts[0].sum_of_squares, full.problem.exact_squares)
+    ratio = gain / more / (squares / freedom)
+    return NestedTest(ratio, more, freedom, float(fdtrc(more, freedom, ratio)), names)
 
 
 def fit_laws(
@@ -318,7 +323,14 @@ def _candidates(
     values: dict[str, Any],
     more: tuple[str, ...],
 ) -> tuple[dict[str, Candidate], dict[str, str]]:
-    """Laws to fit by name, and why others are not tried."""
+    """Laws to fit by name, each with what is free, and reasons why others are not tried, by name.
+
+    Args:
+        scenes: of the shots.
+        laws: the user's choice, see `fit_laws`.
+        values: start values of parameters, by name.
+        more: further parameters to fit.
+    """
     if isinstance(laws, Mapping):
         for name, law in laws.items():
             check_kind(f"laws[{name!r}]", law, Law)
@@ -359,28 +371,38 @@ def _candidates(
 
 
 def _opens_and_closes(scene: Scene) -> bool:
-    """Whether gaps matter: some contact has one, or a wall lets contacts open and close again."""
+    """True where gaps matter: a contact is open, or a wall lets contacts open and close again."""
     return not np.all(scene.closed) or (scene.walls is not None and any(scene.walls))
 
 
 def _default(law: Law, more: tuple[str, ...]) -> dict[str, Any]:
-    """What is free in a caller's law: as by default, and further parameters that it has."""
-    known = free_parameters_of(law)
-    return dict.fromkeys((*default_free(law), *(name for name in more if name in known)), True)
+    """The free parameters of a user's law: those by default, and those of `more` that it has."""
+    available = free_parameters_of(law)
+    return dict.fromkeys((*default_free(law), *(name for name in more if name in available)), True)
 
 
 def _variants(law: Law, contacts: int, alike: bool, more: tuple[str, ...]) -> dict[str, Candidate]:
-    """One e for all contacts or one each, stiffness ratios fixed or free; one program for all."""
-    known = free_parameters_of(law)
-    if "restitution" not in known or np.ndim(known["restitution"].value) > 1:
+    """Candidates of a law, by the ending of their names, which share one program.
+
+    One restitution for all contacts, or one for each; stiffness ratios fixed, or free.
+
+    Args:
+        law: at its start values.
+        contacts: the largest number in a scene.
+        alike: True if all scenes have as many.
+        more: further free parameters.
+    """
+    available = free_parameters_of(law)
+    if "restitution" not in available or np.ndim(available["restitution"].value) > 1:
         return {"": (law, _default(law, more))}
-    fields = [name for name in ("restitution", "stiffness") if name in known]
-    others = {name: True for name in more if name in known and name not in fields}
+    fields = [name for name in ("restitution", "stiffness") if name in available]
+    others = {name: True for name in more if name in available and name not in fields}
     if contacts == 1:  # the same program as a plain fit
         return {"": (law, dict.fromkeys(("restitution", *others), True))}
     for name in fields:
-        each = jnp.broadcast_to(known[name].value, (contacts,))
+        each = jnp.broadcast_to(available[name].value, (contacts,))
         law = with_parameter(law, name, each)
+    # labels of `free`: equal numbers share one value, 0 is fixed
     each_own = np.arange(1, contacts + 1)
     coefficients, ratios = {"": np.ones(contacts, int)}, {"": np.zeros(contacts, int)}
     if alike:
@@ -398,39 +420,44 @@ def _variants(law: Law, contacts: int, alike: bool, more: tuple[str, ...]) -> di
 
 
 def _judged(fits: dict[str, Fit]) -> dict[str, LawFit]:
-    """The laws with their verdicts, in order."""
+    """The laws by name in order, with verdicts: `_verdict_alone`, then against the best law.
+
+    The best has the least sum of squared errors in shots left out; of fewer than `_LEAST` shots,
+    the least variance of the residuals.
+    """
     errors = {name: _errors_left_out(each) for name, each in fits.items()}
-    against = {name: _against(each) for name, each in fits.items()}
+    against = {name: _verdict_alone(each) for name, each in fits.items()}
     squares = {name: _per_shot(each, errors[name]) for name, each in fits.items()}
     usable = [name for name in fits if against[name][0] != "fails"] or list(fits)
-    many = all(np.isfinite(squares[name]).sum() >= _LEAST for name in usable)
-    least = {name: np.nansum(squares[name]) if many else _variance(fits[name]) for name in usable}
-    best = min(usable, key=lambda name: (least[name], len(fits[name].names)))
+    by_shots = all(np.isfinite(squares[name]).sum() >= _LEAST for name in usable)
+    error = {n: np.nansum(squares[n]) if by_shots else _variance(fits[n]) for n in usable}
+    best = min(usable, key=lambda name: (error[name], len(fits[name].names)))
     entries = []
     for name, each in fits.items():
         tier, verdict = against[name]
-        if many:
-            chance, level, worse = _chance(squares[name], squares[best]), WORSE, "predicts worse"
+        if by_shots:
+            chance, level = _paired_p_value(squares[name], squares[best]), WORSE
         else:
-            chance, level, worse = _by_residuals(each, fits[best]), WORSE_OF_FEW, "fits worse"
+            chance, level = _f_test_of_residuals(each, fits[best]), WORSE_OF_FEW
         if tier != "fails" and chance < level:
-            worse = f"{worse} than {best} (p-value {chance:.1g})"
+            verb = "predicts" if by_shots else "fits"
+            worse = f"{verb} worse than {best} (p-value {chance:.1g})"
             tier, verdict = "worse", f"{verdict}, {worse}" if tier != "fits" else worse
-        error = each.problem.rms(errors[name])
-        entries.append(LawFit(name, each, error, _aicc(each), verdict, tier))
-    return {x.name: x for x in sorted(entries, key=_order)}
+        rms = each.problem.rms(errors[name])
+        entries.append(LawFit(name, each, rms, _aicc(each), verdict, tier))
+    return {x.name: x for x in sorted(entries, key=_sort_key)}
 
 
-def _order(entry: LawFit) -> tuple[Any, ...]:
-    """Adequate first, by parameters, then in the order of `advise`; the rest by error."""
+def _sort_key(entry: LawFit) -> tuple[Any, ...]:
+    """Sort key: tier, then number of parameters (of worse tiers: error), then order of `advise`."""
     tier, base, order = _TIERS.index(entry.tier), entry.name.split(",")[0], simplest_first()
     place = order.index(base) if base in order else len(order)
     error = entry.left_out_error if np.isfinite(entry.left_out_error) else entry.fit.rms
     return tier, entry.parameters if tier < 2 else error, place
 
 
-def _against(result: Fit) -> tuple[str, str]:
-    """What is against a law by itself: (tier, in words)."""
+def _verdict_alone(result: Fit) -> tuple[str, str]:
+    """The tier of a fit by itself, one of `_TIERS`, and the verdict in words."""
     failing = [STATUS[code].name for code in result.status if STATUS[code].failure]
     if failing:
         names = ", ".join(dict.fromkeys(failing))
@@ -445,7 +472,10 @@ def _against(result: Fit) -> tuple[str, str]:
 
 
 def _errors_left_out(result: Fit) -> np.ndarray:
-    """Of every shot what the others predict wrongly, (K, n); NaN where there is none."""
+    """Errors (K, n) of predictions of each shot from a fit to the others; NaN for a single shot.
+
+    By a fit without each; of more than `FEW` shots, linearized.
+    """
     if result.shot_count < 2:
         return np.full(result.residual.shape, np.nan)
     if len(result.residual) <= FEW:
@@ -454,37 +484,45 @@ def _errors_left_out(result: Fit) -> np.ndarray:
 
 
 def _linearized(result: Fit) -> np.ndarray:
-    """The same by one Gauss-Newton step: `(I - J_k (J^T J)^-1 J_k^T)^-1 r_k`."""
+    """Errors (K, n) of predictions of each shot from the others, by one Gauss-Newton step.
+
+    Equation: `(I - H_kk)^-1 r_k` with blocks `H_kk = J_k (J^T J)^-1 J_k^T` of the hat matrix, in
+    independent residuals.
+    """
     jacobian, residual = map(
         result.problem.measurement.independent, (result.jacobian, result.residual)
     )
     flat = jacobian.reshape(-1, jacobian.shape[-1])
     inverse = np.linalg.pinv(flat.T @ flat, rcond=1e-12, hermitian=True)
     hat = jacobian @ inverse @ np.swapaxes(jacobian, 1, 2)
-    rest = np.eye(hat.shape[-1]) - hat
-    error = np.stack([np.linalg.lstsq(a, b, rcond=1e-9)[0] for a, b in zip(rest, residual)])
+    complement = np.eye(hat.shape[-1]) - hat
+    error = np.stack([np.linalg.lstsq(a, b, rcond=1e-9)[0] for a, b in zip(complement, residual)])
     return result.problem.measurement.errors_of(error)
 
 
 def _per_shot(result: Fit, error: np.ndarray) -> np.ndarray:
-    """Weighted squares (K,) of these errors; NaN where a shot has none."""
+    """Sums of squares (K,) of the errors of each shot, over sigma; NaN where a shot has none."""
     squares = np.sum(result.problem.measurement.independent(error) ** 2, axis=1)
     return np.where(np.isnan(error).all(axis=1), np.nan, squares)
 
 
-def _chance(squares: np.ndarray, best: np.ndarray) -> float:
-    """That a law predicting as well as the best shows such errors: paired t tests over shots.
+def _paired_p_value(squares: np.ndarray, best: np.ndarray) -> float:
+    """p-value of the hypothesis that a law predicts as well as the best: paired t tests over shots.
 
-    Of the squares, and of their logarithms, which a few large ones do not drown.
+    The smaller one of two: of the squared errors (K,), and of their logarithms, which a few large
+    ones do not dominate.
     """
     both = np.isfinite(squares) & np.isfinite(best)
-    some = both & (squares > 0) & (best > 0)
-    gain = _above_zero(squares[both] - best[both], best[both])
-    return min(gain, _above_zero(np.log(squares[some]) - np.log(best[some]), 1.0))
+    positive = both & (squares > 0) & (best > 0)
+    gain = _t_test(squares[both] - best[both], best[both])
+    return min(gain, _t_test(np.log(squares[positive]) - np.log(best[positive]), 1.0))
 
 
-def _above_zero(more: np.ndarray, size: Any) -> float:
-    """Chance of values of mean 0 that lie as far above it."""
+def _t_test(more: np.ndarray, size: Any) -> float:
+    """p-value of the one-sided t test that the mean of `more` is 0: `t = mean / (std / sqrt(N))`.
+
+    Values below `SAME size` count as 0: rounding.
+    """
     more = np.where(np.abs(more) > SAME * np.abs(size), more, 0.0)
     if len(more) < _LEAST or not more.any():
         return 1.0
@@ -495,23 +533,30 @@ def _above_zero(more: np.ndarray, size: Any) -> float:
 
 
 def _variance(result: Fit) -> float:
-    """Of the residuals; infinite where no degree of freedom is left."""
+    """Variance of the residuals, |r|^2 / f; infinite where no degree of freedom f is left."""
     freedom = result.degrees_of_freedom
     return result.starts[0].sum_of_squares / freedom if freedom > 0 else np.inf
 
 
-def _by_residuals(result: Fit, best: Fit) -> float:
-    """Chance of residuals so much larger, as if the better law had one parameter more at least."""
+def _f_test_of_residuals(result: Fit, best: Fit) -> float:
+    """p-value of an F test of the residuals of a law against those of the best one.
+
+    The best one counts as having one parameter more at least; 1 where its residuals are larger.
+    """
     gain = result.starts[0].sum_of_squares - best.starts[0].sum_of_squares
     more = max(best.rank - result.rank, 1)
-    return _f_test(gain, more, best)[-1] if gain > 0 else 1.0
+    return _f_test(gain, more, best).chance if gain > 0 else 1.0
 
 
 def _aicc(result: Fit) -> float:
-    """Akaike's criterion; with unknown noise corrected for few data; NaN if meaningless."""
+    """Akaike's criterion, where sigma is unknown corrected for small samples; NaN if meaningless.
+
+    Equation: `AIC + 2 k (k + 1) / (n - k - 1)`, n values, k parameters with the noise. It has a
+    meaning for a converged fit of full rank, inside its bounds, to all shots.
+    """
     n, count = result.problem.values, len(result.names)
-    whole = result.rank == count and not result.at_bound.any() and not result.problem.left_out
-    if not whole or not result.converged:
+    regular = result.rank == count and not result.at_bound.any() and not result.problem.left_out
+    if not regular or not result.converged:
         return np.nan
     if result.problem.sigma is not None:
         return result.aic
@@ -522,11 +567,21 @@ def _aicc(result: Fit) -> float:
 def _speed_test(
     constant: Fit, candidate: Candidate, scene: Scene | None, data: Experiments, options: Any
 ) -> tuple[NestedTest | None, Fit | None]:
-    """Whether e depends on the speed, and how; None of a law without e, or of one speed."""
+    """Test of a restitution that depends on the speed, and the fit with it.
+
+    None for laws without a restitution or with such a dependence, and for shots of one speed.
+
+    Args:
+        constant: the fit without it.
+        candidate: its law, and what is free.
+        scene: of all shots, or None.
+        data: the shots.
+        options: of `fit`.
+    """
     law, free = candidate
-    known, speeds = free_parameters_of(law), data.approach_speed(scene)
+    available, speeds = free_parameters_of(law), data.approach_speed(scene)
     speeds = speeds[speeds > 0]
-    constant_e = "restitution" in known and not known.keys() & set(OF_SPEED)
+    constant_e = "restitution" in available and not available.keys() & set(OF_SPEED)
     if not constant_e or len(speeds) < 2 or np.ptp(speeds) == 0:
         return None, None
     typical = float(np.exp(np.mean(np.log(speeds))))

@@ -94,13 +94,22 @@ def read_positions(path: str | Path) -> Positions:
 
 
 def _last_digit(cell: str) -> float:
-    """The step in which a number is written: .001 of '0.033'."""
+    """The value of one unit in the last digit of a number as it is written: .001 of '0.033'."""
     mantissa, _, power = cell.lower().partition("e")
     return float(10.0 ** (int(power or 0) - len(mantissa.partition(".")[2])))
 
 
 def _even(where: str, time: np.ndarray, rounding: float) -> np.ndarray:
-    """Times in equal steps from which the measured ones differ by rounding only."""
+    """Times (S,) in equal steps: as they are, or a line through them if they were rounded.
+
+    Args:
+        where: beginning of a message.
+        time: measured, must rise in equal steps but for rounding.
+        rounding: one unit in the last digit of the times as they are written [s].
+
+    Raises:
+        ValueError: times that do not rise, or in unequal steps.
+    """
     if len(time) < 2 or not (np.diff(time) > 0).all():
         raise ValueError(f"{where}: the times `t` must be two or more, and rise.")
     step = (time[-1] - time[0]) / (len(time) - 1)
@@ -124,7 +133,14 @@ def _even(where: str, time: np.ndarray, rounding: float) -> np.ndarray:
 def _read(
     path: str | Path, kinds: dict[str, dict[str, float]], allowed: str, what: str
 ) -> tuple[str, list["CsvColumn"], list[tuple[str, list[str]]]]:
-    """Place of the header, its columns, and the lines below with their places."""
+    """Place of the header in words, its columns, and the rows below: (place, cells).
+
+    Args:
+        path: CSV file.
+        kinds: units by kind of column, with their factors.
+        allowed: the columns that may be there, in words.
+        what: the noun for a row, 'shot' or 'sample'.
+    """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(
@@ -167,7 +183,15 @@ class CsvColumn(NamedTuple):
 def _column(
     where: str, index: int, header: str, kinds: dict[str, dict[str, float]], allowed: str
 ) -> CsvColumn:
-    """The column of a header cell."""
+    """The column that a header cell such as `post_1[m/s]` names; a ValueError for any other text.
+
+    Args:
+        where: beginning of a message.
+        index: of the column, from 0.
+        header: text of the cell.
+        kinds: units by kind of column, with their factors.
+        allowed: the columns that may be there, in words.
+    """
     if header == "shot" and kinds is _KINDS:
         return CsvColumn(header, "shot", 0, 1.0, "")
     match = _HEADER.fullmatch(header)
@@ -195,7 +219,7 @@ def _column(
 
 
 def _check_columns(where: str, columns: list[CsvColumn]) -> dict[str, int]:
-    """Number of columns of each kind, each of which must occur once."""
+    """Number of columns of each kind; a ValueError for repeated, missing and mixed ones."""
     keys = [(c.kind, c.body) for c in columns]
     velocities = [c for c in columns if c.kind in (*_NEEDED, *_ERRORS)]
     for column, key in zip(columns, keys):
@@ -209,14 +233,15 @@ def _check_columns(where: str, columns: list[CsvColumn]) -> dict[str, int]:
             )
     kinds = [kind for kind in _KINDS if kind in _NEEDED or any(x == kind for x, _ in keys)]
     bodies = max(1, *(c.body for c in velocities)) if velocities else 1
-    counts = {
+    counts = {  # one for each body; gaps and coordinates q may be more or fewer
         kind: bodies
         if kind in (*_NEEDED, *_ERRORS, "mass")
         else max(body for other, body in keys if other == kind)
         for kind in kinds
     }
-    each = [(i + 1, k) for i in range(max(counts.values())) for k in kinds if i < counts[k]]
-    missing = [f"{kind}_{i}" for i, kind in each if (kind, i) not in keys]
+    # of every kind, columns 1 to its count
+    required = [(i + 1, k) for i in range(max(counts.values())) for k in kinds if i < counts[k]]
+    missing = [f"{kind}_{i}" for i, kind in required if (kind, i) not in keys]
     if missing:
         raise ValueError(
             f"{where}: column `{missing[0]}[unit]` is missing; every body from 1 to {bodies} needs "
@@ -228,7 +253,10 @@ def _check_columns(where: str, columns: list[CsvColumn]) -> dict[str, int]:
 def _values(
     columns: list[CsvColumn], rows: list[tuple[str, list[str]]], counts: dict[str, int]
 ) -> dict[str, np.ndarray]:
-    """The cells in SI units, checked, by kind; a warning reports those that say NaN."""
+    """The cells in SI units by kind (rows, `counts[kind]`), checked; NaN where they are empty.
+
+    A warning reports cells with the text NaN.
+    """
     values = {kind: np.full((len(rows), n), np.nan) for kind, n in counts.items()}
     not_numbers = []
     for k, (line, row) in enumerate(rows):
@@ -254,12 +282,12 @@ def _values(
 
 
 def _is_nan(cell: str) -> bool:
-    """Whether a cell says NaN."""
+    """True if the text of a cell is NaN."""
     return cell.lower() == "nan"
 
 
 def _number(where: str, column: CsvColumn, cell: str) -> float:
-    """The cell in SI units, NaN where nothing was measured."""
+    """The number in a cell, in SI units; NaN if it is empty, where the column allows that."""
     if cell == "" or _is_nan(cell):
         if column.kind in ("pre", "mass", "gap", "t"):
             what = "a velocity before the impact" if column.kind == "pre" else "this"
@@ -282,7 +310,7 @@ def _number(where: str, column: CsvColumn, cell: str) -> float:
 
 
 def _check_error(where: str, column: CsvColumn, measured: bool, error: float) -> None:
-    """Refuse a measured value whose standard error is missing or not positive."""
+    """Raise a ValueError if the standard error of a measured value is missing or not positive."""
     exact = column.kind == "sigma_pre" and error == 0  # as of what is at rest
     if measured and not error > 0 and not exact:
         value = "is empty" if np.isnan(error) else f"is {error / column.factor:g}"

@@ -4,6 +4,8 @@ Minimize `|r(y)|^2 / 2` for `low <= y <= high`, by
 Levenberg-Marquardt or by gradient descent with optax. Steps are cut at the box, and a variable on a
 bound whose gradient points outward is left out of the step, so minima on a bound are found exactly.
 One pass evaluates residual and Jacobian together, so that an impact is compiled once.
+
+Axes: S problems side by side, Q variables y, R residuals r.
 """
 
 import time
@@ -16,6 +18,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from jimpact.tools.checks import needed, suggestion
 from jimpact.tools.compiling import quick_jit
@@ -27,6 +30,7 @@ if TYPE_CHECKING:
 
 HOW = "pip install optax"
 Method: TypeAlias = "str | optax.GradientTransformation"
+AnyArray: TypeAlias = Array | np.ndarray  # on the device, or on the host
 
 # Steps of one start before the solver gives up: more only costs time.
 DEFAULT_STEPS = {"levenberg-marquardt": 100, "lbfgs": 100, "adam": 500, "sgd": 1000}
@@ -77,44 +81,61 @@ SETTLED, SETTLING = 1e-5, 10  # change (natural scales) and rounds, where errors
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class LeastSquares:
-    """Minimize `|r(y)|^2 / 2` for `low <= y <= high`: all that a solver knows of a fit.
+    """Minimize `|r(y)|^2 / 2` for `low <= y <= high`: a fit as a solver sees it.
+
+    S stacked problems have one more axis in front of every array.
 
     Attributes:
-        evaluate: y (Q,) -> r (R,), dr/dy (R, Q), and what is kept of the best point; a pytree.
-        low, high: (Q,) the box.
-        size: () what r was divided by.
+        evaluate: y -> r, dr/dy, and further outcomes (a pytree), kept of the best point.
+        low, high: bounds of y.
+        size: the number that r was divided by: `|r| size` is in units of sigma.
         project: (y, H, g) -> allowed z of the least `g^T (z - y) + (z - y)^T H (z - y) / 2`; None:
-            all of the box is allowed.
-        zeros: shaped like what `evaluate` gives.
-        short: whether `evaluate` takes so little time that many problems may wait for each other.
+            all y within the bounds are allowed.
+        zeros: arrays of 0 shaped like the results of `evaluate`.
+        short: True where `evaluate` is so quick that many problems may wait for each other.
     """
 
-    evaluate: Callable[[jax.Array], tuple[jax.Array, jax.Array, Any]]
-    low: Any
-    high: Any
-    size: Any
-    project: Callable[[jax.Array, jax.Array, jax.Array], jax.Array] | None
+    evaluate: Callable[[Float[AnyArray, " Q"]], tuple[Float[Array, " R"], Float[Array, "R Q"], Any]]
+    low: Float[AnyArray, "*S Q"]
+    high: Float[AnyArray, "*S Q"]
+    size: Float[AnyArray, "*S"]
+    project: (
+        Callable[[Float[Array, " Q"], Float[Array, "Q Q"], Float[Array, " Q"]], Float[Array, " Q"]]
+        | None
+    )
     zeros: Any
     short: bool = field(metadata={"static": True})
 
     def lanes(self, count: int) -> int:
-        """How many of `count` such problems are solved side by side."""
+        """Number of problems, of `count`, that one program solves at a time.
+
+        All of them wait for the slowest one, so they are many only where `evaluate` is quick.
+        """
         if not self.short:
             return LANES if count > 1 else 1
         many = LANES_OF_MANY if jax.default_backend() == "cpu" else LANES_ON_ACCELERATOR
         return LANES if count <= LANES_OF_MANY else many
 
 
-def _free_gradient(problem: LeastSquares, y: jax.Array, gradient: jax.Array) -> jax.Array:
-    """The gradient without variables that sit on a bound and are pushed against it."""
+def _free_gradient(
+    problem: LeastSquares, y: Float[AnyArray, " Q"], gradient: Float[Array, " Q"]
+) -> Float[Array, " Q"]:
+    """The projected gradient: 0 for a variable on a bound that a descent would cross.
+
+    Equation: `0 if y_i <= low_i and g_i > 0, or y_i >= high_i and g_i < 0; else g_i`.
+    """
     pushed = ((y <= problem.low) & (gradient > 0)) | ((y >= problem.high) & (gradient < 0))
     return jnp.where(pushed, 0.0, gradient)
 
 
 def _damped_step(
-    gradient: jax.Array, jacobian: jax.Array, damping: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Damped Gauss-Newton step, and the decrease it promises."""
+    gradient: Float[Array, " Q"], jacobian: Float[Array, "R Q"], damping: Float[Array, ""]
+) -> tuple[Float[Array, " Q"], Float[Array, ""]]:
+    """Levenberg-Marquardt step d, and the decrease of `|r|^2 / 2` that the linear model promises.
+
+    Equation: `(J^T J + mu D) d = -g` with `g = J^T r`, D the diagonal of `J^T J` (its smallest
+    entries raised); the decrease is `-g^T d - |J d|^2 / 2`.
+    """
     hessian = jacobian.T @ jacobian
     curvature = jnp.diagonal(hessian)
     largest = jnp.max(curvature)
@@ -125,17 +146,21 @@ def _damped_step(
 
 
 class Damping(NamedTuple):
-    """The damping of Levenberg-Marquardt, its next growth, and what the last step promised."""
+    """The damping mu of Levenberg-Marquardt by Nielsen's rule (1999).
 
-    value: jax.Array
-    growth: jax.Array
-    promised: jax.Array
+    `growth` is the factor on mu after a step that fails; `promised` is the decrease of
+    `|r|^2 / 2` that the linear model promised of the last step.
+    """
 
-    def after(self, gain: jax.Array) -> "Damping":
-        """Nielsen's rule after a step that gained so much.
+    value: Float[AnyArray, "*S"]
+    growth: Float[AnyArray, "*S"]
+    promised: Float[AnyArray, "*S"]
 
-        Equation: `value max(1/3, 1 - (2 gain / promised - 1)^3)` after a gain, else
-        `value growth`, and the growth doubles.
+    def after(self, gain: Float[AnyArray, "*S"]) -> "Damping":
+        """The damping after a step that has lowered `|r|^2 / 2` by `gain`.
+
+        Equation: with `rho = gain / promised`, `mu max(1/3, 1 - (2 rho - 1)^3)` and `growth = 2`
+        where gain > 0; else `mu growth`, and the growth doubles.
         """
         better = gain > 0
         ratio = jnp.where(jnp.isfinite(gain), gain / self.promised, 1.0)
@@ -146,25 +171,39 @@ class Damping(NamedTuple):
 
 
 class SolverState(eqx.Module):
-    """The best point so far, what the next pass tries, and the method's memory."""
+    """An iteration: the best point so far, the next trial point, and the memory of the method."""
 
-    y: jax.Array
-    residual: jax.Array
-    jacobian: jax.Array
+    y: Float[AnyArray, "*S Q"]  # the best point
+    residual: Float[AnyArray, "*S R"]  # there, as the next two
+    jacobian: Float[AnyArray, "*S R Q"]
+    aux: Any  # further outcomes of `LeastSquares.evaluate`
+    cost: Float[AnyArray, "*S"]  # |r|^2 / 2
+    gain: Float[AnyArray, "*S"]  # decrease of it that a Gauss-Newton step promises
+    trial: Float[AnyArray, "*S Q"]
+    memory: Any  # `Damping`, or the state of an optax transformation
+    steps: Int[AnyArray, "*S"]
+    done: Bool[AnyArray, "*S"]
+    stuck: Bool[AnyArray, "*S"]  # no step lowers the cost
+
+
+class _Point(NamedTuple):
+    """A point y, its residual r, dr/dy, further outcomes of `evaluate`, and `|r|^2 / 2`."""
+
+    y: Float[AnyArray, " Q"]
+    residual: Float[AnyArray, " R"]
+    jacobian: Float[AnyArray, "R Q"]
     aux: Any
-    cost: jax.Array
-    gain: jax.Array  # what a Gauss-Newton step from the best point still promises
-    trial: jax.Array
-    memory: Any
-    steps: jax.Array
-    done: jax.Array
-    stuck: jax.Array  # no step lowers the cost
+    cost: Float[AnyArray, ""]
 
 
 def step_limit(method: Any, stated: int | None) -> int:
-    """The stated limit of steps, or that of the method; raises a ValueError for an unknown one."""
-    known = isinstance(method, str) and method in DEFAULT_STEPS
-    if not known:
+    """Largest number of iterations of one start: `stated`, or the default of the method.
+
+    Raises:
+        ValueError: an unknown method.
+    """
+    is_named = isinstance(method, str) and method in DEFAULT_STEPS
+    if not is_named:
         optax = needed("optax", HOW)
         if not isinstance(method, optax.GradientTransformation):
             raise ValueError(
@@ -172,106 +211,120 @@ def step_limit(method: Any, stated: int | None) -> int:
                 f"optax.GradientTransformation, but has value {method!r}."
                 f"{suggestion(method, DEFAULT_STEPS)}"
             )
-    return DEFAULT_STEPS[method if known else "adam"] if stated is None else stated
+    return DEFAULT_STEPS[method if is_named else "adam"] if stated is None else stated
 
 
-def begin(problems: Any, y: Any, solver: "Solver") -> SolverState:
-    """States before the first pass of S problems from y (S, Q), on the host."""
+def begin(problems: LeastSquares, y: Float[np.ndarray, "S Q"], solver: "Solver") -> SolverState:
+    """Initial states of S stacked problems that start from y, on the host: nothing is evaluated."""
     count = len(y)
-    all_are: Any = partial(np.full, count, dtype=y.dtype)
+    filled: Any = partial(np.full, count, dtype=y.dtype)
     if solver.method == "levenberg-marquardt":
-        memory: Any = Damping(*map(all_are, (solver.damping, _FIRST_GROWTH, np.inf)))
+        memory: Any = Damping(*map(filled, (solver.damping, _FIRST_GROWTH, np.inf)))
     else:
         init = _transformation(solver.method, solver.max_steps).init
         memory = jax.device_get(jax.vmap(init)(y))
-    costs = all_are(np.inf), all_are(np.inf)
-    ends: Any = np.zeros(count, int), np.zeros(count, bool), np.zeros(count, bool)
-    trial = np.clip(y, problems.low, problems.high)
     residual, jacobian, aux = problems.zeros
-    state = SolverState(y, residual, jacobian, aux, *costs, trial, memory, *ends)
+    state = SolverState(
+        y=y,
+        residual=residual,
+        jacobian=jacobian,
+        aux=aux,
+        cost=filled(np.inf),
+        gain=filled(np.inf),
+        trial=np.clip(y, problems.low, problems.high),
+        memory=memory,
+        steps=np.zeros(count, int),
+        done=np.zeros(count, bool),
+        stuck=np.zeros(count, bool),
+    )
     return jax.tree.map(np.array, state)  # copies: states are written in place
 
 
 @quick_jit
 def advance_all(
-    problems: Any, states: SolverState, method: Method, max_steps: int, stop: jax.Array
+    problems: LeastSquares, states: SolverState, method: Method, max_steps: Any, stop: Any
 ) -> SolverState:
-    """Every problem by at most `PASSES` trials more, until it is done or has made `max_steps`.
+    """Advance S stacked problems by up to `PASSES` iterations each, at most to `max_steps`.
 
     The host calls it again and again; in between it shows progress and drops what is done. `stop`
     (): a problem is done where a Gauss-Newton step promises less than this part of `|r|^2 / R`.
     """
 
-    def one(problem: Any, state: SolverState) -> SolverState:
-        """One problem, until it is done or at the step limit."""
+    def advance_one(problem: Any, state: SolverState) -> SolverState:
+        """Iterate on one problem until it is done or at its limit of steps."""
         last = jnp.minimum(state.steps + PASSES, max_steps)
         one_pass = partial(_pass, problem, method, max_steps, stop)
         return jax.lax.while_loop(lambda s: ~s.done & (s.steps < last), one_pass, state)
 
-    return eqx.filter_vmap(one)(problems, states)
+    return eqx.filter_vmap(advance_one)(problems, states)
 
 
 def _pass(
-    problem: LeastSquares, method: Method, max_steps: int, stop: jax.Array, state: SolverState
+    problem: LeastSquares, method: Method, max_steps: Any, stop: Any, state: SolverState
 ) -> SolverState:
-    """Residual and Jacobian of the trial, and the next one."""
+    """One iteration: evaluate the trial point, keep the better point, step to the next trial.
+
+    The step is that of `_damped_step`, or of an optax transformation. The problem is done where a
+    Gauss-Newton step (with the least damping) from the best point promises too little.
+    """
     residual, jacobian, aux = problem.evaluate(state.trial)
     cost = 0.5 * jnp.sum(residual**2)
     better = cost < state.cost
-    here = (state.trial, residual, jacobian, aux, cost)
-    best = (state.y, state.residual, state.jacobian, state.aux, state.cost)
-    best = jax.tree.map(lambda a, b: jnp.where(better, a, b), here, best)
-    y, r, jac, aux, least = best
+    tried = _Point(state.trial, residual, jacobian, aux, cost)
+    before = _Point(state.y, state.residual, state.jacobian, state.aux, state.cost)
+    best = jax.tree.map(lambda a, b: jnp.where(better, a, b), tried, before)
+    y, r = best.y, best.residual
     dtype = str(y.dtype)
-    slope = jac.T @ r
-    free = _free_gradient(problem, y, slope)
-    of_free = jnp.where((free == 0) & (slope != 0), 0.0, jac)
+    gradient = best.jacobian.T @ r
+    projected = _free_gradient(problem, y, gradient)
+    # without the columns of variables that are held at a bound
+    free_jacobian = jnp.where((projected == 0) & (gradient != 0), 0.0, best.jacobian)
     floor = jnp.asarray(_LEAST[dtype], y.dtype)
     if method == "levenberg-marquardt":
         memory = state.memory.after(state.cost - cost)
         dampings = jnp.stack([floor, memory.value])  # compiled once
-        moves, gains = jax.vmap(partial(_damped_step, free, of_free))(dampings)
+        moves, gains = jax.vmap(partial(_damped_step, projected, free_jacobian))(dampings)
         gain, trial = gains[0], jnp.clip(y + moves[1], problem.low, problem.high)
-        change = jac @ (trial - y)
+        change = best.jacobian @ (trial - y)  # of r in the linear model, after the cut at the box
         memory = memory._replace(promised=-(r @ change) - 0.5 * jnp.sum(change**2))
         stuck = memory.value > _STUCK
     else:
-        gain = _damped_step(free, of_free, floor)[1]
-        gradient = _free_gradient(problem, state.trial, jacobian.T @ residual)
+        gain = _damped_step(projected, free_jacobian, floor)[1]
+        trial_gradient = _free_gradient(problem, state.trial, jacobian.T @ residual)
         # optax itself mixes integers and floats: it needs the standard promotion
         with jax.numpy_dtype_promotion("standard"):
             move, memory = _transformation(method, max_steps).update(
-                gradient,
+                trial_gradient,
                 state.memory,
                 state.trial,
                 value=cost,
-                grad=gradient,
+                grad=trial_gradient,
                 value_fn=partial(_cost, problem),
             )
         trial = jnp.clip(state.trial + move, problem.low, problem.high)
         stuck = jnp.asarray(False)
-    finest = stop * least / residual.shape[0] + STOP_EXACT[dtype]
-    rounding = ROUNDING[dtype] * least / residual.shape[0] + ROUNDING_EXACT[dtype]
+    # promises below which the search is done: always, or where no lower point was found
+    finest = stop * best.cost / residual.shape[0] + STOP_EXACT[dtype]
+    rounding = ROUNDING[dtype] * best.cost / residual.shape[0] + ROUNDING_EXACT[dtype]
     small = gain <= jnp.where(better, finest, jnp.maximum(finest, rounding))
-    return SolverState(
-        y, r, jac, aux, least, gain, trial, memory, state.steps + 1, small | stuck, stuck
-    )
+    end: Any = {"steps": state.steps + 1, "done": small | stuck, "stuck": stuck}
+    return SolverState(**best._asdict(), gain=gain, trial=trial, memory=memory, **end)
 
 
-def _cost(problem: LeastSquares, y: jax.Array) -> jax.Array:
-    """`|r|^2 / 2` at the nearest point in the bounds, for line searches.
+def _cost(problem: LeastSquares, y: Float[Array, " Q"]) -> Float[Array, ""]:
+    """`|r|^2 / 2` at the nearest point within the bounds, for line searches of optax.
 
     Its derivative is taken from the Jacobian that `evaluate` gives.
     """
 
     @jax.custom_jvp
     def cost(y: jax.Array) -> jax.Array:
-        """Half the sum of squares."""
+        """`|r(y)|^2 / 2`."""
         return 0.5 * jnp.sum(problem.evaluate(y)[0] ** 2)
 
     @cost.defjvp
     def _rule(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
-        """The derivative by the Jacobian."""
+        """`|r|^2 / 2` and its change `(J^T r)^T dy` along a tangent dy."""
         residual, jacobian, _ = problem.evaluate(primals[0])
         return 0.5 * jnp.sum(residual**2), (jacobian.T @ residual) @ tangents[0]
 
@@ -279,7 +332,10 @@ def _cost(problem: LeastSquares, y: jax.Array) -> jax.Array:
 
 
 def _transformation(method: Method, max_steps: int) -> "optax.GradientTransformationExtraArgs":
-    """The optax transformation of a method."""
+    """The optax transformation of a method: as it is given, or that of its name.
+
+    The learning rate of 'adam' decays as a cosine over `max_steps`.
+    """
     optax = needed("optax", HOW)
 
     if method == "adam":
@@ -295,7 +351,7 @@ def _transformation(method: Method, max_steps: int) -> "optax.GradientTransforma
 
 
 class Solver(NamedTuple):
-    """How minima are searched for: the method, its steps, and how it is watched."""
+    """Options of a search for minima: the method, its limits, and the display of progress."""
 
     method: Method = "levenberg-marquardt"
     max_steps: int = DEFAULT_STEPS["levenberg-marquardt"]
@@ -306,40 +362,52 @@ class Solver(NamedTuple):
 
 
 class Ends(NamedTuple):
-    """Where S solves ended, on the host; residuals in units of sigma."""
+    """End points of S solves, on the host; residuals in units of sigma.
 
-    y: np.ndarray  # (S, Q)
-    squares: np.ndarray  # (S,) |r|^2
-    residual: np.ndarray  # (S, R)
-    jacobian: np.ndarray  # (S, R, Q)
-    predicted: np.ndarray
-    status: np.ndarray
-    slopes: Any  # `dv+/dv-` of the shots, where errors of v- are passed on, else None
-    converged: np.ndarray  # (S,) whether so close to a minimum that it stands
-    stuck: np.ndarray  # (S,) no step lowers the sum of squares, although derivatives promise it
-    steps: np.ndarray
+    A single one, `rows(k)`, has no axis S.
+    """
+
+    y: Float[np.ndarray, "*S Q"]
+    squares: Float[np.ndarray, "*S"]  # |r|^2
+    residual: Float[np.ndarray, "*S R"]
+    jacobian: Float[np.ndarray, "*S R Q"]
+    predicted: Float[np.ndarray, "..."]  # S, and the shape of what was measured
+    status: Int[np.ndarray, "*S K"]  # codes of the shots; one of another observable
+    slopes: Float[np.ndarray, "*S K n n"] | None  # dv+/dv- where errors of v- are passed on
+    converged: Bool[np.ndarray, "*S"]  # True close enough to a minimum, see `CONVERGED`
+    stuck: Bool[np.ndarray, "*S"]  # no step lowers |r|^2, although derivatives promise it
+    steps: Int[np.ndarray, "*S"]
 
     def rows(self, which: Any) -> "Ends":
-        """Some of them."""
+        """The ends of these solves; `which` indexes the axis S."""
         return jax.tree.map(lambda x: x[which], self)
 
 
 def minimize(
     problems: Sequence[LeastSquares],
-    points: np.ndarray,
+    points: Float[np.ndarray, "S Q"],
     solver: Solver,
     stop: float = 0.0,
     noise: float | None = None,
     what: str = "fits",
-    fixed: np.ndarray | None = None,
+    fixed: Bool[np.ndarray, "S Q"] | None = None,
 ) -> Ends:
-    """Minima of problems from y (S, Q), equally many of each, one after the other.
+    """Minima of N problems of one structure, each from S / N of the points, which follow in order.
 
-    As many as `lanes(S)` are solved side by side; those that are done make room for
-    others. `stop`: see `FINE`, which it is at least. `noise`: all are starts of one problem, whose
-    residuals have this noise at least, and every few passes the worse half of them is given up
-    (successive halving). Progress counts `what`. `fixed` (S, Q): which entries of y stay as they
-    are. Where not all of the box is allowed, that is left aside at first, and then holds.
+    Up to `lanes(S)` solves run side by side; those that are done make room for others. Where a
+    problem allows only a part of its box (`project`), it is solved in all of the box first. Then y
+    goes to the allowed point of the least linearized residuals, repeatedly, until it stays.
+
+    Args:
+        problems: N of them.
+        points: y from which the solves start.
+        solver: options.
+        stop: done where a Gauss-Newton step promises less than this part of `|r|^2 / R`; at
+            least `FINE`.
+        noise: standard error of a residual; with it all points are starts of one problem, and
+            every few passes the worse half of them is given up (successive halving).
+        what: the noun in messages of progress.
+        fixed: True for entries of y that stay at their start.
     """
     many = stacked(problems, len(points) // len(problems))
     points = points.astype(many.low.dtype)
@@ -352,15 +420,15 @@ def minimize(
     states, converged = _descended(many, points, solver, *rule)
     y, steps, stuck = np.asarray(states.y), states.steps, states.stuck
     once, moved = solver._replace(max_steps=1), np.full(len(y), project is not None)
-    for _ in range(SETTLING):
+    for _ in range(SETTLING):  # by turns: the best allowed point, residual and Jacobian there
         if not moved.any():
             break
-        inside = np.empty_like(y)
+        allowed = np.empty_like(y)
         lanes, workers = many.lanes(len(y)), solver.workers
         for rows, nearest in in_parts(best_allowed, (project, states), lanes, workers=workers):
-            inside[rows] = nearest
-        states, _ = _descended(many, inside, once, *rule)
-        moved, y = np.abs(inside - y).max(axis=1) > SETTLED, inside
+            allowed[rows] = nearest
+        states, _ = _descended(many, allowed, once, *rule)
+        moved, y = np.abs(allowed - y).max(axis=1) > SETTLED, allowed
     size = np.asarray(many.size, float)
     return Ends(
         y=np.asarray(states.y, float),
@@ -377,51 +445,54 @@ def minimize(
 
 
 @quick_jit
-def best_allowed(project: Any, states: SolverState) -> jax.Array:
-    """The allowed points where the linearized residuals are least."""
+def best_allowed(project: Any, states: SolverState) -> Float[Array, "S Q"]:
+    """The allowed z of the least linearized residuals `|r + J (z - y)|^2`, y the best points."""
 
-    def one(project: Any, state: SolverState) -> jax.Array:
-        """Of one problem."""
+    def nearest(project: Any, state: SolverState) -> Float[Array, " Q"]:
+        """`project(y, J^T J, J^T r)` of one problem."""
         jacobian = state.jacobian
         hessian, gradient = jacobian.T @ jacobian, jacobian.T @ state.residual
         return project(state.y, hessian, gradient)
 
-    return jax.vmap(one)(project, states)
+    return jax.vmap(nearest)(project, states)
 
 
 def _descended(
-    problems: Any,
-    points: np.ndarray,
+    problems: LeastSquares,
+    points: Float[np.ndarray, "S Q"],
     solver: Solver,
     stop: float,
     noise: float | None,
     what: str,
-) -> tuple[SolverState, np.ndarray]:
-    """States where searches from y (S, Q) ended, and which have converged; see `minimize`."""
+) -> tuple[SolverState, Bool[np.ndarray, " S"]]:
+    """Last states of S solves within the box, and True for those that converged.
+
+    Arguments as of `minimize`, but the problems are stacked.
+    """
     dtype, count = points.dtype, len(points)
     limit: Any = solver.max_steps
-    descends = solver.method != "levenberg-marquardt"
-    if not descends:
-        limit = np.asarray(limit)  # one program serves all limits
+    by_gradient = solver.method != "levenberg-marquardt"
+    if not by_gradient:
+        limit = np.asarray(limit)  # an argument of the program, which serves all limits
     rule: Any = {"method": solver.method, "max_steps": limit, "stop": np.asarray(stop, dtype)}
     advance, states = partial(advance_all, **rule), begin(problems, points, solver)
     problems = replace(problems, zeros=None)
     converged = np.zeros(count, bool)
-    active, lanes = np.arange(count), problems.lanes(count)
-    first = True
+    active, lanes = np.arange(count), problems.lanes(count)  # indices of the solves that go on
+    compiles = True  # the first time
     while len(active):
-        before, every = states.cost.copy(), (problems, states)
-        for rows, some in in_parts(advance, every, lanes, active, solver.workers, first):
-            for leaf, value in zip(jax.tree.leaves(states), jax.tree.leaves(some)):
+        before, trees = states.cost.copy(), (problems, states)
+        for rows, part in in_parts(advance, trees, lanes, active, solver.workers, compiles):
+            for leaf, value in zip(jax.tree.leaves(states), jax.tree.leaves(part)):
                 leaf[rows] = value
-        first = False
-        converged = _converged(states, DESCENDED if descends else CONVERGED)
+        compiles = False
+        converged = _converged(states, DESCENDED if by_gradient else CONVERGED)
         ended = states.done | (states.steps >= solver.max_steps)
-        if not descends:
+        if not by_gradient:
             creeps = (states.cost > (1 - CREEPS) * before) & (states.memory.value < _SHORT)
             ended |= creeps & ~converged
         active = active[~ended[active]]
-        if noise is not None and not descends:
+        if noise is not None and not by_gradient:
             active = _better_half(states, active, noise / problems.size[0])
         done, steps = count - len(active), int(states.steps.max())
         solver.show(f"fit: {done} of {count} {what} done, step {steps}", done, count)
@@ -430,26 +501,35 @@ def _descended(
     return states, converged
 
 
-def _better_half(states: SolverState, active: np.ndarray, noise: float) -> np.ndarray:
-    """Of the active starts the better half, and all that are hardly worse than the best of all."""
+def _better_half(
+    states: SolverState, active: Int[np.ndarray, " A"], noise: Any
+) -> Int[np.ndarray, " B"]:
+    """Indices of the starts that go on, by successive halving: the better half of the active ones.
+
+    So do all that are hardly worse than the best start, of the least `c = |r|^2 / 2`:
+    `c <= c_min + HARDLY_WORSE max(c_min / R, noise^2 / 2)`.
+    """
     order, least = active[np.argsort(states.cost[active])], np.nanmin(states.cost)
     variance = max(least / states.residual.shape[-1], 0.5 * noise**2)
     hardly_worse = states.cost[order] <= least + HARDLY_WORSE * variance
     return order[hardly_worse | (np.arange(len(order)) < len(order) // 2)]
 
 
-def _converged(states: SolverState, enough: float) -> np.ndarray:
-    """Which points (S,) are so close to a minimum that they stand."""
+def _converged(states: SolverState, enough: float) -> Bool[np.ndarray, " S"]:
+    """True where a Gauss-Newton step promises at most the part `enough` of `|r|^2 / R`.
+
+    So it is where the fit is exact up to rounding, and where no step lowers the cost.
+    """
     promised, squares = (2 * np.asarray(x, float) for x in (states.gain, states.cost))
     small = promised <= enough * squares / states.residual.shape[-1]
     return small | (squares <= EXACT[str(states.y.dtype)]) | states.stuck
 
 
 def stacked(problems: Sequence[Any], each: int = 1) -> Any:
-    """Problems of one structure side by side, each so many times."""
+    """N problems of one structure as one, with an axis S = N `each` in front: each repeated."""
 
     def side_by_side(*leaves: Any) -> Any:
-        """Arrays with a leading axis; what is no array is the same for all."""
+        """A leaf of all problems as one array (S, ...); what is no array is the same in all."""
         if not eqx.is_array(leaves[0]):
             return leaves[0]
         return np.repeat(np.stack([np.asarray(leaf) for leaf in leaves]), each, axis=0)

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 from scipy.linalg import qr
 
 from jimpact.fits.problem import FitProblem
@@ -18,15 +19,15 @@ SMALL_CHANGE = 0.01  # the size, in natural scales, in which undetermined combin
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """Errors of P parameters; see `Fit`."""
+    """Errors of P parameters by the linearized law; `Fit` says what each field is."""
 
     rank: int
-    singular_values: np.ndarray
+    singular_values: Float[np.ndarray, " P"]
     degrees_of_freedom: int
     noise: float
-    covariance: np.ndarray
-    correlation: np.ndarray
-    standard_error: np.ndarray
+    covariance: Float[np.ndarray, "P P"]
+    correlation: Float[np.ndarray, "P P"]
+    standard_error: Float[np.ndarray, " P"]
     identifiability: tuple[str, ...]
 
 
@@ -41,9 +42,9 @@ def uncertainty(
     largest. Data without sigma that are reproduced to the last digit do not show their noise.
 
     Args:
-        problem: that was solved.
-        minimum: of it.
-        noise: s; None: as stated, or from |r|^2.
+        problem: least squares.
+        minimum: its residual and Jacobian.
+        noise: s; None: 1 where sigma is stated, else from |r|^2.
     """
     scale, jacobian = problem.steps_at(minimum.value), minimum.jacobian
     # all P right singular vectors, which the thin form has unless there are fewer rows than P
@@ -57,7 +58,7 @@ def uncertainty(
         noise = estimated if problem.sigma is None else 1.0
     determined = directions[:rank] / singular[:rank, None]
     covariance = noise**2 * (determined.T @ determined) * np.outer(scale, scale)
-    null = directions[rank:]
+    null = directions[rank:]  # combinations of parameters that change no residual
     lost = np.any(np.abs(null) > TAKES_PART, axis=0)
     covariance[lost, :] = covariance[:, lost] = np.nan
     covariance[lost, lost] = np.inf
@@ -70,15 +71,24 @@ def uncertainty(
     return Uncertainty(rank, singular, freedom, noise, covariance, correlation, error, words)
 
 
-def _reduced(null: np.ndarray) -> np.ndarray:
-    """The same subspace in reduced row echelon form: each direction with few parameters."""
+def _reduced(null: Float[np.ndarray, "D P"]) -> Float[np.ndarray, "D P"]:
+    """The reduced row echelon form of D directions: the same subspace, few parameters in each.
+
+    By `N T = Q [R1 R2]` with column pivoting T: the rows `[I, R1^-1 R2] T^T` span what N spans.
+    """
     _, rows, pivots = qr(null, mode="economic", pivoting=True)
     rows[:, pivots] = np.linalg.solve(rows[:, : len(rows)], rows)
     return np.asarray(rows)
 
 
-def _in_words(problem: FitProblem, direction: np.ndarray, scale: np.ndarray) -> str:
-    """A direction that leaves all predictions as they are, as small changes of parameters."""
+def _in_words(
+    problem: FitProblem, direction: Float[np.ndarray, " P"], scale: Float[np.ndarray, " P"]
+) -> str:
+    """The sentence for a direction (of scaled parameters) that changes no prediction.
+
+    It names the parameters in it with the changes that belong together, the largest one
+    `SMALL_CHANGE` times `scale`.
+    """
     names, log = problem.names, problem.parameters.log
     value_name = "value" if problem.experiments is None else "velocity"
     parts, taking_part = [], []
