@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
 
 from jimpact.core.quasi_space import quasi_basis
 from jimpact.core.scene import Scene, momentum
@@ -21,20 +22,20 @@ Constraint = Callable[[jax.Array], jax.Array]  # q -> h(q) (b,), 0 at all times
 class QuasiLagrange(NamedTuple):
     """The terms of `qn' + F_norm = G lambda_bar`, `qt' + F_tan = 0`, bilateral constraints first.
 
-    `normal` F_norm (b + m,) and `tangential` F_tan (n - m - b,) [N / sqrt(kg)]; `matrix`
-    G = n_q^T M n_q (b + m, b + m), not reduced; `norm` |grad h|, |grad f| (b + m,):
-    `lambda_bar = norm * lambda`; `bilateral` b.
+    d = b + m: b bilateral constraints, m contacts. `normal` F_norm and `tangential` F_tan
+    [N / sqrt(kg)]; `matrix` G = n_q^T M n_q, not reduced; `norm` |grad h|, |grad f| in the metric
+    M^-1: `lambda_bar = norm * lambda`; `bilateral` b.
     """
 
-    normal: jax.Array
-    tangential: jax.Array
-    matrix: jax.Array
-    norm: jax.Array
+    normal: Float[Array, " d"]
+    tangential: Float[Array, " tangential"]
+    matrix: Float[Array, "d d"]
+    norm: Float[Array, " d"]
     bilateral: int
 
     @full_precision
-    def bilateral_forces(self, force: Any = 0.0) -> jax.Array:
-        """lambda_b (b,) that hold the constraints while contacts push with `force` (m,) [N].
+    def bilateral_forces(self, force: Any = 0.0) -> Float[Array, " b"]:
+        """Forces lambda_b that hold the constraints while contacts push with `force` (m,) [N].
 
         Equation: `F_norm^b = G_bb lambda_bar_b + G_bu lambda_bar_u`, (6.29) with qn_b' = 0.
         """
@@ -44,8 +45,11 @@ class QuasiLagrange(NamedTuple):
         return jnp.linalg.solve(self.matrix[:b, :b], rest) / self.norm[:b]
 
     @full_precision
-    def rates(self, force: Any = 0.0) -> tuple[jax.Array, jax.Array]:
-        """qn' (b + m,) and qt' while contacts push with `force` (m,) [N], constraints kept."""
+    def rates(self, force: Any = 0.0) -> tuple[Float[Array, " d"], Float[Array, " tangential"]]:
+        """Rates qn' and qt' while contacts push with `force` (m,) [N], constraints kept.
+
+        Equation: `qn' = G lambda_bar - F_norm`, `qt' = -F_tan`.
+        """
         push = as_float_array("force", force) * jnp.ones_like(self.norm[self.bilateral :])
         every = jnp.concatenate([self.bilateral_forces(push), push]) * self.norm
         return self.matrix @ every - self.normal, -self.tangential
@@ -94,7 +98,8 @@ def quasi_lagrange(
     t = as_numbers("time", time, (), "one instant; vmap over many")
     fixed = 0 if constraints is None else jax.eval_shape(constraints, at).shape[0]
     chosen = None if contacts is None else tuple(contacts)
-    return QuasiLagrange(*_terms(system, constraints, chosen, at, v, t), fixed)
+    terms = _terms(system, constraints, chosen, at, v, t)
+    return terms._replace(bilateral=fixed)  # an int: what is jitted returns arrays
 
 
 @quick_jit
@@ -102,15 +107,19 @@ def _terms(
     system: System,
     constraints: Constraint | None,
     contacts: tuple[int, ...] | None,
-    q: jax.Array,
-    v: jax.Array,
-    t: jax.Array,
-) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """F_norm, F_tan, G and the norms."""
+    q: Float[Array, " nq"],
+    v: Float[Array, " n"],
+    t: Float[Array, ""],
+) -> QuasiLagrange:
+    """Terms F_norm, F_tan, G and norms of `QuasiLagrange`.
+
+    Equation: `(F_norm, F_tan) = -d/dt (Xi(q) M(q) q')` along q' = v, q'' = that without contacts;
+    `norm = grad f . n_q`, with n_q = `M^-1 grad f / |grad f|`.
+    """
     body = system.body
 
-    def scene_at(displacement: jax.Array) -> Scene:
-        """Mass and all directions, those of constraints first, after a displacement of q."""
+    def scene_at(displacement: Float[Array, " n"]) -> Scene:
+        """Mass and directions [grad h, grad f] after a displacement from q."""
         at = body.nearby(q, displacement)
         normals = body.normals(at)
         if contacts is not None:
@@ -120,41 +129,44 @@ def _terms(
             normals = jnp.concatenate([gradient.T, normals], axis=1)
         return Scene(body.mass_matrix(at), normals)
 
-    def quasi(s: jax.Array, w: jax.Array) -> jax.Array:
-        """Quasi-velocities of w after the time s."""
+    def quasi(s: Float[Array, ""], w: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Quasi-velocities `Xi M w` after the time s at the velocity v, first order in s."""
         scene = scene_at(s * v)
         return jnp.concatenate(quasi_basis(scene), axis=1).T @ momentum(scene, w)
 
     scene = scene_at(jnp.zeros_like(v))
     free = free_acceleration(system, q, v, user_force(system, q, v, t), mass_at(system, q))
     zero = jnp.zeros((), v.dtype)
+    # derivative at s = 0 along (1, q''): d/dt (Xi M q')
     _, rate = jax.jvp(quasi, (zero, v), (jnp.ones_like(zero), free))
     normal, _ = quasi_basis(scene)
     metric = jax.vmap(lambda x: momentum(scene, x), 1, 1)(normal)
     directions = scene.normals
     norm = jnp.sum(directions * normal, axis=0)  # grad f^T M^-1 grad f / |grad f|
     count = directions.shape[1]
-    return -rate[:count], -rate[count:], normal.T @ metric, norm
+    return QuasiLagrange(-rate[:count], -rate[count:], normal.T @ metric, norm, 0)
 
 
 class ContactProblem(NamedTuple):
     """`0 <= lambda  _|_  f'' = D lambda + B >= 0` at contacts that stay closed.
 
-    `delassus` D (m, m) [1/kg]; `free` B(q, q') (m,) [m/s^2], gap accelerations without contacts.
+    `delassus` D [1/kg]; `free` B(q, q') [m/s^2], gap accelerations without contact forces.
     """
 
-    delassus: jax.Array
-    free: jax.Array
+    delassus: Float[Array, "m m"]
+    free: Float[Array, " m"]
 
-    def forces(self, closed: Any = True) -> jax.Array:
-        """lambda (m,) [N] at the contacts that are `closed` (m,), with gap velocity 0."""
+    def forces(self, closed: Any = True) -> Float[Array, " m"]:
+        """Forces lambda [N] at the contacts that are `closed` (m,), with gap velocity 0."""
         held = jnp.broadcast_to(jnp.asarray(closed, bool), self.free.shape)
         return _forces(self.delassus, self.free, held)
 
 
 @quick_jit
-def _forces(delassus: jax.Array, free: jax.Array, held: jax.Array) -> jax.Array:
-    """lambda (m,), 0 at contacts that are not held."""
+def _forces(
+    delassus: Float[Array, "m m"], free: Float[Array, " m"], held: Bool[Array, " m"]
+) -> Float[Array, " m"]:
+    """Forces of `0 <= lambda _|_ D lambda + B >= 0` over held contacts, 0 at others [N]."""
     both = held[:, None] & held[None, :]
     unit = jnp.eye(len(held), dtype=free.dtype)
     return solve_lcp(jnp.where(both, delassus, unit), jnp.where(held, free, 1.0)).z
@@ -191,13 +203,13 @@ def contact_problem(system: System, q: Any, velocity: Any, time: Any = 0.0) -> C
     """
     arguments = {"q": q, "velocity": velocity, "time": time}
     state = (as_numbers(name, x) for name, x in arguments.items())
-    return ContactProblem(*_problem(system, *state))
+    return _problem(system, *state)
 
 
 @quick_jit
 def _problem(
-    system: System, q: jax.Array, v: jax.Array, t: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """D and B."""
+    system: System, q: Float[Array, " nq"], v: Float[Array, " n"], t: Float[Array, ""]
+) -> ContactProblem:
+    """D and B of all contacts."""
     contacts = contacts_at(system, q, v, t, False)
-    return contacts.delassus, contacts.approach
+    return ContactProblem(contacts.delassus, contacts.approach)

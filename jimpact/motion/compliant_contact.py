@@ -5,28 +5,27 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
 
 from jimpact.core.law import Law
 from jimpact.events.contact_flow import Phase
 from jimpact.laws.forces import Force
 from jimpact.motion.compliant_flow import (
-    Phases,
+    ContactModes,
     compliant_flow,
+    contact_modes,
     loaded,
     mode_rows,
     normal_forces,
-    phases_of,
     stable_step,
 )
 from jimpact.motion.dynamics import gaps, kinematics, not_rounding
-from jimpact.motion.event_driven import why_stuck
 from jimpact.motion.flow import (
     Flight,
     State,
     allowed_errors,
     first_flight,
     one_pass,
-    packed,
     selected,
     status_at_start,
     toward_sample,
@@ -46,17 +45,14 @@ from jimpact.motion.persistent_contact import (
     with_normal_forces,
 )
 from jimpact.motion.record import KIND_CODE
+from jimpact.motion.run import course_of, end_of, goes_on
 from jimpact.motion.tables import (
     Course,
     MotionEnd,
     MotionProblem,
     MotionTable,
-    differentiable,
     empty_table,
     event_numbers,
-    put,
-    recorded_events,
-    sampled_states,
 )
 from jimpact.motion.transitions import (
     REST_SPEED,
@@ -80,12 +76,12 @@ class _CompliantRun(NamedTuple):
     """A motion with contact forces up to now."""
 
     flight: Flight
-    fastest: jax.Array  # approach (m,) [m/s] so far, with friction slip (m,), too
+    fastest: Float[Array, " s"]  # [m/s] largest approach (m) so far, with friction slip (m), too
     table: MotionTable
-    event_count: jax.Array
-    status: jax.Array
-    apart: jax.Array  # whether all contacts are open and none closes
-    vanished: jax.Array  # () [s] when steps last vanished at an end of slip, -inf before
+    event_count: Int[Array, ""]
+    status: Int[Array, ""]
+    apart: Bool[Array, ""]  # all contacts are open and none closes
+    vanished: Float[Array, ""]  # [s] when steps last vanished at an end of slip, -inf before
 
 
 def force_of(law: Law) -> Force:
@@ -111,15 +107,12 @@ def force_of(law: Law) -> Force:
 
 def compliant_motion(problem: MotionProblem, max_events: int, until_apart: bool) -> Course:
     """The motion from `times[0]` to `times[-1]`, or until all contacts are open and none closes."""
-    end = differentiable(problem, lambda problem: _run(problem, max_events, until_apart))
-    start = _start(problem)
-    samples = sampled_states(end.table.samples, start, end.reached)
-    events = recorded_events(end.table, end.event_count, problem)
-    return Course(samples, events, end.steps, end.status)
+    run = partial(_run, max_events, until_apart)
+    return course_of(problem, _start(problem), run)[0]
 
 
 def _start(problem: MotionProblem) -> State:
-    """The state at the beginning: contacts are as deep as their gaps say."""
+    """State at the beginning: indentations `x = -f`, 0 of closed gaps; no impulses yet."""
     gap = gaps(problem.system, problem.q0, problem.times[0])
     x = jnp.where(jnp.abs(gap) <= problem.settings.closed_below, 0.0, -gap)
     each = 0 if problem.mu is None else problem.tangents // problem.contacts
@@ -127,24 +120,25 @@ def _start(problem: MotionProblem) -> State:
     return problem.start._replace(contact=jnp.concatenate([x[None], impulses]))
 
 
-def _run(problem: MotionProblem, max_events: int, until_apart: bool) -> MotionEnd:
-    """From pass to pass."""
+def _run(max_events: int, until_apart: bool, problem: MotionProblem) -> MotionEnd:
+    """Pass after pass until the last sample, a failure, or, `until_apart`, all contacts open."""
 
-    def goes_on(problem: MotionProblem, run: _CompliantRun) -> jax.Array:
-        on = (run.status == CODE["ok"]) & (run.flight.sample < problem.times.shape[0])
+    def continues(problem: MotionProblem, run: _CompliantRun) -> Bool[Array, ""]:
+        """True while the motion goes on, and contacts are not apart where that ends it."""
+        on = goes_on(problem, run)
         return on & ~run.apart if until_apart else on
 
     one = partial(_one_pass, max_events)
-    end = until_over(goes_on, one, problem, _begin(problem, max_events))
-    flight = end.flight
-    counts = jnp.stack([flight.sample, end.event_count])
-    return MotionEnd(
-        end.table, flight.sample, end.event_count, flight.steps, end.status, counts, None
-    )
+    last = until_over(continues, one, problem, _begin(problem, max_events))
+    return end_of(problem, last, jnp.stack([last.flight.sample, last.event_count]))
 
 
 def _begin(problem: MotionProblem, max_events: int) -> _CompliantRun:
-    """The run before its first pass: phases follow from gaps and their rates."""
+    """Run at the start of the motion: phases follow from gaps and gap velocities.
+
+    Compression where the indentation x > 0, or x = 0 and the contact does not open; expansion where
+    x > 0 and it opens, of a force that has this phase; else open.
+    """
     system, force, mu, _, _, _, times, m, _ = problem
     state = _start(problem)
     gamma, slip = _rates(problem, state)
@@ -152,28 +146,28 @@ def _begin(problem: MotionProblem, max_events: int) -> _CompliantRun:
     phase = jnp.where((x > 0) | ((x == 0) & (gamma <= 0)), Phase.COMPRESSION, Phase.OPEN)
     if not force.slackens:
         phase = jnp.where((x > 0) & (gamma > 0), Phase.EXPANSION, phase)
-    phase, watched, fastest = phase.astype(jnp.int32), 2 * m, jnp.maximum(-gamma, 0.0)
+    phase, margins, fastest = phase.astype(jnp.int32), 2 * m, jnp.maximum(-gamma, 0.0)
     if mu is not None:
-        phase = mode_rows(Phases(phase, no_modes(m, x.dtype)))
-        watched, fastest = 3 * m, jnp.concatenate([fastest, slip])
-    flight = first_flight(system, state, phase[:, None], watched, times)
+        phase = mode_rows(ContactModes(phase, no_modes(m, x.dtype)))
+        margins, fastest = 3 * m, jnp.concatenate([fastest, slip])
+    flight = first_flight(system, state, phase[:, None], margins, times)
     contacts = contacts_at(system, state.q, state.v, state.t, False)
     stable = stable_step(force, flight.aim.modes, contacts, state)
     flight = toward_sample(flight, times, jnp.minimum(flight.free, stable))
     flight = flight._replace(event=flight.event.at[:m].set(True))  # friction is to be decided
     return _CompliantRun(
-        flight,
-        jax.lax.stop_gradient(fastest),
-        empty_table(problem, state, max_events),
-        jnp.int32(0),
-        status_at_start(system, state, times[-1], jnp.inf),
-        jnp.all((phase[:m] == Phase.OPEN) & (gamma >= 0)),
-        jnp.full_like(state.t, -jnp.inf),
+        flight=flight,
+        fastest=jax.lax.stop_gradient(fastest),
+        table=empty_table(problem, state, max_events),
+        event_count=jnp.int32(0),
+        status=status_at_start(system, state, times[-1], jnp.inf),
+        apart=jnp.all((phase[:m] == Phase.OPEN) & (gamma >= 0)),
+        vanished=jnp.full_like(state.t, -jnp.inf),
     )
 
 
-def _rates(problem: MotionProblem, at: State) -> tuple[jax.Array, jax.Array]:
-    """Gap velocities (m,) and speeds of slip (m,), 0 without friction."""
+def _rates(problem: MotionProblem, at: State) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """Gap velocities f' and speeds of slip |u| [m/s], these 0 without friction."""
     normal, tangent = kinematics(problem.system, at.q, at.v, at.t, problem.mu is not None)
     if tangent is None:
         return normal.rate, jnp.zeros_like(normal.rate)
@@ -181,66 +175,77 @@ def _rates(problem: MotionProblem, at: State) -> tuple[jax.Array, jax.Array]:
 
 
 def _with_friction(problem: MotionProblem, run: _CompliantRun) -> _CompliantRun:
-    """Which contacts stick or slide, decided anew after an event."""
+    """Run with new modes of friction after an event: contacts whose force acts stick or slide.
+
+    Contacts with slip slide. All others stick if forces with normal forces F of the law hold them:
+    `|a_t| <= within` at `|lambda_t| <= mu F`; else modes solve `choose_with_friction` for given
+    normal forces. Without an event modes remain.
+    """
     system, force, mu, settings, *_ = problem
     if mu is None:
         return run
     at, m, event = run.flight.state, problem.contacts, run.flight.event
 
-    def decided() -> tuple[jax.Array, jax.Array]:
-        """Modes, and whether they were found."""
-        phase, side = phases_of(run.flight.aim.modes, at)
+    def decided() -> tuple[Int[Array, "k 1"], Bool[Array, ""]]:
+        """Rows of the new modes, and true if they are consistent."""
+        phase, before = contact_modes(run.flight.aim.modes, at)
         contacts = contacts_at(system, at.q, at.v, at.t, True)
-        known = with_normal_forces(contacts, normal_forces(force, phase, contacts, at))
+        pushed = with_normal_forces(contacts, normal_forces(force, phase, contacts, at))  # by F
         scale, slip = jnp.max(run.fastest), _rates(problem, at)[1]
-        stopped = slip_stops(settings, side, event[2 * m :], slip, scale)
-        let_go = (event[2 * m :] & side.stick) | stopped
+        stopped = slip_stops(settings, before, event[2 * m :], slip, scale)
+        let_go = (event[2 * m :] & before.stick) | stopped  # friction has reached its limit
         released = jnp.concatenate([jnp.zeros_like(let_go), let_go])
-        fastest = jnp.max(jnp.abs(known.approach))
+        fastest = jnp.max(jnp.abs(pushed.approach))  # largest acceleration: a share is rounding
         rest = not_rounding(REST_SPEED, slip.dtype) * scale + velocity_noise(settings, fastest)
         slides, slack = (slip > rest) & ~stopped, rest_acceleration(slip.dtype) * fastest
         acts = loaded(phase)
-        choice = choose_with_friction(known, mu, side, acts, released, slides, slack)
+        choice = choose_with_friction(pushed, mu, before, acts, released, slides, slack)
         # corners that sink in differently are nearly redundant: they stick where the forces of the
         # flow, which share what they hold, can hold them
-        assert known.tangent is not None
-        moves = direction(by_contact(known.tangent.rate, m))
+        assert pushed.tangent is not None
+        moves = direction(by_contact(pushed.tangent.rate, m))  # of the slip
         sticking = Modes(acts, acts & ~slides, jnp.where(slides, moves[:, 0], 1.0))
         if settings.spatial:
             sticking = sticking._replace(sign=jnp.ones_like(sticking.sign))
-        held = forces(known, mu, sticking, jnp.where(slides[:, None], moves, 0.0))
-        left = cone_margins(known, mu, held)
-        within = WITHIN * friction_acceleration(known, mu, held.normal)
+        held = forces(pushed, mu, sticking, jnp.where(slides[:, None], moves, 0.0))
+        left = cone_margins(pushed, mu, held)  # [m/s^2] to the rim
+        within = WITHIN * friction_acceleration(pushed, mu, held.normal)
         # what passes the flat position turns: no forces hold both of its corners
         assert held.tangential is not None
         both = jnp.concatenate([held.normal, held.tangential])
-        growth = length(by_contact((known.approach + known.delassus @ both)[m:], m))
+        # slip acceleration of contacts that stick: not 0 where forces cannot hold them
+        growth = length(by_contact((pushed.approach + pushed.delassus @ both)[m:], m))
         holds = (growth <= within) & (left >= jnp.where(let_go, within, 0.0))
         sticks = jnp.all(~sticking.stick | holds)
         chosen = selected(sticks, sticking, choice.modes)
         if settings.spatial:  # a force that changes as fast as in a contact has slip begin at once
             chosen = chosen._replace(sign=jnp.ones_like(chosen.sign))
-        return mode_rows(Phases(phase, chosen))[:, None], choice.consistent | sticks
+        return mode_rows(ContactModes(phase, chosen))[:, None], choice.consistent | sticks
 
     old = run.flight.aim.modes, jnp.asarray(True)
-    asked = jnp.any(event)
-    modes, found = selected(asked, jax.lax.cond(any_lane(asked), decided, lambda: old), old)
-    status = jnp.where(found, run.status, CODE["no_contact_force"]).astype(jnp.int32)
+    happened = jnp.any(event)
+    new = jax.lax.cond(any_lane(happened), decided, lambda: old)
+    modes, consistent = selected(happened, new, old)
+    status = jnp.where(consistent, run.status, CODE["no_contact_force"]).astype(jnp.int32)
     aim = run.flight.aim._replace(modes=modes)
     return run._replace(flight=run.flight._replace(aim=aim), status=status)
 
 
 def _one_pass(max_events: int, problem: MotionProblem, run: _CompliantRun) -> _CompliantRun:
-    """One pass of the stepper, and what it shows."""
+    """Run after one pass of the stepper, with its state as next sample, and its event if any.
+
+    Events: contacts that close or open, and friction that turns from sticking to slip or stops.
+    """
     run = _with_friction(problem, run)
     system, times, flight, m = problem.system, problem.times, run.flight, problem.contacts
     flow = compliant_flow(problem, flight.state, flight.aim.modes, run.fastest)
     settings = problem.settings
+    # errors of time and works, then of indentations and impulses by the scales of the contacts
     ledger = allowed_errors(system, settings, flight.state, 1.0)[: -flight.state.contact.size]
     depth, impulse = flow.scales.depth, flow.scales.impulse
     sizes = [depth, *[impulse] * (len(flight.state.contact) - 1)]
-    rows = jnp.concatenate([ledger, settings.rtol * jnp.concatenate(sizes)])
-    flown, _ = one_pass(flow, settings, rows, times, flight)
+    allowed = jnp.concatenate([ledger, settings.rtol * jnp.concatenate(sizes)])
+    flown, _ = one_pass(flow, settings, allowed, times, flight)
     before, after = flight.aim.modes[:m, 0], flown.aim.modes[:m, 0]
     was_open, is_open = before == Phase.OPEN, after == Phase.OPEN
     closed, opened = was_open & ~is_open, ~was_open & is_open
@@ -248,50 +253,52 @@ def _one_pass(max_events: int, problem: MotionProblem, run: _CompliantRun) -> _C
     fastest, none = jnp.maximum(-gamma, 0.0), jnp.zeros(m, bool)
     turned, stopped, vanished = none, none, run.vanished
     if problem.mu is not None:
-        side = phases_of(flight.aim.modes, flown.state).side
-        flown, vanished = _ended_slip(problem, run, flown, side, slip)
+        friction = contact_modes(flight.aim.modes, flown.state).friction
+        flown, vanished = _ended_slip(problem, run, flown, friction, slip)
         fired = flown.event[2 * m :]
-        stopped = slip_stops(settings, side, fired, slip, flow.scales.slip)
-        turned, fastest = (fired & side.stick) | stopped, jnp.concatenate([fastest, slip])
+        stopped = slip_stops(settings, friction, fired, slip, flow.scales.slip)
+        turned, fastest = (fired & friction.stick) | stopped, jnp.concatenate([fastest, slip])
         flown = flown._replace(state=flow.stopped(stopped, flown.state))
     at = flown.state
     happened = jnp.any(closed | opened | turned)
-    full = happened & (run.event_count >= max_events)
+    full = happened & (run.event_count >= max_events)  # no row is left
     written = happened & ~full
     status = jnp.where(full, CODE["max_events"], run.status)
-    status = jnp.where(flown.stuck, why_stuck(system, flown, problem.q0, times), status)
     kind = jnp.where(jnp.any(opened), KIND_CODE["detachment"], KIND_CODE["friction"])
     kind = jnp.where(jnp.any(closed), KIND_CODE["contact"], kind)
     some = (closed | opened | turned).astype(kind.dtype)
-    marks = jnp.concatenate([jnp.stack([kind, 0 * kind]), some])
-    index = jnp.where(written, run.event_count, max_events)
-    table = MotionTable(
-        put(run.table.samples, packed(at)[:, 0], flight.sample),
-        put(run.table.events, _event(problem, at, opened), index),
-        put(run.table.marks, marks, index),
-    )
+    marks = jnp.concatenate([jnp.stack([kind, 0 * kind]), some])  # no status of a law
+    row = jnp.where(written, run.event_count, max_events)
+    table = run.table.with_sample(at, flight.sample)
     return _CompliantRun(
-        flown,
-        jax.lax.stop_gradient(jnp.maximum(run.fastest, fastest)),
-        table,
-        run.event_count + written.astype(jnp.int32),
-        status.astype(jnp.int32),
-        jnp.all((after == Phase.OPEN) & (gamma >= 0)),
-        vanished,
+        flight=flown,
+        fastest=jax.lax.stop_gradient(jnp.maximum(run.fastest, fastest)),
+        table=table.with_event(_event(problem, at, opened), marks, row),
+        event_count=run.event_count + written.astype(jnp.int32),
+        status=status.astype(jnp.int32),
+        apart=jnp.all((after == Phase.OPEN) & (gamma >= 0)),
+        vanished=vanished,
     )
 
 
 def _ended_slip(
-    problem: MotionProblem, run: _CompliantRun, flown: Flight, side: Modes, slip: jax.Array
-) -> tuple[Flight, jax.Array]:
-    """Slip (m,) that has nearly ended where steps vanish ends, and when () [s] that last was so.
+    problem: MotionProblem,
+    run: _CompliantRun,
+    flown: Flight,
+    friction: Modes,
+    slip: Float[Array, " m"],
+) -> tuple[Flight, Float[Array, ""]]:
+    """Flight in which slip of at most STOPPED of the scale ends where steps vanish, and that time.
+
+    `friction`: modes of the step; `slip`: its speeds [m/s] at the end. The time [s] is
+    `run.vanished` unless this happens now; not twice at one instant.
 
     A body that turns on one corner drags another through its end of slip. There friction turns
     round at once, and with it the force that holds the first corner: no step lands on its cone.
     """
     m, most = problem.contacts, problem.settings.max_steps
     scale = jnp.maximum(jnp.max(run.fastest), jnp.max(slip))
-    ends = side.active & ~side.stick & (slip <= STOPPED * scale)
+    ends = friction.active & ~friction.stick & (slip <= STOPPED * scale)
     vanished = flown.stuck & (flown.steps < most) & (flown.state.t > run.vanished)
     here = vanished & jnp.any(ends)
     event = flown.event.at[2 * m :].set(ends)
@@ -300,8 +307,8 @@ def _ended_slip(
     return selected(here, again, flown), jnp.where(here, flown.state.t, run.vanished)
 
 
-def _event(problem: MotionProblem, at: State, opened: jax.Array) -> jax.Array:
-    """Numbers of an event: the impulse of contacts that have `opened` (m,); velocities go on."""
+def _event(problem: MotionProblem, at: State, opened: Bool[Array, " m"]) -> Float[Array, " w"]:
+    """Row of an event: impulses of contacts that have `opened`; velocities do not jump."""
     none = no_jump(at, problem.contacts, problem.tangents)
     zero, (push, *tangential) = jnp.zeros_like(at.t), jnp.where(opened, at.contact[1:], 0.0)
     jump = none._replace(impulse=push)

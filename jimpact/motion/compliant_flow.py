@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
 
 from jimpact.events.contact_flow import Phase
 from jimpact.laws.forces import Force
@@ -49,25 +50,29 @@ SLOWEST = 1e-12  # [m/s] scale of contacts that have not moved yet; any small on
 
 
 class ContactScales(NamedTuple):
-    """Scales of each contact (m,), from its fastest approach so far."""
+    """Scales of each contact, from its fastest approach so far."""
 
-    speed: jax.Array  # [m/s]
-    depth: jax.Array  # [m] indentation at that speed
-    force: jax.Array  # [N] at that indentation
-    onset: jax.Array  # of `Force.onset`, of the dimension that it has
-    impulse: jax.Array  # [N s]
-    slip: jax.Array  # () [m/s] of the whole motion so far
-
-
-class Phases(NamedTuple):
-    """Of each contact (m,): its phase, and how it slides or sticks while its force acts."""
-
-    phase: jax.Array
-    side: Modes
+    speed: Float[Array, " m"]  # [m/s]
+    depth: Float[Array, " m"]  # [m] indentation at that speed
+    force: Float[Array, " m"]  # [N] at that indentation
+    onset: Float[Array, " m"]  # of `Force.onset`, of the dimension that it has
+    impulse: Float[Array, " m"]  # [N s]
+    slip: Float[Array, ""]  # [m/s] of the whole motion so far
 
 
-def _contact_scales(force: Force, contacts: Contacts, fastest: jax.Array) -> ContactScales:
-    """The scales that belong to these speeds (m,) of approach, and of slip after them."""
+class ContactModes(NamedTuple):
+    """Phase of each contact, and its mode of friction, which is active while the force acts."""
+
+    phase: Int[Array, " m"]  # `contact_flow.Phase`: open, compression, expansion, slack
+    friction: Modes
+
+
+def _contact_scales(force: Force, contacts: Contacts, fastest: Float[Array, " s"]) -> ContactScales:
+    """Scales of contacts from their largest gap velocities, and slips after them [m/s] (m or 2 m).
+
+    Equation: the indentation x that stores the energy `speed^2 / (2 W_jj)`, the force F(x, 0), the
+    impulse `speed / W_jj`.
+    """
     m = len(contacts.normal.rate)
     w, slip = jnp.diagonal(contacts.delassus)[:m], jnp.maximum(jnp.max(fastest), SLOWEST)
     speed = jnp.maximum(fastest[:m], SLOWEST)
@@ -77,7 +82,7 @@ def _contact_scales(force: Force, contacts: Contacts, fastest: jax.Array) -> Con
 
 
 class CompliantFlow(MotionFlow):
-    """Forces of contacts of which each is open, in compression, in expansion, or slack.
+    """Flow with contact forces; each contact is open, in compression, in expansion, or slack.
 
     Equation: `M q'' = (loads) + N F(x, x') + H lambda_t`, `x' = -f'` (in expansion `-f' / e^2`);
     `lambda_t` holds contacts that stick (`h'' = 0`), and is `-mu F u / |u|` at those that slide.
@@ -92,27 +97,37 @@ class CompliantFlow(MotionFlow):
     scales: ContactScales
 
     @property
-    def speed_scale(self) -> jax.Array:
+    def speed_scale(self) -> Float[Array, ""]:
         """The largest gap velocity or slip so far."""
         return self.scales.slip
 
-    def constants(self, modes: jax.Array) -> Phases:
-        """Phases and friction."""
-        return phases_of(modes, self.like)
+    def constants(self, modes: Int[Array, "k 1"]) -> ContactModes:
+        """Phases and modes of friction from their rows."""
+        return contact_modes(modes, self.like)
 
-    def pushed(self, const: Phases, at: State) -> tuple[Contacts, Forces]:
-        """Contact space with the normal forces that act, and the forces."""
+    def contact_forces(self, const: ContactModes, at: State) -> tuple[Contacts, Forces]:
+        """Contact space with the normal forces F of the law, and all forces.
+
+        Tangential ones keep the modes of friction, `M v' = (loads) + N F + H lambda_t`.
+        """
         contacts = self.contacts(at)
         push = normal_forces(self.force, const.phase, contacts, at)
         if self.mu is None:
             return contacts, Forces(push, None, contacts.free + contacts.moved @ push)
         known = with_normal_forces(contacts, push)
-        return known, forces(known, self.mu, const.side, self.slip(const.side, known))
+        slip = self.slip(const.friction, known)
+        return known, forces(known, self.mu, const.friction, slip)
 
-    def field(self, const: Phases, modes: jax.Array, y: jax.Array) -> jax.Array:
-        """Rates of the state."""
+    def field(
+        self, const: ContactModes, modes: Int[Array, "k 1"], y: Float[Array, "some 1"]
+    ) -> Float[Array, "rows 1"]:
+        """Rates of q, v, t, of the works, and of each contact: indentation, impulses.
+
+        Equation: as of the class; powers `F . v` of loads, `lambda_n f'` and `lambda_t . u` of
+        contacts; `x' = -f'`, p' = lambda.
+        """
         at = unpacked(self.like, y)
-        contacts, force = self.pushed(const, at)
+        contacts, force = self.contact_forces(const, at)
         gamma, push = contacts.normal.rate, force.normal
         closing = _unloading(self.force, const.phase, -gamma)
         friction, base = contact_powers(self.system, contacts, force, at.t)
@@ -128,31 +143,46 @@ class CompliantFlow(MotionFlow):
             contact_work=jnp.stack([push * gamma, friction]),
             contact=jnp.stack(remembered),
         )
-        return jnp.concatenate(self.rows_of(rates, at, const.side, contacts, force))
+        return jnp.concatenate(self.rows_of(rates, at, const.friction, contacts, force))
 
-    def along_tangents(self, tangential: jax.Array) -> jax.Array:
-        """Tangential forces, in space along the tangents of the body."""
+    def along_tangents(self, tangential: Float[Array, " t"]) -> Float[Array, " t"]:
+        """Tangential forces along the tangents of the body, from those along `axes`."""
         if self.axes is None:
             return tangential
         each = by_contact(tangential, len(self.axes.along))
         return jnp.einsum("mj,mjk->mk", each, slip_frames(self.axes.along)).reshape(-1)
 
-    def margins(self, const: Phases, modes: jax.Array, y: jax.Array) -> jax.Array:
-        """Where a gap closes, a force ends or returns; where compression or friction turns."""
+    def margins(
+        self, const: ContactModes, modes: Int[Array, "k 1"], y: Float[Array, "some 1"]
+    ) -> Float[Array, "margins 1"]:
+        """Rows of `_normal_margins`, with friction of `friction_margins`, and of the sample."""
         at = unpacked(self.like, y)
         if self.mu is None:
             rate = kinematics(self.system, at.q, at.v, at.t)[0].rate
             return self.from_margins(self._normal_margins(const.phase, rate, at.contact[0]), at)
-        contacts, force = self.pushed(const, at)
+        contacts, force = self.contact_forces(const, at)
         normal = self._normal_margins(const.phase, contacts.normal.rate, at.contact[0])
         zero = jnp.zeros_like(at.t)
-        side = friction_margins(
-            contacts, self.mu, const.side, force, zero + 1, zero, self.scales.slip
+        friction = friction_margins(
+            contacts, self.mu, const.friction, force, zero + 1, zero, self.scales.slip
         )
-        return self.from_margins(jnp.concatenate([normal, side]), at)
+        return self.from_margins(jnp.concatenate([normal, friction]), at)
 
-    def _normal_margins(self, const: jax.Array, rate: jax.Array, x: jax.Array) -> jax.Array:
-        """By indentation, then by velocity (2 m,)."""
+    def _normal_margins(
+        self, const: Int[Array, " m"], rate: Float[Array, " m"], x: Float[Array, " m"]
+    ) -> Float[Array, " 2*m"]:
+        """Margins of phases `const`: m by the indentation x [m], then m by the gap velocity [m/s].
+
+        | phase | by x | by gap velocity |
+        |---|---|---|
+        | open | -x: the gap closes | 1 |
+        | compression | 1 | -f': it turns to expansion |
+        | expansion | x: it opens | f': it is compressed again |
+
+        With a force that may vanish at x > 0 (`slackens`) the first margin is `Force.onset` in
+        compression, minus that where slack, and the second one x: the contact opens at x = 0. All
+        are in units of the scales.
+        """
         gamma, depth = rate / self.scales.speed, x / self.scales.depth
         if self.force.slackens:
             onset = self.force.onset(jnp.where(x >= 0, x, 0.0), -rate) / self.scales.onset
@@ -164,8 +194,8 @@ class CompliantFlow(MotionFlow):
         by_x = jnp.where(const == Phase.OPEN, -depth, by_x)
         return jnp.concatenate([by_x, jnp.where(const == Phase.OPEN, 1.0, by_g)])
 
-    def rooted(self, modes: jax.Array) -> jax.Array:
-        """Openings, by the root of the indentation."""
+    def rooted(self, modes: Int[Array, "k 1"]) -> Bool[Array, "margins 1"]:
+        """True for margins of opening: landings on them step in the root of the indentation."""
         phase = self.constants(modes).phase[:, None]
         opens = phase == Phase.EXPANSION
         by_g = (phase == Phase.COMPRESSION) & self.force.slackens
@@ -173,10 +203,17 @@ class CompliantFlow(MotionFlow):
         return jnp.concatenate([opens, by_g, rest])
 
     def switch(
-        self, modes: jax.Array, y: jax.Array, which: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """Phases after an event; a contact that closes or opens has no indentation."""
-        at, (phase, side) = unpacked(self.like, y), self.constants(modes)
+        self,
+        modes: Int[Array, "k 1"],
+        y: Float[Array, "rows 1"],
+        which: Bool[Array, "margins 1"],
+    ) -> tuple[Int[Array, "k 1"], Float[Array, "rows 1"]]:
+        """Modes and state after the events `which`; a contact that closes or opens has x = 0.
+
+        Phases change as `_normal_margins` says; friction that sets in with a force is decided by
+        `compliant_contact`.
+        """
+        at, (phase, friction) = unpacked(self.like, y), self.constants(modes)
         m = len(phase)
         by_x, by_g = which[:m, 0], which[m : 2 * m, 0]
         closed = by_x & (phase == Phase.OPEN)
@@ -198,29 +235,33 @@ class CompliantFlow(MotionFlow):
         rows = after
         if self.mu is not None:  # friction starts anew with the force
             keeps = loaded(phase) & loaded(after)
-            rows = mode_rows(Phases(after, side._replace(active=keeps)))
+            rows = mode_rows(ContactModes(after, friction._replace(active=keeps)))
         state = packed(at._replace(contact=contact))
-        state = jnp.concatenate([state, y[len(state) :]])  # and spare rows as they are
+        state = jnp.concatenate([state, y[len(state) :]])  # `error_only_rows` stay as they are
         return rows[:, None].astype(modes.dtype), state
 
-    def begins(self, before: jax.Array, after: jax.Array) -> jax.Array:
-        """Where a force sets in."""
+    def begins(self, before: Int[Array, "k 1"], after: Int[Array, "k 1"]) -> Bool[Array, "1 1"]:
+        """True where the force of a contact sets in: it was open or slack, and is compressed."""
         before, after = (self.constants(x).phase[:, None] for x in (before, after))
         free = (before == Phase.OPEN) | (before == Phase.SLACK)
         return any_of((after == Phase.COMPRESSION) & free)
 
-    def projected(self, const: Phases, at: State) -> tuple[State, jax.Array]:
-        """Slip of contacts that stick set to 0, in the metric of M; normals may turn."""
-        new = at if self.mu is None else self.without_slip(const.side, at)
+    def projected(self, const: ContactModes, at: State) -> tuple[State, Bool[Array, " none"]]:
+        """State without slip of contacts that stick, see `without_slip`; no normal jumps here."""
+        new = at if self.mu is None else self.without_slip(const.friction, at)
         return new, jnp.zeros(0, bool)
 
-    def stopped(self, which: jax.Array, at: State) -> State:
-        """Slip of contacts (m,) set to 0."""
+    def stopped(self, which: Bool[Array, " m"], at: State) -> State:
+        """State without slip of these contacts, see `without_slip`."""
         one = jnp.ones_like(at.contact_work[0])
         return self.without_slip(Modes(which, which, one), at, straight=False)
 
     def without_slip(self, modes: Modes, at: State, straight: bool = True) -> State:
-        """Slip of contacts that stick set to 0, and what of it is across where it ends."""
+        """State in which contacts that stick have slip 0: `v += M^-1 H p`, the least change by M.
+
+        Where `straight`, slip across its direction is set to 0, too, of contacts whose slip begins
+        or ends in this step.
+        """
         contacts = self.contacts(at)
         known = with_normal_forces(contacts, jnp.zeros_like(contacts.normal.rate))
         assert known.tangent is not None
@@ -232,68 +273,90 @@ class CompliantFlow(MotionFlow):
         return at._replace(v=at.v + contacts.moved @ p)
 
 
-def loaded(phase: jax.Array) -> jax.Array:
-    """Whether the force of a contact acts."""
+def loaded(phase: Int[Array, "*m"]) -> Bool[Array, "*m"]:
+    """True where the force of a contact acts: in compression and expansion."""
     return (phase == Phase.COMPRESSION) | (phase == Phase.EXPANSION)
 
 
-def normal_forces(force: Force, phase: jax.Array, contacts: Contacts, at: State) -> jax.Array:
-    """Forces (m,) [N] of contacts in these phases."""
+def normal_forces(
+    force: Force, phase: Int[Array, " m"], contacts: Contacts, at: State
+) -> Float[Array, " m"]:
+    """Normal forces F(x, -f') >= 0 [N] of the loaded contacts, 0 of others."""
     x = at.contact[0]
     push = force.force(jnp.where(x >= 0, x, 0.0), -contacts.normal.rate)
     return jnp.where(loaded(phase), jnp.maximum(push, 0.0), 0.0)
 
 
-def phases_of(modes: jax.Array, like: State) -> Phases:
-    """The phases of such rows (m, 1) of modes, with friction (3 m, 1)."""
+def contact_modes(modes: Int[Array, "k 1"], like: State) -> ContactModes:
+    """Phases and modes of friction from their rows: phase (m), with friction stick, sign (3 m)."""
     m = like.contact_work.shape[1]
     phase = modes[:m, 0]
     none = no_modes(m, like.q.dtype)
     if len(modes) == m:
-        return Phases(phase, none)
+        return ContactModes(phase, none)
     stick, sign = modes[m:, 0].reshape(2, -1)
     acts = loaded(phase) & ((stick > 0) | (sign != 0))
-    return Phases(phase, Modes(acts, stick > 0, sign.astype(none.sign.dtype)))
+    return ContactModes(phase, Modes(acts, stick > 0, sign.astype(none.sign.dtype)))
 
 
-def mode_rows(now: Phases) -> jax.Array:
-    """Rows (3 m,) of modes with friction; 0 where none acts."""
-    friction = jnp.stack([x.astype(jnp.int32) for x in now.side[1:]])
-    friction = jnp.where(now.side.active, friction, 0)
+def mode_rows(now: ContactModes) -> Int[Array, " rows"]:
+    """Rows (3 m) of phases and of friction: phase, stick, sign; both 0 where no friction acts."""
+    friction = jnp.stack([x.astype(jnp.int32) for x in now.friction[1:]])
+    friction = jnp.where(now.friction.active, friction, 0)
     return jnp.concatenate([now.phase.astype(jnp.int32), *friction])
 
 
 def compliant_flow(
-    problem: MotionProblem, at: State, modes: jax.Array, fastest: jax.Array
+    problem: MotionProblem, at: State, modes: Int[Array, "k 1"], fastest: Float[Array, " s"]
 ) -> CompliantFlow:
-    """The flow from this state on, on the scales of the contacts so far."""
+    """Flow from this state on; `fastest`: largest approach, then slip, of each contact [m/s].
+
+    Roundings of margins: SNAP of the tolerance, or velocities that arise within the rounding of
+    time; of friction a share of the largest force or slip.
+    """
     system, force, mu, settings, _, _, times, m, _ = problem
     contacts = contacts_at(system, at.q, at.v, at.t, mu is not None)
     scales = _contact_scales(force, contacts, fastest)
-    share, axes = jnp.full(m, SNAP * settings.rtol, at.q.dtype), None
+    axes, by_depth = None, jnp.full(m, SNAP * settings.rtol, at.q.dtype)
     noise = velocity_noise(settings, jnp.max(jnp.abs(contacts.approach)))
-    share = jnp.concatenate([share, jnp.maximum(share, noise / scales.speed)])
+    rounding = jnp.concatenate([by_depth, jnp.maximum(by_depth, noise / scales.speed)])
     if mu is not None:
-        phase, now = phases_of(modes, at)
+        phase, now = contact_modes(modes, at)  # now: modes of friction
         push = normal_forces(force, phase, contacts, at)
         known = with_normal_forces(contacts, push)
         if settings.spatial:
             axes = slip_axes(known, mu, now, scales.slip)
-        most = friction_acceleration(known, mu, jnp.maximum(scales.force, push))
+        largest = friction_acceleration(known, mu, jnp.maximum(scales.force, push))
         by_slip = now.active & ~now.stick
         rest = rest_acceleration(at.q.dtype)
-        side = jnp.where(by_slip, jnp.maximum(rest * scales.slip, noise), rest * most)
-        share = jnp.concatenate([share, side])
-    rounded, longest = roundings(settings, share, times), longest_step(system, times)
+        friction = jnp.where(by_slip, jnp.maximum(rest * scales.slip, noise), rest * largest)
+        rounding = jnp.concatenate([rounding, friction])
+    rounded, longest = roundings(rounding, times), longest_step(system, times)
     longest = jnp.minimum(longest, stable_step(force, modes, contacts, at))
     blank = jnp.zeros((len(packed(at)), 1), at.q.dtype)
     return CompliantFlow(
-        system, rounded, times[0], settings.rtol, blank, at, longest, mu, axes, force, scales
+        system=system,
+        rounding=rounded,
+        sample=times[0],
+        rtol=settings.rtol,
+        sizes=blank,
+        like=at,
+        longest=longest,
+        mu=mu,
+        axes=axes,
+        force=force,
+        scales=scales,
     )
 
 
-def stable_step(force: Force, modes: jax.Array, contacts: Contacts, at: State) -> jax.Array:
-    """How long a step may be () [s] beside the stiffness and damping of the loaded contacts."""
+def stable_step(
+    force: Force, modes: Int[Array, "k 1"], contacts: Contacts, at: State
+) -> Float[Array, ""]:
+    """Longest stable step [s] with the stiffness dF/dx and damping dF/dx' of loaded contacts.
+
+    Equation: `STABLE / max(omega, delta)`, bounds by row sums of |W|:
+    `omega^2 = max_i sum_j |W_ij| dF_j/dx`, `delta = max_i sum_j |W_ij| dF_j/dx'`.
+    """
     x, rate, m = at.contact[0], -contacts.normal.rate, len(at.contact[0])
     phase, one = modes[:m, 0], jnp.ones_like(x)
     x = jnp.where(x >= 0, x, 0.0)
@@ -306,8 +369,13 @@ def stable_step(force: Force, modes: jax.Array, contacts: Contacts, at: State) -
     return jnp.where(fastest > 0, STABLE / jnp.where(fastest > 0, fastest, 1.0), jnp.inf)
 
 
-def _unloading(force: Force, phase: jax.Array, rate: jax.Array) -> jax.Array:
-    """Rates (m,) of indentation, or of what goes with it, faster in plastic expansion."""
+def _unloading(
+    force: Force, phase: Int[Array, " m"], rate: Float[Array, " m"]
+) -> Float[Array, " m"]:
+    """`rate` in compression, `rate / e^2` in plastic expansion: of the indentation or stiffness.
+
+    e is the coefficient of the bistiffness, by which unloading is stiffer.
+    """
     if force.bistiffness is None:
         return rate
     e = jnp.where(force.bistiffness.restitution > 0, force.bistiffness.restitution, 1.0)

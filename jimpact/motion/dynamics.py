@@ -1,83 +1,106 @@
-"""Gaps, their rates and accelerations, and the acceleration that forces alone give."""
+"""Gaps, their rates and accelerations, and the acceleration that forces alone give.
+
+Dimensions of arrays in this folder: nq coordinates q, n velocities v (nq = n but for bodies with
+quaternions), m contacts, t tangential directions (m in the plane, 2 m in space), k = m + t rows of
+contact space.
+"""
 
 from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
 
 from jimpact.motion.system import System
 from jimpact.numerics.dense import solve_mass_matrix
 from jimpact.tools.compiling import full_precision
 from jimpact.tools.precision import precision
 
+Mass = Float[Array, " n"] | Float[Array, "n n"]  # M, its diagonal or all of it
+
 
 def not_rounding(share: float, dtype: jnp.dtype) -> float:
-    """A share that counts as 0, in single precision that of a few roundings."""
+    """The larger one of `share` and 4 eps: a smaller share of a number is rounding."""
     return max(share, precision(dtype).rounding)
 
 
 class Kinematics(NamedTuple):
-    """Of the m contacts at one instant; `rate' = grad^T q'' + drift`."""
+    """Gaps of the contacts, or displacements along their tangents, and derivatives in time.
 
-    value: jax.Array  # (m,) gaps; 0 of what slides
-    rate: jax.Array  # (m,) as seen from the base
-    drift: jax.Array  # (m,) second derivative for q'' = 0
-    gradient: jax.Array  # (n, m)
+    Equation: `rate = gradient^T (v - B y_b')`, `d rate / dt = gradient^T v' + drift`.
+    """
+
+    value: Float[Array, " d"]  # gaps [m]; 0 of tangential displacements, of which only rates count
+    rate: Float[Array, " d"]  # [m/s] as seen from the base
+    drift: Float[Array, " d"]  # [m/s^2] derivative of the rate for v' = 0
+    gradient: Float[Array, "n d"]
 
 
-def base_velocity(system: System, t: jax.Array) -> jax.Array | None:
-    """`B y_b'(t)` (n,), None without a base."""
+def base_velocity(system: System, t: Float[Array, ""]) -> Float[Array, " n"] | None:
+    """Velocity `B y_b'(t)` of a moving base in all coordinates [m/s]; None without a base."""
     if system.base is None:
         return None
     return jax.jvp(lambda s: _displaced(system, s), (t,), (jnp.ones_like(t),))[1]
 
 
-def carried_along(system: System, v: jax.Array, t: jax.Array) -> jax.Array:
-    """Velocity of the base (n,), 0 without one."""
+def carried_along(system: System, v: Float[Array, " n"], t: Float[Array, ""]) -> Float[Array, " n"]:
+    """Velocity `B y_b'(t)` of the base [m/s], 0 without one."""
     velocity = base_velocity(system, t)
     return jnp.zeros_like(v) if velocity is None else velocity
 
 
 @full_precision
-def _displaced(system: System, t: jax.Array) -> jax.Array:
-    """Displacement of the base `B y_b(t)` (n,)."""
+def _displaced(system: System, t: Float[Array, ""]) -> Float[Array, " n"]:
+    """Displacement `B y_b(t)` of the base in all coordinates [m]."""
     assert system.base is not None
     assert system.base_directions is not None
     return system.base_directions @ jnp.atleast_1d(system.base(t))
 
 
 @full_precision
-def seen_from_base(system: System, q: jax.Array, t: jax.Array) -> jax.Array:
-    """The configuration, displaced by `-B y_b(t)`."""
+def seen_from_base(
+    system: System, q: Float[Array, " nq"], t: Float[Array, ""]
+) -> Float[Array, " nq"]:
+    """Configuration q displaced by `-B y_b(t)`: the one that an observer on the base sees."""
     return q if system.base is None else system.body.moved(q, -_displaced(system, t))
 
 
-def gaps(system: System, q: jax.Array, t: jax.Array) -> jax.Array:
-    """f (m,) [m]."""
+def gaps(system: System, q: Float[Array, " nq"], t: Float[Array, ""]) -> Float[Array, " m"]:
+    """Gaps f [m] of the configuration seen from the base."""
     return jnp.atleast_1d(system.body.gap_function(seen_from_base(system, q, t)))
 
 
 def is_pile(system: System) -> bool:
-    """Whether time stepping takes the closed contacts only."""
+    """True for a body of many contacts (`Bodies` with `room`), which stores only closed ones."""
     return system.body.pair_count is not None
 
 
-def recorded_gaps(system: System, q: jax.Array, t: jax.Array) -> jax.Array:
-    """Gaps (m,), of a pile the least one (1,)."""
+def recorded_gaps(
+    system: System, q: Float[Array, " nq"], t: Float[Array, ""]
+) -> Float[Array, " m"]:
+    """Gaps [m] of all contacts, which the record of a motion holds; of a pile the least alone."""
     if is_pile(system):
         return system.body.least_gap(seen_from_base(system, q, t))[None]
     return gaps(system, q, t)
 
 
 def kinematics(
-    system: System, q: jax.Array, v: jax.Array, t: jax.Array, friction: bool = False
+    system: System,
+    q: Float[Array, " nq"],
+    v: Float[Array, " n"],
+    t: Float[Array, ""],
+    friction: bool = False,
 ) -> tuple[Kinematics, Kinematics | None]:
-    """That of the gaps, and with friction that of what slides (its value is 0)."""
+    """Kinematics of the gaps, and with friction of the tangential displacements.
+
+    A body with formulas gives normals and tangents, whose derivative in time is the drift; of
+    other bodies gaps are differentiated twice.
+    """
     body = system.body
 
-    def tangents(at: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """What slides has no value."""
+    def tangents(at: Float[Array, " nq"]) -> tuple[Float[Array, " t"], Float[Array, "n t"]]:
+        """Tangents H (n, t), with 0 for the displacements along them."""
         h = body.tangents(at)
         assert h is not None
         return jnp.zeros_like(h[0]), h
@@ -86,8 +109,8 @@ def kinematics(
         normal = _differentiated(system, q, v, t)
         return normal, _along(system, q, v, t, tangents) if friction else None
 
-    def all_directions(at: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Gaps; normals, then tangents."""
+    def all_directions(at: Float[Array, " nq"]) -> tuple[Float[Array, " m"], Float[Array, "n d"]]:
+        """Gaps f (m,), and directions [N, H]: normals, then tangents where there is friction."""
         known = body.directions(at, friction)
         each = [x for x in known[1:] if x is not None]
         return known.gaps, jnp.concatenate(each, axis=1)
@@ -101,44 +124,53 @@ def kinematics(
     return normal, Kinematics(jnp.zeros_like(slip), slip, both.drift[m:], both.gradient[:, m:])
 
 
-def _differentiated(system: System, q: jax.Array, v: jax.Array, t: jax.Array) -> Kinematics:
-    """That of the gaps by two derivatives."""
+def _differentiated(
+    system: System, q: Float[Array, " nq"], v: Float[Array, " n"], t: Float[Array, ""]
+) -> Kinematics:
+    """Kinematics of the gaps by differentiation along (v, 1): f, f' and `drift = f''`."""
     here, along = _in_time(v, t)
 
-    def value_at(u: jax.Array, s: jax.Array) -> jax.Array:
-        """Gaps (m,) after the displacement u and the time s."""
+    def value_at(u: Float[Array, " n"], s: Float[Array, ""]) -> Float[Array, " m"]:
+        """Gaps f [m] after the displacement u from q and the time s from t."""
         return gaps(system, system.body.nearby(q, u), t + s)
 
-    def rates(u: jax.Array, s: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Gaps and gap velocities (m,) there."""
+    def gaps_and_rates(
+        u: Float[Array, " n"], s: Float[Array, ""]
+    ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+        """Gaps f [m] and their derivative f' [m/s] along (v, 1) at this displacement and time."""
         return jax.jvp(value_at, (u, s), along)
 
-    (value, rate), (_, drift) = jax.jvp(rates, here, along)
+    (value, rate), (_, drift) = jax.jvp(gaps_and_rates, here, along)
     return Kinematics(value, rate, drift, system.body.normals(seen_from_base(system, q, t)))
 
 
 def _in_time(
-    v: jax.Array, t: jax.Array
+    v: Float[Array, " n"], t: Float[Array, ""]
 ) -> tuple[tuple[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
-    """Displacement and time at an instant, 0, and their rates.
+    """Point (u, s) = (0, 0) of displacement and time, and its rate (v, 1), for `jax.jvp`.
 
-    Only the rates depend on v, so that different velocities at one q share all other operations.
+    Only the rate depends on v, so that different velocities at one q share all other operations.
     """
     return (jnp.zeros_like(v), jnp.zeros_like(t)), (v, jnp.ones_like(t))
 
 
 def _along(
     system: System,
-    q: jax.Array,
-    v: jax.Array,
-    t: jax.Array,
-    directions: Callable[[jax.Array], tuple[jax.Array, jax.Array]],
+    q: Float[Array, " nq"],
+    v: Float[Array, " n"],
+    t: Float[Array, ""],
+    directions: Callable[[Float[Array, " nq"]], tuple[Float[Array, " m"], Float[Array, "n d"]]],
 ) -> Kinematics:
-    """Velocities along the directions (n, k) that a function of q gives, with some values."""
+    """Kinematics along directions D (n, d) by one derivative: `rate = D^T (v - B y_b')`.
+
+    `directions`: configuration seen from the base -> values (m,), which are passed on, and D.
+    """
     here, along = _in_time(v, t)
 
-    def rates(u: jax.Array, s: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-        """Velocities (k,) after the displacement u and the time s; values, directions."""
+    def rates(
+        u: Float[Array, " n"], s: Float[Array, ""]
+    ) -> tuple[Float[Array, " d"], tuple[Float[Array, " m"], Float[Array, "n d"]]]:
+        """Rates `D^T (v - B y_b')` after the displacement u and the time s; values and D there."""
         value, h = directions(seen_from_base(system, system.body.nearby(q, u), t + s))
         carried = base_velocity(system, t + s)
         rate = h.T @ (v if carried is None else v - carried)
@@ -148,13 +180,13 @@ def _along(
     return Kinematics(value, rate, drift, h)
 
 
-def mass_at(system: System, q: jax.Array) -> jax.Array:
-    """M (n,) or (n, n)."""
+def mass_at(system: System, q: Float[Array, " nq"]) -> Mass:
+    """Mass matrix M(q) of the body [kg, kg m^2]."""
     return system.body.mass_matrix(q)
 
 
-def definite(mass: jax.Array) -> jax.Array:
-    """Whether M is positive definite."""
+def definite(mass: Mass) -> Bool[Array, ""]:
+    """True where M is positive definite: its Cholesky factorization is finite."""
     if mass.ndim == 1:
         return jnp.all(mass > 0)
     mass = jax.lax.stop_gradient(mass)
@@ -162,28 +194,37 @@ def definite(mass: jax.Array) -> jax.Array:
 
 
 @full_precision
-def kinetic(system: System, q: jax.Array, v: jax.Array) -> jax.Array:
+def kinetic(system: System, q: Float[Array, " nq"], v: Float[Array, " n"]) -> Float[Array, ""]:
     """`T = v^T M v / 2` [J]."""
     mass = mass_at(system, q)
     return 0.5 * v @ (mass * v if mass.ndim == 1 else mass @ v)
 
 
-def potential(system: System, q: jax.Array) -> jax.Array:
-    """V [J]."""
+def potential(system: System, q: Float[Array, " nq"]) -> Float[Array, ""]:
+    """Potential energy V(q) [J], 0 without a potential."""
     return jnp.zeros((), q.dtype) if system.potential is None else system.potential(q)
 
 
-def user_force(system: System, q: jax.Array, v: jax.Array, t: jax.Array) -> jax.Array:
-    """F (n,) without the forces of the potential."""
+def user_force(
+    system: System, q: Float[Array, " nq"], v: Float[Array, " n"], t: Float[Array, ""]
+) -> Float[Array, " n"]:
+    """Generalized force F(q, v, t) [N, N m] of the argument `force`, without that of V."""
     if system.force is None:
         return jnp.zeros_like(v)
     return jnp.asarray(system.force(q, v, t)).astype(v.dtype)
 
 
 def free_acceleration(
-    system: System, q: jax.Array, v: jax.Array, force: jax.Array, mass: jax.Array
-) -> jax.Array:
-    """v' (n,) without contact forces: `M v' = F - grad V + inertial forces`."""
+    system: System,
+    q: Float[Array, " nq"],
+    v: Float[Array, " n"],
+    force: Float[Array, " n"],
+    mass: Mass,
+) -> Float[Array, " n"]:
+    """Acceleration v' [m/s^2] without contact forces: `M v' = F - grad V + (inertial forces)`.
+
+    `force` is F, `mass` is M at q.
+    """
     total = force
     if system.potential is not None:
         total = total - system.body.pulled(q, jax.grad(system.potential)(q))

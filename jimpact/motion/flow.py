@@ -1,4 +1,10 @@
-"""Flights and persistent contact: an instance of the event-aligned stepper, `events/stepper.py`."""
+"""Flights and persistent contact: flows of the event-aligned stepper, `numerics/stepper.py`.
+
+A *flight* is the motion between two events. A *sample* is an instant at which the state is
+recorded; steps land on it. *Modes* are frozen in a step: see `persistent_contact.Modes`. *Margins*
+are quantities that stay positive while the modes hold; one that falls to 0 is an event. Rows of the
+stepper have a last axis for a batch, here of length 1.
+"""
 
 import abc
 import dataclasses
@@ -8,6 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, Int
 
 from jimpact.bodies.base import Body
 from jimpact.motion.dynamics import (
@@ -67,57 +74,65 @@ LOOKS = 64
 
 
 class State(NamedTuple):
-    """What is integrated: q, v, t, and work of forces, of the base, of each contact [J]."""
+    """State of a motion: q, v, t, and the work of forces, base and contacts since the start [J]."""
 
-    q: jax.Array
-    v: jax.Array
-    t: jax.Array  # ()
-    work: jax.Array  # ()
-    base_work: jax.Array  # ()
-    contact_work: jax.Array  # (2, m): normal, tangential
-    contact: jax.Array  # (2, m): indentation, impulse of compliant contacts; (0, m) of rigid ones
+    q: Float[Array, " nq"]
+    v: Float[Array, " n"]
+    t: Float[Array, ""]
+    work: Float[Array, ""]
+    base_work: Float[Array, ""]
+    contact_work: Float[Array, "2 m"]  # normal, tangential
+    # of compliant contacts: indentation [m], then impulses [N s], normal and tangential (none
+    # without friction); of rigid ones no rows
+    contact: Float[Array, "c m"]
 
 
 class Settings(NamedTuple):
-    """Tolerances of a motion."""
+    """Tolerances and options of a motion."""
 
     rtol: float
     atol: float
-    closed_below: jax.Array
-    gap_rounding: jax.Array  # gaps below it are rounding
+    closed_below: Float[Array, ""]  # [m] contacts with smaller gaps are closed
+    gap_rounding: Float[Array, ""]  # [m] smaller gaps are rounding
     max_steps: int
     friction: bool
     spatial: bool  # friction has two rows a contact
-    duration: jax.Array
-    accumulation: jax.Array  # `slow`: see `transitions.resolve`
+    duration: Float[Array, ""]  # [s]
+    accumulation: Float[Array, ""]  # `slow`: see `transitions.resolve`
 
 
-def speed_of(energy: jax.Array, w: jax.Array) -> jax.Array:
-    """The largest gap velocity () that a kinetic energy could give a contact, `sqrt(2 T W_jj)`."""
+def speed_of(energy: Float[Array, ""], w: Float[Array, " k"]) -> Float[Array, ""]:
+    """Largest gap velocity `max_j sqrt(2 T W_jj)` [m/s] that a kinetic energy T could give.
+
+    `w` is the diagonal W_jj of the Delassus matrix.
+    """
     return jnp.sqrt(2 * energy * jnp.max(w))
 
 
 class Scales(NamedTuple):
     """Largest values of the motion so far."""
 
-    gap_velocity: jax.Array
-    # gap velocity that all kinetic energy could give a contact; at least what bodies at rest gain
-    # while a closed gap opens
-    speed: jax.Array
-    acceleration: jax.Array
+    gap_velocity: Float[Array, ""]  # [m/s]
+    # [m/s] gap velocity that all kinetic energy could give a contact; at least what bodies at rest
+    # gain while a closed gap opens
+    speed: Float[Array, ""]
+    acceleration: Float[Array, ""]  # [m/s^2] of a gap
 
 
-def watched(
+def contact_margins(
     contacts: Contacts,
-    mu: jax.Array | None,
+    mu: Float[Array, " m"] | None,
     modes: Modes,
     scales: Scales,
-    below: jax.Array,
-    slip: jax.Array | None = None,
-) -> jax.Array:
-    """What must stay positive (k,): gaps or normal forces, then friction.
+    below: Float[Array, " m"],
+    slip: Float[Array, "m 2"] | None = None,
+) -> Float[Array, " k"]:
+    """Margins while the modes hold: gaps or normal forces, then those of friction.
 
-    `below`: (m,) gaps <= 0 that steps begin with. `slip`: as in `forces`.
+    Equation: `f_j - below_j` of an open contact, `lambda_j W_jj + slack` of a persistent one, with
+    a slack for rounding; friction by `friction_margins`.
+
+    `below`: gaps <= 0 that the step begins with [m]. `slip`: directions, as in `forces`.
     """
     m = modes.active.shape[0]
     force = forces(contacts, mu, modes, slip)
@@ -129,129 +144,141 @@ def watched(
         return normal
     # sliding ends where slip does, and where its forces stop to exist: both may be in one step
     slides = any_lane(jnp.any(modes.active & ~modes.stick))  # else its product with slip is 0
-    lasts = (
-        jax.lax.cond(
-            slides, lambda: regularity(contacts, mu, modes, slip), lambda: jnp.ones((), w.dtype)
-        )
-        - precision(w.dtype).root
-    )
-    side = friction_margins(contacts, mu, modes, force, lasts, slack, scales.speed)
-    return jnp.concatenate([normal, side])
+    one = jnp.ones((), w.dtype)
+    regular = jax.lax.cond(slides, lambda: regularity(contacts, mu, modes, slip), lambda: one)
+    lasts = regular - precision(w.dtype).root
+    friction = friction_margins(contacts, mu, modes, force, lasts, slack, scales.speed)
+    return jnp.concatenate([normal, friction])
 
 
 def friction_margins(
     contacts: Contacts,
-    mu: jax.Array,
+    mu: Float[Array, " m"],
     modes: Modes,
     force: Forces,
-    lasts: jax.Array,
-    slack: jax.Array,
-    speed_scale: jax.Array,
-) -> jax.Array:
-    """What must stay positive (m,): the rest of the cone (and `slack`) of what sticks, or slip."""
+    lasts: Float[Array, ""],
+    slack: Float[Array, ""],
+    speed_scale: Float[Array, ""],
+) -> Float[Array, " m"]:
+    """Margins of friction: distance from the rim of the cone plus `slack`, or slip times `lasts`.
+
+    The first of contacts that stick, see `cone_margins`; the second of those that slide, see
+    `slip_margins`, with `lasts` what is left of the regularity until forces count as singular; 1 of
+    open ones.
+    """
     cone = cone_margins(contacts, mu, force) + slack
     ends = slip_margins(contacts, mu, modes, force, lasts, speed_scale)
     return jnp.where(modes.active, jnp.where(modes.stick, cone, ends), 1.0)
 
 
 class MotionFlow(eqx.Module, stepper.Flow):
-    """What flights have in common.
+    """Flow of the stepper that rigid and compliant contacts have in common.
 
-    State (rows): q, v, t, the ledger, and what contacts remember. The last of the margins is the
+    Rows y of the state: those of `State`, then `error_only_rows`. The last of the margins is the
     time left to the next sample. Margins are in units of their rounding. In space tangents are
     along the `axes` of the step.
     """
 
     system: System
-    rounding: jax.Array  # (k,)
-    sample: jax.Array  # time of the next sample ()
+    rounding: Float[Array, " margins"]
+    sample: Float[Array, ""]  # [s] time of the next sample
     rtol: float
-    sizes: jax.Array  # (rows, 1): a step may make errors of `rtol` of them
+    sizes: Float[Array, "rows 1"]  # a step may make errors of `rtol` of them
     like: State  # of its shapes
-    longest: jax.Array  # step ()
-    mu: jax.Array | None
+    longest: Float[Array, ""]  # [s] longest step
+    mu: Float[Array, " m"] | None
     axes: SlipAxes | None
 
     @property
     def error_only_rows(self) -> int:
-        """Rows in addition to those of the state, which only limit the length of steps.
+        """Number of rows after those of the state, whose errors only limit the length of steps.
 
-        In space logarithms of slip: steps follow it until little is left.
+        In space m: logarithms of slip, so that steps follow it until little is left.
         """
         return 0 if self.axes is None else len(self.axes.speed)
 
     @property
     def taking_part(self) -> int:  # type: ignore[override]
-        """One: the number of passes does not matter here."""
+        """1: it scales the number of passes that the stepper allows at full tolerance."""
         return 1
 
     @property
-    def tolerance(self) -> jax.Array:  # type: ignore[override]
-        """`rtol`."""
+    def tolerance(self) -> Float[Array, "1 1"]:  # type: ignore[override]
+        """`rtol`, as (1, 1)."""
         return jnp.full((1, 1), self.rtol, self.sizes.dtype)
 
-    def allowance(self, modes: jax.Array, y: jax.Array) -> jax.Array:
-        """Errors that a step may make in each row (rows, 1), in tolerances."""
+    def allowance(
+        self, modes: Int[Array, "k 1"], y: Float[Array, "rows 1"]
+    ) -> Float[Array, "rows 1"]:
+        """Errors that a step may make in each row, in tolerances."""
         return self.sizes
 
     @property
-    def zero_margin(self) -> jax.Array:
-        """Margins are in units of their rounding."""
+    def zero_margin(self) -> Float[Array, "1 1"]:
+        """1: margins are in units of their rounding."""
         return jnp.ones((1, 1), self.sizes.dtype)
 
-    def from_margins(self, margins: jax.Array, at: State) -> jax.Array:
-        """Rows (k, 1) of margins, with that of the next sample."""
+    def from_margins(self, margins: Float[Array, " k"], at: State) -> Float[Array, "margins 1"]:
+        """Rows of margins, that of the next sample `t_sample - t` last, over their rounding."""
         return (jnp.append(margins, self.sample - at.t) / self.rounding)[:, None]
 
     def errors_of_error_only_rows(
-        self, settings: Settings, state: State, h: jax.Array, of_q: jax.Array
-    ) -> list[jax.Array]:
-        """Errors that a step of length h may make in its spare rows; `of_q`: sizes of q in it."""
+        self, settings: Settings, state: State, h: Float[Array, ""], of_q: Float[Array, " nq"]
+    ) -> list[Float[Array, " m"]]:
+        """Errors that a step of length h [s] may make in `error_only_rows`.
+
+        `of_q`: sizes `|q| + h |q'|` of the coordinates within the step.
+        """
         if self.axes is None:
             return []
         return [turning_errors(self.axes, settings.rtol, self.speed_scale)]
 
     @property
     @abc.abstractmethod
-    def speed_scale(self) -> jax.Array:
-        """Speed () of the motion so far."""
+    def speed_scale(self) -> Float[Array, ""]:
+        """Largest speed [m/s] of the motion so far, of which small slip is a share."""
 
     def contacts(self, at: State) -> Contacts:
-        """Contact space at this state."""
+        """Contact space at this state, with tangents along the axes of the step."""
         along = None if self.axes is None else self.axes.along
         return contacts_at(self.system, at.q, at.v, at.t, self.mu is not None, along)
 
-    def slip(self, modes: Modes, contacts: Contacts) -> jax.Array | None:
-        """Directions of slip (m, 2) in space."""
+    def slip(self, modes: Modes, contacts: Contacts) -> Float[Array, "m 2"] | None:
+        """Directions of slip in space, in the axes of the step; None in the plane."""
         if self.axes is None or contacts.tangent is None:
             return None
         return slip_within(self.axes, modes, contacts.tangent.rate)
 
     def rows_of(
         self, rates: State, at: State, modes: Modes, contacts: Contacts, force: Forces
-    ) -> list[jax.Array]:
-        """Rows of the rates, and in space those of logarithms of slip."""
+    ) -> list[Float[Array, "rows 1"]]:
+        """Rates (rows, 1) of the state, and in space those of the logarithms of slip."""
         rows = [self.regular(rates, at)]
         if self.axes is not None:
             rows.append(log_rates(self.axes, modes, contacts, force)[:, None])
         return rows
 
-    def projected(self, const: Any, at: State) -> tuple[State, jax.Array]:
-        """The state back on the constraints of its modes; which contacts have another normal."""
+    def projected(self, const: Any, at: State) -> tuple[State, Bool[Array, " jumps"]]:
+        """The state, moved back onto the constraints of its modes; true where a normal jumped."""
         return at, jnp.zeros(0, bool)
 
     def switch(
-        self, modes: jax.Array, y: jax.Array, which: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """Nothing: what happens at events is decided between flights."""
+        self,
+        modes: Int[Array, "k 1"],
+        y: Float[Array, "rows 1"],
+        which: Bool[Array, "margins 1"],
+    ) -> tuple[Int[Array, "k 1"], Float[Array, "rows 1"]]:
+        """Modes and state unchanged: events are resolved between flights."""
         return modes, y
 
-    def over(self, modes: jax.Array, y: jax.Array, passes: jax.Array) -> jax.Array:
-        """Never: the loop of the motion decides."""
+    def over(
+        self, modes: Int[Array, "k 1"], y: Float[Array, "rows 1"], passes: Float[Array, "1 1"]
+    ) -> Bool[Array, "1 1"]:
+        """False: the loop of the motion decides when it ends."""
         return jnp.zeros((1, 1), bool)
 
-    def regular(self, rates: State, at: State) -> jax.Array:
-        """Rows of rates; NaN where M is not positive definite."""
+    def regular(self, rates: State, at: State) -> Float[Array, "rows 1"]:
+        """Rates (rows, 1) of the state; NaN where M is not positive definite."""
         if callable(self.system.mass):
             return jnp.where(definite(mass_at(self.system, at.q)), packed(rates), jnp.nan)
         return packed(rates)
@@ -266,24 +293,27 @@ class MechanicalFlow(MotionFlow):
     """
 
     scales: Scales
-    below: jax.Array  # (m,) gaps that the step begins with, 0 where they are positive
+    below: Float[Array, " m"]  # [m] gaps that the step begins with, 0 where they are positive
 
     near = 0.01  # steps in time are exact for parabolas: only the last of a landing is not in time
 
     @property
     def error_only_rows(self) -> int:
-        """Gaps by integration, too: steps follow them where the base moves faster than the body."""
+        """Gaps by integration (m), too: steps follow a base that moves faster than the body."""
         return self.like.contact_work.shape[1] + super().error_only_rows
 
     @property
-    def speed_scale(self) -> jax.Array:
-        """That of all kinetic energy."""
+    def speed_scale(self) -> Float[Array, ""]:
+        """Gap velocity [m/s] that all kinetic energy could give a contact."""
         return self.scales.speed
 
     def errors_of_error_only_rows(
-        self, settings: Settings, state: State, h: jax.Array, of_q: jax.Array
-    ) -> list[jax.Array]:
-        """Those of gaps first."""
+        self, settings: Settings, state: State, h: Float[Array, ""], of_q: Float[Array, " nq"]
+    ) -> list[Float[Array, " m"]]:
+        """Errors `atol + rtol (|f| + h |f'| + |N|^T |u|)` of gaps, then those of slip.
+
+        u: sizes of coordinates in the step, of displacements where the body has quaternions.
+        """
         of_u = of_q if self.system.body.coordinates is None else h * jnp.abs(state.v)
         normal, _ = kinematics(self.system, state.q, state.v, state.t)
         of_gap = (
@@ -292,38 +322,53 @@ class MechanicalFlow(MotionFlow):
         errors = settings.atol + settings.rtol * of_gap
         return [errors, *super().errors_of_error_only_rows(settings, state, h, of_q)]
 
-    def constants(self, modes: jax.Array) -> Modes:
-        """The modes, of each contact."""
+    def constants(self, modes: Int[Array, "k 1"]) -> Modes:
+        """Modes from their rows."""
         return decoded(modes, self.sizes.dtype)
 
-    def field(self, const: Modes, modes: jax.Array, y: jax.Array) -> jax.Array:
-        """Rates of the state."""
+    def field(
+        self, const: Modes, modes: Int[Array, "k 1"], y: Float[Array, "some 1"]
+    ) -> Float[Array, "rows 1"]:
+        """Rates of q, v, t and the works with the forces that keep the modes.
+
+        Equation: `q' = rates(q, v)`, `M v' = (loads) + N lambda_n + H lambda_t`, powers `F . v`,
+        `lambda_t . u` and that of the base; then gap velocities of open contacts, in space
+        `(ln |u|)'`.
+        """
         at = unpacked(self.like, y)
         contacts = self.contacts(at)
         force = forces(contacts, self.mu, const, self.slip(const, contacts))
         friction, base = contact_powers(self.system, contacts, force, at.t)
         power = user_force(self.system, at.q, at.v, at.t) @ at.v
-        per_contact = jnp.stack([jnp.zeros_like(friction), friction])
-        still = jnp.zeros_like(at.contact)
-        one = jnp.ones_like(at.t)
-        moves = self.system.body.rates(at.q, at.v)
-        rates = State(moves, force.acceleration, one, power, base, per_contact, still)
+        rates = State(
+            q=self.system.body.rates(at.q, at.v),
+            v=force.acceleration,
+            t=jnp.ones_like(at.t),
+            work=power,
+            base_work=base,
+            contact_work=jnp.stack([jnp.zeros_like(friction), friction]),
+            contact=jnp.zeros_like(at.contact),
+        )
         gaps_by_steps = jnp.where(const.active, 0.0, contacts.normal.rate)[:, None]
         rows, *logs = self.rows_of(rates, at, const, contacts, force)
         return jnp.concatenate([rows, gaps_by_steps, *logs])
 
-    def margins(self, const: Modes, modes: jax.Array, y: jax.Array) -> jax.Array:
-        """What must stay positive."""
+    def margins(
+        self, const: Modes, modes: Int[Array, "k 1"], y: Float[Array, "some 1"]
+    ) -> Float[Array, "margins 1"]:
+        """Rows of `contact_margins`, and of the time left to the next sample."""
         at = unpacked(self.like, y)
         contacts = self.contacts(at)
         slip = self.slip(const, contacts)
-        margins = watched(contacts, self.mu, const, self.scales, self.below, slip)
+        margins = contact_margins(contacts, self.mu, const, self.scales, self.below, slip)
         return self.from_margins(margins, at)
 
-    def projected(self, const: Modes, at: State) -> tuple[State, jax.Array]:
-        """Gaps and velocities of persistent contacts set to 0, in the metric of M.
+    def projected(self, const: Modes, at: State) -> tuple[State, Bool[Array, " m"]]:
+        """Gaps, gap velocities and slip that the modes hold set to 0: the least change by M.
 
-        But not where one of them has another normal since the step began: which (m,) have.
+        Equation: `q += M^-1 D p_q`, `v += M^-1 D p_v` with `W p = -(f, rates)` in held rows. A
+        persistent contact whose gap velocity exceeds JUMP of the speed after the step has got
+        another normal: then nothing is changed. True (second result) where that is so.
         """
         contacts = self.contacts(at)
         value, rate = contacts.normal.value, contacts.normal.rate
@@ -343,25 +388,25 @@ class MechanicalFlow(MotionFlow):
         return selected(jnp.any(jumps), at, back), jumps
 
 
-def packed(state: State) -> jax.Array:
-    """Rows (.., 1) of a state."""
+def packed(state: State) -> Float[Array, "rows 1"]:
+    """Rows of a state, in the order of its fields."""
     return ravel_pytree(state)[0][:, None]
 
 
-def unpacked(like: State, y: jax.Array) -> State:
-    """The state of rows (.., 1); `error_only_rows` ones come last."""
+def unpacked(like: State, y: Float[Array, "rows 1"]) -> State:
+    """State from its rows; rows after them (`error_only_rows`) are left out."""
     flat, back = ravel_pytree(like)
     return back(y[: len(flat), 0])
 
 
-def decoded(rows: jax.Array, dtype: Any) -> Modes:
-    """The modes of such rows."""
+def decoded(rows: Int[Array, "k 1"], dtype: Any) -> Modes:
+    """Modes from their rows (3 m, 1), see `encoded`."""
     active, stick, sign = rows[:, 0].reshape(3, -1)
     return Modes(active > 0, stick > 0, sign.astype(dtype))
 
 
-def encoded(modes: Modes) -> jax.Array:
-    """Modes as rows (3 m, 1) of whole numbers."""
+def encoded(modes: Modes) -> Int[Array, "k 1"]:
+    """Modes as rows (3 m, 1) of whole numbers: `active`, `stick`, `sign`."""
     rows = [modes.active, modes.stick, modes.sign]
     return jnp.concatenate([x.astype(jnp.int32) for x in rows])[:, None]
 
@@ -371,45 +416,60 @@ class Flight(NamedTuple):
 
     state: State
     aim: stepper.Step  # the step to try
-    plan: jax.Array  # and what the stepper expects of it
-    free: jax.Array  # length of steps that nothing shortens [s]
-    event: jax.Array  # (k,) what has happened
-    jumped: jax.Array  # () whether a normal has jumped: no derivatives from then on
-    sample: jax.Array  # number of samples reached
-    steps: jax.Array
-    stuck: jax.Array
+    plan: Float[Array, "4 1"]  # `StepperState.progress`: what the stepper expects of the step
+    free: Float[Array, ""]  # [s] length of steps that neither event nor sample shortens
+    event: Bool[Array, " margins"]  # margins that the last step has brought to 0
+    jumped: Bool[Array, ""]  # a normal has jumped: no derivatives from then on
+    sample: Int[Array, ""]  # number of samples reached
+    steps: Int[Array, ""]
+    stuck: Bool[Array, ""]  # steps vanish, are too many, or left the range of the gap function
 
 
-def longest_step(system: System, targets: jax.Array) -> jax.Array:
-    """How long a step may be () [s]: a bound only where something may depend on time."""
+def longest_step(system: System, targets: Float[Array, " S"]) -> Float[Array, ""]:
+    """Bound of a step [s]: a part of the duration where loads or base may depend on time, or inf.
+
+    `targets`: times of the samples.
+    """
     if system.base is None and system.force is None:
         return jnp.full((), jnp.inf, targets.dtype)
     return jax.lax.stop_gradient(targets[-1] - targets[0]) / LOOKS
 
 
 def first_flight(
-    system: System, state: State, rows: jax.Array, events: int, targets: jax.Array
+    system: System, state: State, rows: Int[Array, "k 1"], events: int, targets: Float[Array, " S"]
 ) -> Flight:
-    """A flight at the beginning: `rows` of modes, number of `events`; one sample is reached."""
+    """A flight at the start of the motion, where the first sample is reached.
+
+    `rows` of the modes; `events`: number of margins whose zeros are events.
+    """
     step = jnp.minimum(
         jax.lax.stop_gradient(targets[1] - targets[0]), longest_step(system, targets)
     )
+    # `stepper.Step.clock`: a step in time from 0 of this length, to no target
     clock = jnp.stack([0 * step, step, 0 * step, 0 * step])[:, None]
-    aim = stepper.Step(rows, jnp.zeros((events + 1, 1), bool), clock)
-    one, none, no = jnp.int32(1), jnp.int32(0), jnp.asarray(False)
-    event = jnp.zeros(events, bool)
-    return Flight(state, aim, jnp.zeros((4, 1), step.dtype), step, event, no, one, none, no)
+    return Flight(
+        state=state,
+        aim=stepper.Step(rows, jnp.zeros((events + 1, 1), bool), clock),
+        plan=jnp.zeros((4, 1), step.dtype),
+        free=step,
+        event=jnp.zeros(events, bool),
+        jumped=jnp.asarray(False),
+        sample=jnp.int32(1),
+        steps=jnp.int32(0),
+        stuck=jnp.asarray(False),
+    )
 
 
-def next_sample(targets: jax.Array, reached: jax.Array) -> jax.Array:
-    """The time of the next sample, after `reached` () samples."""
+def next_sample(targets: Float[Array, " S"], reached: Int[Array, ""]) -> Float[Array, ""]:
+    """Time [s] of the sample that follows the first `reached` ones."""
     return targets[jnp.minimum(reached, targets.shape[0] - 1)]
 
 
-def toward_sample(flight: Flight, targets: jax.Array, h: jax.Array) -> Flight:
-    """The next step, of length h, lands on the sample if it reaches it."""
+def toward_sample(flight: Flight, targets: Float[Array, " S"], h: Float[Array, ""]) -> Flight:
+    """The flight with a next step of length h [s], which lands on a nearer sample."""
     left = next_sample(targets, flight.sample) - flight.state.t
     lands = left <= h
+    # the last margin is the time left; `clock` and `plan`: see `stepper.Step`, `StepperState`
     target = jnp.zeros_like(flight.aim.target).at[-1].set(lands)
     clock = jnp.stack([0 * h, h, 0 * h, lands.astype(h.dtype)])[:, None]
     plan = flight.plan.at[0, 0].set(jnp.where(lands, left, h)).at[1].set(0.0)
@@ -418,23 +478,24 @@ def toward_sample(flight: Flight, targets: jax.Array, h: jax.Array) -> Flight:
     return flight._replace(aim=aim, plan=plan)
 
 
-def selected(which: jax.Array, new: Any, old: Any) -> Any:
-    """Leaf by leaf, `new` where `which`."""
+def selected(which: Bool[Array, ""], new: Any, old: Any) -> Any:
+    """The pytree `new` if `which`, else `old`, leaf by leaf."""
     return jax.tree.map(lambda a, b: jnp.where(which, a, b), new, old)
 
 
 def one_pass(
     flow: MotionFlow,
     settings: Settings,
-    allowed: jax.Array,
-    targets: jax.Array,
+    allowed: Float[Array, " rows"],
+    targets: Float[Array, " S"],
     flight: Flight,
-    flies: jax.Array | bool = True,
-) -> tuple[Flight, jax.Array]:
-    """One pass of the stepper, and whether its step is accepted.
+    flies: Bool[Array, ""] | bool = True,
+) -> tuple[Flight, Bool[Array, ""]]:
+    """Flight after one pass of the stepper, and true if its step is accepted.
 
-    `allowed` are the errors of all rows of the state but q and v. In a lane without flight
-    only the step to try changes, which `toward_sample` then sets anew.
+    `allowed` are the errors of all rows of the state but q and v. A lane of a batch that does not
+    fly (`flies` false) keeps its state; only the step to try changes, which `toward_sample` then
+    sets anew.
     """
     state = flight.state
     flow = dataclasses.replace(
@@ -446,12 +507,12 @@ def one_pass(
     carry = stepper.StepperState(_rows(flow, state), flight.aim, flight.plan.at[2:].set(0.0))
     after, accept = stepper.advance(flow, carry, 2)
     accept = accept[0, 0] & flies
-    landed = flight.aim.target[:, 0] & accept
+    landed = flight.aim.target[:, 0] & accept  # margins that the step has brought to 0
     sampled = landed[-1]
     new, jumps = _reached(flow, flight.aim, after.y)
     state = selected(accept, new, state)
     jumps = jumps & accept
-    event = landed[:-1].at[: len(jumps)].max(jumps)
+    event = landed[:-1].at[: len(jumps)].max(jumps)  # another normal is an event, too
     steps = flight.steps + jnp.asarray(flies).astype(flight.steps.dtype)
     vanishes = flies & ~accept & (after.step.clock[1, 0] < _smallest_step(targets))
     # what an event or a sample shortens says nothing of the steps after it
@@ -476,20 +537,23 @@ def one_pass(
     begins = jnp.minimum(free, flow.longest)  # forces may have set in since `free`
     aimed = toward_sample(moved, targets, jnp.where(sampled, begins, proposed))
     in_time = (after.step.clock[2, 0] == 0) & (after.step.clock[3, 0] == 0)
+    # the stepper keeps its plan for a landing, a step in the root of time, and a rejected one
     plain = sampled | (accept & in_time)
     aim, plan = selected(plain, (aimed.aim, aimed.plan), (moved.aim, moved.plan))
     return moved._replace(aim=aim, plan=plan), accept
 
 
-def out_of_range(system: System, at: State) -> jax.Array:
-    """Whether () the gap function does not hold here any more."""
+def out_of_range(system: System, at: State) -> Bool[Array, ""]:
+    """True where q is outside the range in which the gap function of the body holds."""
     if type(system.body).valid is Body.valid:
         return jnp.asarray(False)
     return ~(system.body.valid(seen_from_base(system, at.q, at.t)) >= 0)
 
 
-def status_at_start(system: System, at: State, end: jax.Array, closed_below: Any) -> jax.Array:
-    """MotionStatus () of a motion that begins here and shall last until `end`."""
+def status_at_start(
+    system: System, at: State, end: Float[Array, ""], closed_below: Any
+) -> Int[Array, ""]:
+    """Status code of a motion that begins in this state and shall last until `end` [s]."""
     allowed = jnp.maximum(closed_below, system.body.overlap)
     penetrates = jnp.any(recorded_gaps(system, at.q, at.t) < -allowed)
     status = jnp.where(penetrates, CODE["penetration"], CODE["ok"])
@@ -499,22 +563,30 @@ def status_at_start(system: System, at: State, end: jax.Array, closed_below: Any
     return jnp.where(finite, status, CODE["not_finite"]).astype(jnp.int32)
 
 
-def _rows(flow: MotionFlow, state: State) -> jax.Array:
-    """Rows (.., 1) of the state, with spare ones that are 0."""
+def _rows(flow: MotionFlow, state: State) -> Float[Array, "rows 1"]:
+    """Rows of the state, then `error_only_rows`, which begin at 0."""
     return jnp.pad(packed(state), ((0, flow.error_only_rows), (0, 0)))
 
 
-def _reached(flow: MotionFlow, aim: stepper.Step, y: jax.Array) -> tuple[State, jax.Array]:
-    """The state of rows at the end of a step, at a sample with its time to the last digit.
+def _reached(
+    flow: MotionFlow, aim: stepper.Step, y: Float[Array, "rows 1"]
+) -> tuple[State, Bool[Array, " jumps"]]:
+    """State at the end of a step from its rows, `projected`, and contacts whose normal jumped.
 
-    And which contacts have another normal than at its beginning: velocities are as they were.
+    On a sample t is that of the sample to the last digit.
     """
     new, jumps = flow.projected(flow.constants(aim.modes), unpacked(flow.like, y))
     return new._replace(t=jnp.where(aim.target[-1, 0], flow.sample, new.t)), jumps
 
 
-def _errors(flow: MotionFlow, settings: Settings, allowed: jax.Array, flight: Flight) -> jax.Array:
-    """Errors (rows,) that a step may make, by the sizes within it of q and v (they cross 0)."""
+def _errors(
+    flow: MotionFlow, settings: Settings, allowed: Float[Array, " others"], flight: Flight
+) -> Float[Array, " rows"]:
+    """Errors that a step of length h may make in each row.
+
+    Equation: `atol + rtol (|q| + h |q'|)`, v likewise, by sizes within the step as they may cross
+    0; then the `allowed` ones of other rows of the state, and those of `error_only_rows`.
+    """
     system, state, h = flow.system, flight.state, flight.plan[0, 0]
     push = user_force(system, state.q, state.v, state.t)
     rates = free_acceleration(system, state.q, state.v, push, mass_at(system, state.q))
@@ -524,19 +596,23 @@ def _errors(flow: MotionFlow, settings: Settings, allowed: jax.Array, flight: Fl
     return jnp.concatenate([*errors, *flow.errors_of_error_only_rows(settings, state, h, of_q)])
 
 
-def _smallest_step(targets: jax.Array) -> jax.Array:
-    """Length () [s] below which a step does not move time any more."""
+def _smallest_step(targets: Float[Array, " S"]) -> Float[Array, ""]:
+    """Length [s] below which a step does not move time any more."""
     return not_rounding(SMALLEST_STEP, targets.dtype) * (jnp.abs(targets[0]) + jnp.abs(targets[-1]))
 
 
 def allowed_errors(
     system: System, settings: Settings, at: State, share: float = LEDGER
-) -> jax.Array:
-    """Errors allowed in all rows of the state but q and v; in the ledger a `share` of theirs."""
+) -> Float[Array, " rows"]:
+    """Errors allowed in all rows of the state but q and v: time, works [J], contacts.
+
+    Equation: `share (|M v'| . e_q + |M v| . e_v)`, the work of the errors `e = atol + rtol |.|` of
+    q and v; at least atol; time may err by anything, as it is integrated exactly.
+    """
     mass = mass_at(system, at.q)
     free = free_acceleration(system, at.q, at.v, user_force(system, at.q, at.v, at.t), mass)
     both = jnp.stack([free, at.v], axis=1)
-    pushed = jnp.abs(mass[:, None] * both if mass.ndim == 1 else mass @ both)
+    pushed = jnp.abs(mass[:, None] * both if mass.ndim == 1 else mass @ both)  # |M v'|, |M v|
     of_q, of_v = (settings.atol + settings.rtol * jnp.abs(x) for x in (at.q, at.v))
     if system.body.coordinates is not None:  # of displacements
         of_q = jnp.broadcast_to(jnp.max(of_q), at.v.shape)
@@ -546,8 +622,8 @@ def allowed_errors(
     return jnp.full(rows, jnp.maximum(ledger, settings.atol)).at[0].set(jnp.inf)  # time: none
 
 
-def roundings(settings: Settings, margins: jax.Array, targets: jax.Array) -> jax.Array:
-    """Roundings of these margins and of the time to the next sample (k,)."""
+def roundings(margins: Float[Array, " k"], targets: Float[Array, " S"]) -> Float[Array, " margins"]:
+    """Roundings of margins, and last that of the time to the next sample; none is 0."""
     least = precision(targets.dtype).tiny ** 0.5
     each = jnp.append(margins, _smallest_step(targets))
     return jax.lax.stop_gradient(jnp.maximum(each, least))
@@ -555,21 +631,25 @@ def roundings(settings: Settings, margins: jax.Array, targets: jax.Array) -> jax
 
 def flow_of(
     system: System,
-    mu: jax.Array | None,
+    mu: Float[Array, " m"] | None,
     settings: Settings,
     modes: Modes,
     scales: Scales,
-    targets: jax.Array,
+    targets: Float[Array, " S"],
     state: State,
 ) -> MechanicalFlow:
-    """The flow with these modes; `one_pass` sets the time of the next sample, and the errors."""
+    """Flow from this state with these modes; `one_pass` sets `sample` and `sizes`.
+
+    Roundings of margins: `gap_rounding` of gaps [m], a share of the acceleration of normal forces
+    and of the cone, of the speed of slip.
+    """
     share = rest_acceleration(state.q.dtype)
     slack = share * scales.acceleration
     normal = jnp.where(modes.active, slack, settings.gap_rounding)
     stuck = modes.stick | (modes.sign == BEGINS)
-    side = jnp.where(stuck, slack, share * scales.speed)
-    margins = jnp.concatenate([normal, side]) if settings.friction else normal
-    rounded, longest = roundings(settings, margins, targets), longest_step(system, targets)
+    friction = jnp.where(stuck, slack, share * scales.speed)
+    margins = jnp.concatenate([normal, friction]) if settings.friction else normal
+    rounded, longest = roundings(margins, targets), longest_step(system, targets)
     blank = jnp.zeros((1, 1), state.q.dtype)
     # where contacts that were held not quite closed are closed, redundant ones come to lie below
     below = jax.lax.stop_gradient(jnp.minimum(gaps(system, state.q, state.t), 0.0))
@@ -578,6 +658,15 @@ def flow_of(
         contacts = contacts_at(system, state.q, state.v, state.t, True)
         axes = slip_axes(contacts, mu, modes, scales.speed)
     return MechanicalFlow(
-        *(system, rounded, state.t, settings.rtol, blank, state, longest, mu, axes),
-        *(scales, below),
+        system=system,
+        rounding=rounded,
+        sample=state.t,
+        rtol=settings.rtol,
+        sizes=blank,
+        like=state,
+        longest=longest,
+        mu=mu,
+        axes=axes,
+        scales=scales,
+        below=below,
     )

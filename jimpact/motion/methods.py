@@ -4,9 +4,9 @@ import warnings
 from dataclasses import dataclass
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, Int
 
 from jimpact.core.law import Law
 from jimpact.motion.dynamics import is_pile
@@ -187,7 +187,10 @@ METHODS: dict[str, type[Any]] = {
 
 
 def as_method(method: str | Method, step: float | None = None, **options: Any) -> Method:
-    """The method that `simulate` is asked for; a word is one with its defaults, or `options`."""
+    """Method object for the argument `method` of `simulate`: itself, or that of a word.
+
+    `options` are those of the word's class; `step` belongs to 'time_stepping' alone.
+    """
     if isinstance(method, Method):
         if step is not None:
             raise ValueError(
@@ -217,8 +220,8 @@ def name_of(method: Method) -> str:
     return next(name for name, kind in METHODS.items() if isinstance(method, kind))
 
 
-def substeps_of(method: TimeStepping, start: Any, end: Any, samples: int) -> jax.Array:
-    """Steps () between two of so many samples, none longer than `step`."""
+def substeps_of(method: TimeStepping, start: Any, end: Any, samples: int) -> Int[Array, ""]:
+    """Number of equal steps between two samples, so that none is longer than `step`."""
     if is_traced((start, end)):
         raise ValueError("Argument `t_end` must not be traced in time stepping.")
     between = (float(end) - float(start)) / (samples - 1)
@@ -231,9 +234,14 @@ def substeps_of(method: TimeStepping, start: Any, end: Any, samples: int) -> jax
 
 
 def start_by(
-    method: Method, system: System, law: Law, q: jax.Array, v: jax.Array, t_end: Any
+    method: Method,
+    system: System,
+    law: Law,
+    q: Float[Array, "..."],
+    v: Float[Array, "..."],
+    t_end: Any,
 ) -> Start:
-    """The start of a motion by this method; contact forces may begin in penetration.
+    """Checked start of a motion by this method; with contact forces it may be in penetration.
 
     Warns of piles whose events take long. Raises a ValueError as `start_of`, and for friction of a
     pile, which only time stepping has.

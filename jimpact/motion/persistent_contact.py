@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
 
 from jimpact.motion.dynamics import (
     Kinematics,
@@ -62,15 +63,15 @@ _FAINT_RIDGE = 3 / 4
 
 
 class Modes(NamedTuple):
-    """Of the m contacts: `active` (persistent), `stick`, `sign` (of sliding: -1, 0, 1).
+    """Mode of each contact: open, or persistent and sticking or sliding.
 
-    In space, where `slip_in_space.py` has the directions, `sign` is 1 of those that slide, and
-    `BEGINS` of those that begin to.
+    `sign` is that of the slip in the plane, -1, 0 or 1. In space, where `slip_in_space.py` has the
+    directions, it is 1 of contacts that slide, and `BEGINS` of those that begin to.
     """
 
-    active: jax.Array
-    stick: jax.Array
-    sign: jax.Array
+    active: Bool[Array, " m"]  # persistent: gap and gap velocity stay 0
+    stick: Bool[Array, " m"]  # the slip stays 0, too
+    sign: Float[Array, " m"]
 
 
 class Contacts(NamedTuple):
@@ -78,41 +79,41 @@ class Contacts(NamedTuple):
 
     normal: Kinematics
     tangent: Kinematics | None
-    directions: jax.Array  # [N, H] (n, k)
-    moved: jax.Array  # M^-1 [N, H] (n, k)
-    delassus: jax.Array  # (k, k)
-    free: jax.Array  # M^-1 F: q'' without contacts (n,)
-    approach: jax.Array  # (k,) second derivatives of gaps and displacements without contacts
+    directions: Float[Array, "n k"]  # [N, H]
+    moved: Float[Array, "n k"]  # M^-1 [N, H]
+    delassus: Float[Array, "k k"]  # W = [N, H]^T M^-1 [N, H]
+    free: Float[Array, " n"]  # v' without contact forces
+    approach: Float[Array, " k"]  # gap and slip accelerations without contact forces [m/s^2]
 
 
 class Forces(NamedTuple):
-    """Contact forces (m,) [N], q'' (n,)."""
+    """Contact forces lambda [N], and the acceleration v' with them."""
 
-    normal: jax.Array
-    tangential: jax.Array | None
-    acceleration: jax.Array
+    normal: Float[Array, " m"]
+    tangential: Float[Array, " t"] | None
+    acceleration: Float[Array, " n"]
 
 
 def no_modes(m: int, dtype: jnp.dtype) -> Modes:
-    """All contacts open."""
+    """Modes of m open contacts."""
     return Modes(jnp.zeros(m, bool), jnp.zeros(m, bool), jnp.zeros(m, dtype))
 
 
-def by_contact(rows: jax.Array, m: int) -> jax.Array:
-    """Tangential rows (t,) as (m, rows)."""
+def by_contact(rows: Float[Array, " t"], m: int) -> Float[Array, "m r"]:
+    """Tangential rows (t,) by contact (m, r): r = 1 in the plane, 2 in space."""
     return rows.reshape(m, -1)
 
 
-def length(rows: jax.Array) -> jax.Array:
-    """|u_j| (m,) of (m, rows), with derivative 0 at 0."""
+def length(rows: Float[Array, "m r"]) -> Float[Array, " m"]:
+    """Lengths |u_j| of the vectors u (m, r), with derivative 0 at u_j = 0."""
     if rows.shape[1] == 1:
         return jnp.abs(rows[:, 0])
     square = jnp.sum(rows**2, axis=1)
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
 
 
-def direction(rows: jax.Array) -> jax.Array:
-    """Unit vectors of (m, rows), 0 of 0."""
+def direction(rows: Float[Array, "m r"]) -> Float[Array, "m r"]:
+    """Unit vectors u_j / |u_j| of u (m, r), 0 where u_j = 0."""
     if rows.shape[1] == 1:
         return jnp.sign(rows)
     size = length(rows)[:, None]
@@ -120,15 +121,16 @@ def direction(rows: jax.Array) -> jax.Array:
 
 
 def in_space(contacts: Contacts) -> bool:
-    """Whether slip has two rows a contact."""
+    """True where each contact has two tangents."""
     tangent = contacts.tangent
     return tangent is not None and len(tangent.rate) == 2 * len(contacts.normal.rate)
 
 
-def held_rows(modes: Modes, size: int) -> jax.Array:
-    """Which of the first `size` rows (normals, then tangents) the modes hold.
+def held_rows(modes: Modes, size: int) -> Bool[Array, " size"]:
+    """True in rows of contact space whose acceleration the modes hold at 0, the first `size` rows.
 
-    In space the first row of a contact is along its slip: where slip begins the other one is held.
+    Normal rows of persistent contacts, tangential ones of those that stick. In space the first row
+    of a contact is along its slip, the second one across it: where slip begins the latter is held.
     """
     m, stick = modes.active.shape[0], modes.active & modes.stick
     if size == m:
@@ -141,13 +143,17 @@ def held_rows(modes: Modes, size: int) -> jax.Array:
 
 def contacts_at(
     system: System,
-    q: jax.Array,
-    v: jax.Array,
-    t: jax.Array,
+    q: Float[Array, " nq"],
+    v: Float[Array, " n"],
+    t: Float[Array, ""],
     friction: bool,
-    along: jax.Array | None = None,
+    along: Float[Array, "m 2"] | None = None,
 ) -> Contacts:
-    """Contact space of the system at (q, v, t); in space with tangents `along` (m, 2)."""
+    """Contact space at (q, v, t): W = D^T M^-1 D and D^T v' + drift of the directions D = [N, H].
+
+    In space, with `along`, tangents are turned: the first one of each contact is along this unit
+    vector in its plane of contact.
+    """
     mass = mass_at(system, q)
     normal, tangent = kinematics(system, q, v, t, friction)
     directions, drift = normal.gradient, normal.drift
@@ -163,8 +169,12 @@ def contacts_at(
     )
 
 
-def with_normal_forces(contacts: Contacts, push: jax.Array) -> Contacts:
-    """Contact space in which normal forces are `push` (m,), whatever friction does."""
+def with_normal_forces(contacts: Contacts, push: Float[Array, " m"]) -> Contacts:
+    """Contact space in which normal forces are `push` [N], whatever friction does.
+
+    Normal rows become `W_jj (lambda_j - push_j) = 0`, without coupling to tangential forces;
+    tangential ones have `W_tn push` in their accelerations.
+    """
     m = len(push)
     size = jnp.diagonal(contacts.delassus)[:m]
     w = contacts.delassus.at[:, :m].set(0.0).at[:m].set(0.0)
@@ -174,31 +184,36 @@ def with_normal_forces(contacts: Contacts, push: jax.Array) -> Contacts:
     )
 
 
-def slip_frames(along: jax.Array) -> jax.Array:
-    """Axes (m, 2, 2) in the tangent plane of each contact: `along` (m, 2), and at right angles."""
+def slip_frames(along: Float[Array, "m 2"]) -> Float[Array, "m 2 2"]:
+    """Axes (m, axis, component) in each plane of contact: `along`, and at right angles to it."""
     return jnp.stack([along, jnp.stack([-along[:, 1], along[:, 0]], axis=1)], axis=1)
 
 
-def _turned(tangent: Kinematics, along: jax.Array) -> Kinematics:
-    """What slides in space, along (m, 2) and at right angles to it."""
+def _turned(tangent: Kinematics, along: Float[Array, "m 2"]) -> Kinematics:
+    """Kinematics along tangents of which the first is `along`, the second at right angles."""
     axes = slip_frames(along)
 
-    def turned(rows: jax.Array) -> jax.Array:
-        """Rows (.., 2 m) along the axes."""
+    def turned(rows: Float[Array, "*n t"]) -> Float[Array, "*n t"]:
+        """Components of (.., 2 m) along the axes of each contact."""
         each = rows.reshape(*rows.shape[:-1], -1, 2)
         return jnp.einsum("...mk,mjk->...mj", each, axes).reshape(rows.shape)
 
     return Kinematics(*(turned(x) for x in tangent))
 
 
-def friction_acceleration(contacts: Contacts, mu: jax.Array, normal: jax.Array) -> jax.Array:
-    """How much friction can change the slip of each contact itself (m,) [m/s^2]."""
+def friction_acceleration(
+    contacts: Contacts, mu: Float[Array, " m"], normal: Float[Array, " m"]
+) -> Float[Array, " m"]:
+    """Slip acceleration `mu lambda_n W_tt` [m/s^2] that friction can give each contact itself.
+
+    `normal` are forces lambda_n [N]; W_tt is the mean over the tangents of the contact.
+    """
     m = len(mu)
     return mu * normal * by_contact(jnp.diagonal(contacts.delassus)[m:], m).mean(axis=1)
 
 
-def cone_margins(contacts: Contacts, mu: jax.Array, force: Forces) -> jax.Array:
-    """What the forces leave of the friction cones (m,) [m/s^2], 0 at the rim."""
+def cone_margins(contacts: Contacts, mu: Float[Array, " m"], force: Forces) -> Float[Array, " m"]:
+    """Distances `(mu lambda_n - |lambda_t|) W_tt` from the rim of the friction cone [m/s^2]."""
     assert force.tangential is not None
     m = len(mu)
     sizes = by_contact(jnp.diagonal(contacts.delassus)[m:], m).mean(axis=1)
@@ -206,18 +221,30 @@ def cone_margins(contacts: Contacts, mu: jax.Array, force: Forces) -> jax.Array:
 
 
 def slip_begins(
-    contacts: Contacts, mu: jax.Array, normal: jax.Array, growth: jax.Array
-) -> jax.Array:
-    """How much faster (m,) slip may grow, than at the rate `growth` (m,), and yet only begin."""
+    contacts: Contacts,
+    mu: Float[Array, " m"],
+    normal: Float[Array, " m"],
+    growth: Float[Array, " m"],
+) -> Float[Array, " m"]:
+    """Margins `_BEGINNING mu lambda_n W_tt - growth` [m/s^2]: slip begins while they are positive.
+
+    `normal` are forces [N], `growth` is the acceleration of the slip [m/s^2].
+    """
     return _BEGINNING * friction_acceleration(contacts, mu, normal) - growth
 
 
 def forces(
-    contacts: Contacts, mu: jax.Array | None, modes: Modes, slip: jax.Array | None = None
+    contacts: Contacts,
+    mu: Float[Array, " m"] | None,
+    modes: Modes,
+    slip: Float[Array, "m r"] | None = None,
 ) -> Forces:
-    """The forces that keep the modes, and the acceleration with them.
+    """The contact forces that keep the modes, and the acceleration v' with them.
 
-    `slip` (m, rows): unit vectors of those that slide; None: in the plane, `modes.sign`.
+    Equation: `W lambda + approach = 0` in the rows that the modes hold (`held_rows`),
+    `lambda_t = -mu lambda_n d` at contacts that slide, lambda = 0 at open ones.
+
+    `slip`: directions d, unit vectors; None: in the plane, `modes.sign`.
     """
     m = contacts.normal.value.shape[0]
     if contacts.tangent is None or mu is None:
@@ -229,10 +256,10 @@ def forces(
     right = -contacts.approach
     none = jnp.zeros(m, w.dtype)
 
-    def shared(_: int, known: jax.Array) -> jax.Array:
-        """Forces (k,), shared by the normal forces of the last pass."""
+    def shared(_: Int[Array, ""], known: Float[Array, " k"]) -> Float[Array, " k"]:
+        """Forces of held rows; tangential ones are shared by the normal forces of the last pass."""
         # redundant sticking contacts share what they hold in proportion to mu lambda_n, as in
-        # `solvers.friction`: they break loose together
+        # `numerics/friction.py`: they break loose together
         press = mu * jnp.maximum(jax.lax.stop_gradient(known[:m]), 0.0)
         share = jnp.repeat(load_shares(press, _LEAST_SHARE), drag.shape[1])
         weight = jnp.concatenate([none + 1, share])
@@ -244,11 +271,12 @@ def forces(
 
 
 def _dragged(
-    contacts: Contacts, mu: jax.Array, modes: Modes, slip: jax.Array | None
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """What forces do to accelerations (k, k), friction going with the normal force where it slides.
+    contacts: Contacts, mu: Float[Array, " m"], modes: Modes, slip: Float[Array, "m r"] | None
+) -> tuple[Float[Array, "k k"], Bool[Array, " k"], Float[Array, "m r"]]:
+    """Delassus matrix with sliding friction, held rows (k,), and `drag = -lambda_t / lambda_n`.
 
-    Beside it, which rows are held (k,), and `-lambda_t / lambda_n` of what slides (m, rows).
+    Equation: the normal force of a contact that slides brings `lambda_t = -mu lambda_n d`: its
+    column of the matrix is `W_n - sum_r W_t mu d`. `drag` is mu d where it slides, else 0.
     """
     m, k = modes.active.shape[0], contacts.delassus.shape[0]
     slides = (modes.active & ~modes.stick)[:, None]
@@ -259,9 +287,12 @@ def _dragged(
 
 
 def regularity(
-    contacts: Contacts, mu: jax.Array, modes: Modes, slip: jax.Array | None = None
-) -> jax.Array:
-    """Determinant () of the matrix of the forces, over what it is if nothing slides with friction.
+    contacts: Contacts,
+    mu: Float[Array, " m"],
+    modes: Modes,
+    slip: Float[Array, "m r"] | None = None,
+) -> Float[Array, ""]:
+    """Determinant of the held rows of `_dragged`, divided by that of W: 1 without sliding friction.
 
     Of one contact `1 - mu s W_nt / W_nn`, with s the sign of slip. Where it has fallen to 0 forces
     that keep the modes do not exist, or elastic contacts would not settle at them; below the root
@@ -279,14 +310,17 @@ def regularity(
 
 
 def rest_acceleration(dtype: jnp.dtype) -> float:
-    """See `_REST_ACCELERATION`."""
+    """`_REST_ACCELERATION`, in single precision a few roundings."""
     return not_rounding(_REST_ACCELERATION, dtype)
 
 
-def _sizes(dragged: jax.Array, delassus: jax.Array, m: int) -> jax.Array:
-    """Diagonal (k,) that scales forces at m contacts: without friction, as slip does not change it.
+def _sizes(
+    dragged: Float[Array, "k k"], delassus: Float[Array, "k k"], m: int
+) -> Float[Array, " k"]:
+    """Diagonal that scales the equations of `_least`: W_jj, which slip does not change.
 
-    Where a contact jams, that with friction: beside the other one it would be less than the ridge.
+    A contact about to jam has that with friction, `dragged`: it would be less than the ridge beside
+    W_jj.
     """
     with_friction, without = jnp.diagonal(dragged), jnp.diagonal(delassus)
     sizes = jnp.where(with_friction < _JAMS * without, with_friction, without)
@@ -295,8 +329,14 @@ def _sizes(dragged: jax.Array, delassus: jax.Array, m: int) -> jax.Array:
     return jnp.concatenate([sizes[:m], jnp.repeat(rows.mean(axis=1), rows.shape[1])])
 
 
-def _without_friction(w: jax.Array, right: jax.Array, held: jax.Array) -> jax.Array:
-    """As `_least`; few contacts are taken not to be redundant."""
+def _without_friction(
+    w: Float[Array, "k k"], right: Float[Array, "k c"], held: Bool[Array, " k"]
+) -> Float[Array, "k c"]:
+    """Solution x of `w x = right` on held rows, 0 elsewhere; w is symmetric.
+
+    Up to `_INDEPENDENT` contacts are taken not to be redundant and solved directly, others by
+    `_least`.
+    """
     if len(held) > _INDEPENDENT:
         return _least(w, right, held, jnp.ones_like(right[:, 0]), jnp.diagonal(w), _THIN_RIDGE)
     k = jnp.where(held[:, None] & held[None, :], w, jnp.eye(len(held), dtype=w.dtype))
@@ -304,16 +344,17 @@ def _without_friction(w: jax.Array, right: jax.Array, held: jax.Array) -> jax.Ar
 
 
 def _least(
-    w: jax.Array,
-    right: jax.Array,
-    held: jax.Array,
-    weight: jax.Array,
-    size: jax.Array,
+    w: Float[Array, "k k"],
+    right: Float[Array, "k c"],
+    held: Bool[Array, " k"],
+    weight: Float[Array, " k"],
+    size: Float[Array, " k"],
     ridge: float = _RIDGE,
-) -> jax.Array:
-    """`w x = right` (k, columns) on the rows that are held; 0 elsewhere.
+) -> Float[Array, "k c"]:
+    """Solution x (k, c) of `w x = right` on the rows that are held; 0 elsewhere.
 
-    Where that has many solutions, the one of least `sum size_j x_j^2 / weight_j` if w is symmetric.
+    Where that has many solutions, the one of least `sum size_j x_j^2 / weight_j` if w is symmetric:
+    by a `ridge` beside the matrix scaled to unit diagonal, whose effect refinements remove.
     Derivatives take `size` for constant: it must not change with slip.
     """
     scale = jnp.where(held, 1 / jnp.sqrt(size), 1.0)
@@ -328,12 +369,15 @@ def _least(
 
 
 def constraint_impulse(
-    contacts: Contacts, mu: jax.Array | None, modes: Modes, rates: jax.Array
-) -> jax.Array:
-    """Impulses p that take `rates` to 0 where the modes hold them, the least ones.
+    contacts: Contacts,
+    mu: Float[Array, " m"] | None,
+    modes: Modes,
+    rates: Float[Array, "rows ..."],
+) -> Float[Array, "k ..."]:
+    """Impulses p that bring `rates` to 0: `W p = -rates` in held rows, the least ones.
 
-    Rates and impulses are (k,) or (k, columns); of normals alone, rates may have m rows.
-    `contacts.moved @ p` is the change of velocity; of position, if `rates` are gaps (first order).
+    Rates have k rows, or m of normals alone; impulses have k. `contacts.moved @ p` is the change of
+    velocity, or of position where `rates` are gaps (to first order).
     """
     friction = contacts.tangent is not None and mu is not None
     size = rates.shape[0]
@@ -348,9 +392,12 @@ def constraint_impulse(
 
 
 def contact_powers(
-    system: System, contacts: Contacts, result: Forces, t: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Power of friction at every contact (m,) and of the base () [W]."""
+    system: System, contacts: Contacts, result: Forces, t: Float[Array, ""]
+) -> tuple[Float[Array, " m"], Float[Array, ""]]:
+    """Power of friction at every contact `lambda_t . u` and of the base [W].
+
+    The base moves the contact forces: `(N lambda_n + H lambda_t) . B y_b'`.
+    """
     friction = jnp.zeros_like(result.normal)
     push = contacts.normal.gradient @ result.normal
     if contacts.tangent is not None and result.tangential is not None:
@@ -363,16 +410,22 @@ def contact_powers(
 
 def slip_margins(
     contacts: Contacts,
-    mu: jax.Array,
+    mu: Float[Array, " m"],
     modes: Modes,
     force: Forces,
-    lasts: jax.Array,
-    speed_scale: jax.Array,
-) -> jax.Array:
-    """What must stay positive (m,) of contacts that slide, in space along the first of their rows.
+    lasts: Float[Array, ""],
+    speed_scale: Float[Array, ""],
+) -> Float[Array, " m"]:
+    """Margins that are positive while a contact slides: `u_1 lasts`, slip times `regularity`.
 
-    Slip times what `lasts` of the regularity of the forces. Where slip begins, accelerations: that
-    ends where slip grows faster or falls back to 0, or where the contact leans aside.
+    u_1 is the slip along its direction, in space the first tangential row; `lasts` is what is left
+    of `regularity` above its bound. Where slip only begins (`BEGINS`), with its growth u_1' and
+    `c = mu lambda_n W_tt`, the least of three accelerations [m/s^2]; that mode ends where
+
+    - slip falls back to 0: `c u_1 / speed_scale + max(u_1', 0)`;
+    - it grows faster: `_BEGINNING c - u_1'`;
+    - the contact leans aside: `c (1 - |lambda_t2| / (_LEANING mu lambda_n))`, lambda_t2 the force
+      across the slip.
     """
     m = len(mu)
     assert contacts.tangent is not None
@@ -395,104 +448,119 @@ def slip_margins(
 
 
 class ModeChoice(NamedTuple):
-    """Modes; with friction they may not be `consistent`, and there may be `several`.
+    """Modes of the contacts after an event, as complementarity of forces and accelerations asks.
 
-    Of several that is taken which sticks most. But a contact does not go on sliding where elastic
-    contacts would not settle at such forces (see `regularity`): it `parts` (m,).
+    Of several solutions that one is taken which sticks most. But a contact does not go on sliding
+    where elastic contacts would not settle at such forces (see `regularity`): it parts.
     """
 
     modes: Modes
-    consistent: jax.Array
-    regularity: jax.Array  # of the modes
-    several: jax.Array
-    parts: jax.Array
+    consistent: Bool[
+        Array, ""
+    ]  # the modes solve the problem; with friction it may have no solution
+    regularity: Float[Array, ""]  # of the modes
+    several: Bool[Array, ""]  # the problem has several solutions
+    parts: Bool[Array, " m"]  # touching contacts that are taken to open
 
 
 def choose_with_friction(
     contacts: Contacts,
-    mu: jax.Array,
+    mu: Float[Array, " m"],
     before: Modes,
-    touching: jax.Array,
-    released: jax.Array,
-    sliding: jax.Array,
-    slack: jax.Array,
+    touching: Bool[Array, " m"],
+    released: Bool[Array, " 2*m"],
+    sliding: Bool[Array, " m"],
+    slack: Float[Array, ""],
 ) -> ModeChoice:
-    """Modes of the contacts that touch at rest.
+    """Modes of the contacts that touch at rest, with Coulomb's friction.
+
+    Equation: `a = W lambda + approach`, `0 <= a_n _|_ lambda_n >= 0`, and tangentially
+    `lambda_t = -mu lambda_n u / |u|` where a contact slides, elsewhere `|lambda_t| <= mu lambda_n`
+    with `lambda_t = -mu lambda_n a_t / |a_t|` where slip starts. Up to `_PASSES` problems are
+    solved: a contact whose slip contradicts the direction assumed for it is left free in the next.
 
     Args:
         contacts: contact space.
-        mu: coefficients of friction (m,).
+        mu: coefficients of friction.
         before: modes up to now.
-        touching: (m,) gap and gap velocity are 0.
-        released: (2 m,) what has just let go: it is held again only by a force, not by rounding.
-        sliding: (m,) whether the tangential velocity is not 0.
-        slack: gap accelerations below it are rounding.
+        touching: gap and gap velocity are 0.
+        released: (2 m,) normal, then tangential constraints that have just ended: they hold again
+            only with a force, not by rounding.
+        sliding: the slip is not 0.
+        slack: gap accelerations [m/s^2] below it are rounding.
     """
     contacts, mu = jax.lax.stop_gradient((contacts, mu))
     assert contacts.tangent is not None
     slip_began = jnp.any(before.active & ~before.stick & (before.sign == BEGINS))
-    asked = _ModeQuestion(contacts, mu, touching, released, sliding, slip_began, slack)
-    now, direction_now = _expected(asked, before)
+    problem = _ModeProblem(contacts, mu, touching, released, sliding, slip_began, slack)
+    expected, directions = _expected_modes(problem, before)
     no, one = jnp.asarray(False), jnp.ones_like(slack)
-    start = _ModeTrial(now, direction_now, touching, one, no, no, no, jnp.asarray(0))
+    start = _ModeTrial(expected, directions, touching, one, no, no, no, jnp.asarray(0))
     end = jax.lax.while_loop(
-        lambda tried: ~tried.done & (tried.passes < _PASSES),
-        lambda tried: _next_trial(asked, tried),
+        lambda trial: ~trial.done & (trial.passes < _PASSES),
+        lambda trial: _next_trial(problem, trial),
         start,
     )
-    parts, several = touching & ~end.allowed, end.several & end.solved
+    parts, several = touching & ~end.may_press, end.several & end.solved
     return ModeChoice(end.modes, end.solved, end.regularity, several, parts)
 
 
-class _ModeQuestion(NamedTuple):
-    """What `choose_with_friction` is asked, without derivatives."""
+class _ModeProblem(NamedTuple):
+    """Data of the problem of `choose_with_friction`, without derivatives; see its arguments."""
 
     contacts: Contacts
-    mu: jax.Array
-    touching: jax.Array  # (m,)
-    released: jax.Array  # (2 m,)
-    sliding: jax.Array  # (m,)
-    slip_began: jax.Array  # () slip that only began before: now it slides or sticks, nothing begins
-    slack: jax.Array
+    mu: Float[Array, " m"]
+    touching: Bool[Array, " m"]
+    released: Bool[Array, " 2*m"]
+    sliding: Bool[Array, " m"]
+    # a contact had mode BEGINS: now it slides or sticks, and no other one gets that mode
+    slip_began: Bool[Array, ""]
+    slack: Float[Array, ""]
 
     @property
     def sticking_modes(self) -> Modes:
-        """What touches and does not slide sticks."""
+        """Modes in which all touching contacts are persistent, and stick unless they slide."""
         ones = jnp.ones(len(self.mu), self.mu.dtype)
         return Modes(self.touching, self.touching & ~self.sliding, ones)
 
 
 class _ModeTrial(NamedTuple):
-    """One try of `choose_with_friction`."""
+    """Solution of one complementarity problem of `choose_with_friction`."""
 
     modes: Modes
-    known: jax.Array  # (m, rows) directions of slip that are fixed, 0 where they are solved for
-    allowed: jax.Array  # (m,) contacts that may be pressed
-    regularity: jax.Array
-    several: jax.Array
-    solved: jax.Array
-    done: jax.Array
-    passes: jax.Array
+    known: Float[Array, "m r"]  # directions of slip that are assumed, 0 where they are solved for
+    may_press: Bool[Array, " m"]  # contacts that take part; others are taken to open
+    regularity: Float[Array, ""]
+    several: Bool[Array, ""]
+    solved: Bool[Array, ""]
+    done: Bool[Array, ""]  # solved, and no assumed direction is contradicted
+    passes: Int[Array, ""]
 
 
-def _expected(asked: _ModeQuestion, before: Modes) -> tuple[Modes, jax.Array]:
-    """Modes as they were but for what has let go; directions (m, rows) of slip that is known."""
-    contacts, mu, touching, released, sliding, _, slack = asked
+def _expected_modes(problem: _ModeProblem, before: Modes) -> tuple[Modes, Float[Array, "m r"]]:
+    """Modes to try first: as before, but for constraints that ended; directions of known slip.
+
+    The direction of a contact that slides is that of its slip u; slip starts against the last force
+    of sticking, `-lambda_t / |lambda_t|`; 0 where the direction is to be solved for.
+    """
+    contacts, mu, touching, released, sliding, _, slack = problem
     assert contacts.tangent is not None
     m, spatial = len(mu), in_space(contacts)
     slid = before.active & ~before.stick
-    broken = released[m:] & before.stick & ~sliding
-    ended = jnp.any(released[m:] & slid)
+    broken = released[m:] & before.stick & ~sliding  # friction has reached the cone: slip starts
+    ended = jnp.any(released[m:] & slid)  # slip of a contact has come to 0
     # where sticking breaks at one contact of a body, those that began to slide before go on
     goes_on = slid & jnp.any(released[m:] & before.stick) & ~ended & ~sliding
     starts = broken | goes_on if spatial else broken  # in space directions are not remembered
-    now = Modes(touching, ~sliding & (starts | ~goes_on), jnp.where(goes_on, before.sign, 0.0))
+    stick = ~sliding & (starts | ~goes_on)
+    now = Modes(touching, stick, jnp.where(goes_on, before.sign, 0.0))
     moves = direction(by_contact(contacts.tangent.rate, m))
     slides = jnp.where(sliding[:, None], moves, 0.0 if spatial else now.sign[:, None])
     # sliding begins against the last force of sticking
     held_on = now._replace(active=touching & ~released[:m])
-    tries = jax.tree.map(lambda *x: jnp.stack(x), held_on, asked.sticking_modes)
-    both = jax.lax.map(lambda modes: forces(contacts, mu, modes, slides), tries)
+    # one evaluation of forces for both modes, so that it is compiled once
+    two_modes = jax.tree.map(lambda *x: jnp.stack(x), held_on, problem.sticking_modes)
+    both = jax.lax.map(lambda modes: forces(contacts, mu, modes, slides), two_modes)
     held, stuck = (jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1))
     assert held.tangential is not None
     against = by_contact(held.tangential, m)
@@ -505,12 +573,18 @@ def _expected(asked: _ModeQuestion, before: Modes) -> tuple[Modes, jax.Array]:
     return now, jnp.where(starts[:, None], against, slides)
 
 
-def _next_trial(asked: _ModeQuestion, tried: _ModeTrial) -> _ModeTrial:
-    """Modes by a complementarity problem, and what the next try must change."""
-    contacts, mu, touching, released, sliding, slip_began, slack = asked
-    m, known = len(mu), tried.known
+def _next_trial(problem: _ModeProblem, last: _ModeTrial) -> _ModeTrial:
+    """Modes by the problem of `choose_with_friction`, with directions and contacts of `last`.
+
+    Of what it contradicts the next trial is free: assumed directions against which slip starts, and
+    a contact that would slide although its forces are singular (it is wedged) where another
+    solution exists.
+    """
+    contacts, mu, touching, released, sliding, slip_began, slack = problem
+    m, known = len(mu), last.known
     dtype, diagonal = known.dtype, jnp.diagonal(contacts.delassus)[:m]
-    rows = jnp.concatenate([tried.allowed, jnp.repeat(tried.allowed, known.shape[1])])
+    # rows of contacts that take part: normals (m), then their tangents; others get lambda = 0
+    rows = jnp.concatenate([last.may_press, jnp.repeat(last.may_press, known.shape[1])])
     eye = jnp.eye(len(rows), dtype=dtype)
     w = jnp.where(rows[:, None] & rows[None], contacts.delassus, eye)
     free = jnp.where(rows, contacts.approach, 0.0)
@@ -518,51 +592,59 @@ def _next_trial(asked: _ModeQuestion, tried: _ModeTrial) -> _ModeTrial:
         w, free[:m], free[m:], mu * jnp.ones(m, dtype), complementary=True,
         sliding=known.reshape(-1),
     )  # fmt: skip
-    rate = contacts.approach + contacts.delassus @ jnp.concatenate(
+    acceleration = contacts.approach + contacts.delassus @ jnp.concatenate(
         [solution.normal, solution.tangential]
     )
-    turns, is_known = by_contact(rate[m:], m), length(known) > 0
-    active = tried.allowed & (rate[:m] <= slack)
+    along, is_known = by_contact(acceleration[m:], m), length(known) > 0  # (m, r) of the slip
+    active = last.may_press & (acceleration[:m] <= slack)
+    # what has just let go needs a force, as an acceleration, that is no rounding
     active = active & (~released[:m] | (solution.normal * diagonal > slack))
-    slips = is_known | (length(turns) > slack)
-    slide = jnp.where(is_known[:, None], known, direction(turns))
+    slips = is_known | (length(along) > slack)
+    slide = jnp.where(is_known[:, None], known, direction(along))
     sign = slide[:, 0]
     if in_space(contacts):
-        growth = jnp.sum(turns * slide, axis=1)
+        growth = jnp.sum(along * slide, axis=1)
         slow = slip_begins(contacts, mu, solution.normal, growth) > 0
         sign = jnp.where(slow & ~sliding & ~slip_began, float(BEGINS), 1.0)
     modes = Modes(active, active & ~slips, sign)
     # what was taken to slide from rest must do so
-    returns = active & is_known & ~sliding & (jnp.sum(known * turns, axis=1) < -slack)
+    returns = active & is_known & ~sliding & (jnp.sum(known * along, axis=1) < -slack)
     several = solution.status == CODE["several_outcomes"]
     solved = solution.status <= CODE["several_outcomes"]
-    given = jnp.where(solved, returns, ~sliding)[:, None]
+    free_again = jnp.where(solved, returns, ~sliding)[:, None]
     # what would go on sliding though it cannot parts, where that is a solution, too
-    pressed = jnp.where(solved, active, tried.allowed)
+    pressed = jnp.where(solved, active, last.may_press)
     pressing = modes._replace(active=pressed, stick=pressed & ~slips)
     regular = regularity(contacts, mu, pressing, slide)
-    # twice: flights end at once it
+    # flights end where the regularity falls to `root`: contacts are wedged from twice that on
     wedged = active & slips & (regular <= 2 * precision(dtype).root)
-    open_ones_part = jnp.all(~touching | tried.allowed | (rate[:m] >= -slack))
+    open_ones_part = jnp.all(~touching | last.may_press | (acceleration[:m] >= -slack))
     return _ModeTrial(
-        modes,
-        jnp.where(given, 0.0, known),
-        tried.allowed & ~(wedged & several),
-        regular,
-        several | tried.several,
-        solved & open_ones_part & ~jnp.any(wedged),
-        solved & open_ones_part & ~jnp.any(wedged | returns),
-        tried.passes + 1,
+        modes=modes,
+        known=jnp.where(free_again, 0.0, known),
+        may_press=last.may_press & ~(wedged & several),
+        regularity=regular,
+        several=several | last.several,
+        solved=solved & open_ones_part & ~jnp.any(wedged),
+        done=solved & open_ones_part & ~jnp.any(wedged | returns),
+        passes=last.passes + 1,
     )
 
 
-def pressed_together(
-    contacts: Contacts, touching: jax.Array, slack: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """`0 <= lambda _|_ W lambda + approach >= 0` over touching contacts, without friction.
+class Pressed(NamedTuple):
+    """Contacts that a frictionless contact problem presses together."""
 
-    Returns:
-        Which contacts (m,) are pressed, which (m,) neither press nor part, and lambda (m,).
+    pressed: Bool[Array, " m"]  # lambda > 0
+    kept_closed: Bool[Array, " m"]  # neither force nor gap acceleration
+    force: Float[Array, " m"]  # lambda [N]
+
+
+def pressed_together(
+    contacts: Contacts, touching: Bool[Array, " m"], slack: Float[Array, ""]
+) -> Pressed:
+    """Normal forces of touching contacts: `0 <= lambda _|_ W lambda + approach >= 0`, no friction.
+
+    Gap accelerations below `slack` [m/s^2] are rounding.
     """
     contacts = jax.lax.stop_gradient(contacts)
     m = touching.shape[0]
@@ -572,4 +654,4 @@ def pressed_together(
     # redundant contacts: any of the solutions will do
     solution = solve_lcp(jnp.where(both, w, eye), b, regular=True)
     pressed = touching & (solution.z * jnp.diagonal(w) > slack)
-    return pressed, touching & ~pressed & (solution.w <= slack), solution.z
+    return Pressed(pressed, touching & ~pressed & (solution.w <= slack), solution.z)

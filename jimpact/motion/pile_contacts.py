@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Array, Float, Int
 
 from jimpact.bodies.closed_pairs import listed_pairs
 from jimpact.core.law import Law
@@ -18,7 +19,7 @@ from jimpact.tools.compiling import quick_jit
 
 
 class PileContacts(NamedTuple):
-    """Of `TimeStepping.contacts`: m contacts, those of bodies i < j first, then with walls.
+    """The m closed contacts of a pile in one step: those of bodies i < j first, then with walls.
 
     Args:
         bodies: (m, 2) numbers i, j; -1 for a wall.
@@ -42,15 +43,15 @@ class PileContacts(NamedTuple):
     normals: np.ndarray
     impulse: np.ndarray
     tangential: np.ndarray
-    velocity: jax.Array
-    status: jax.Array
+    velocity: Float[Array, " n"]
+    status: Int[Array, ""]
     scene: Scene
 
 
 def contacts_of_step(
     system: System, law: Law, q: Any, v: Any, t: Any, step: float, closed_below: Any
 ) -> PileContacts:
-    """The contacts of a pile in a step, see `TimeStepping.contacts`."""
+    """Closed contacts of a pile and their impulses in one step, see `TimeStepping.contacts`."""
     check_kind("system", system, System)
     check_kind("law", law, Law)
     if not is_pile(system):
@@ -63,13 +64,21 @@ def contacts_of_step(
     system, law, q, v = in_common_dtype(system, law, q, v)
     start = start_of(system, law, q, v, (t, t + step), closed_below)
     check_stepped_law(system, law, start.contacts, law.joins_step and system.friction is None)
-    pairs, impulse, after, status = jax.device_get(_step(start, law))
-    if not pairs.filled:
+    made = jax.device_get(_step(start, law))
+    if not made.pairs.filled:
         raise ValueError("Arguments `q` and `v` must lead to a contact within the step.")
-    order, bodies, ways, scene = listed_pairs(pairs, system.mass)
-    x, places = impulse[order], (ways.shape[3] + 1) // 2
-    tangential = np.einsum("mk,mkx->mx", x[:, 1:], ways[:, 1:, 0, :places])
-    return PileContacts(bodies, ways[:, 0, 0, :places], x[:, 0], tangential, after, status, scene)
+    order, bodies, directions, scene = listed_pairs(made.pairs, system.mass)
+    # directions (m, b, body i or j, velocity): the first d velocities of a body are those of places
+    impulse, d = made.impulse[order], (directions.shape[3] + 1) // 2
+    return PileContacts(
+        bodies=bodies,
+        normals=directions[:, 0, 0, :d],
+        impulse=impulse[:, 0],
+        tangential=np.einsum("mk,mkx->mx", impulse[:, 1:], directions[:, 1:, 0, :d]),
+        velocity=made.velocity,
+        status=made.status,
+        scene=scene,
+    )
 
 
 _step = quick_jit(step_of_pile)

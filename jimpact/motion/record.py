@@ -10,6 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from jimpact.tools.records import as_data, fields_as_data
 from jimpact.tools.status import STATUS, Status
@@ -28,8 +29,11 @@ _NAMES = {
 }
 
 
+AnyArray = Array | np.ndarray  # on the host `Motion.then` and `joined` take rows by NumPy
+
+
 class Events(eqx.Module):
-    """Rows of events, in time; rows beyond `count` are NaN or 0.
+    """Rows of events, in time; rows beyond `count` are NaN or 0. E: number of rows.
 
     `kind` is an index of `jimpact.motion.record.EVENT_KINDS`: an `accumulation` is the impact at
     which the rest of an infinite sequence is passed; by estimates from its energy, the force that
@@ -39,27 +43,27 @@ class Events(eqx.Module):
     tangentially.
     """
 
-    count: jax.Array
-    time: jax.Array  # (E,)
-    kind: jax.Array  # (E,)
-    contacts: jax.Array  # (E, m) that take part
-    q: jax.Array  # (E, n)
-    velocity_before: jax.Array
-    velocity_after: jax.Array
-    impulse: jax.Array  # (E, m)
-    tangential_impulse: jax.Array  # (E, m), in space (E, 2 m)
-    energy: jax.Array  # (E, 2, m)
-    status: jax.Array  # (E,) of the law, see `jimpact.STATUS`
-    accumulation_end: jax.Array  # (E,)
-    accumulation_gap: jax.Array
+    count: Int[AnyArray, "*B"]
+    time: Float[AnyArray, "*B E"]
+    kind: Int[AnyArray, "*B E"]
+    contacts: Bool[AnyArray, "*B E m"]  # that take part
+    q: Float[AnyArray, "*B E nq"]
+    velocity_before: Float[AnyArray, "*B E n"]
+    velocity_after: Float[AnyArray, "*B E n"]
+    impulse: Float[AnyArray, "*B E m"]
+    tangential_impulse: Float[AnyArray, "*B E t"]  # t = m, in space 2 m
+    energy: Float[AnyArray, "*B E 2 m"]
+    status: Int[AnyArray, "*B E"]  # of the law, see `jimpact.STATUS`
+    accumulation_end: Float[AnyArray, "*B E"]
+    accumulation_gap: Float[AnyArray, "*B E"]
 
 
 def no_events(size: int, q: jax.Array, v: jax.Array, m: int, tangents: int | None = None) -> Events:
-    """An empty table of events of m contacts; `tangents`: tangential impulses, None: m."""
+    """Table of `size` empty rows for events of m contacts; `tangents`: their number, None: m."""
     dtype, n = q.dtype, v.shape[0]
 
-    def blank(*shape: int) -> jax.Array:
-        """NaN (size, *shape)."""
+    def blank(*shape: int) -> Float[Array, "size ..."]:
+        """NaN for each row, of this shape."""
         return jnp.full((size, *shape), jnp.nan, dtype)
 
     return Events(
@@ -80,18 +84,17 @@ def no_events(size: int, q: jax.Array, v: jax.Array, m: int, tangents: int | Non
 
 
 def joined(parts: list[Events], most: int) -> Events:
-    """The events of runs that follow each other, on the host; `most` rows at most."""
+    """Events of runs that follow each other as one table, on the host; `most` rows at most."""
     if len(parts) == 1 and len(parts[0].time) <= most:
         return parts[0]
-    rows = [dataclasses.replace(part, count=part.count[None]) for part in parts]
-    events = jax.tree.map(lambda *x: np.concatenate(x)[:most], *rows)
-    return jax.tree.map(
-        jnp.asarray, dataclasses.replace(events, count=np.sum(events.count, dtype=np.int32))
-    )
+    columns = [name for name in Events.__dataclass_fields__ if name != "count"]
+    rows = {name: np.concatenate([getattr(x, name) for x in parts])[:most] for name in columns}
+    count = np.sum([x.count for x in parts], dtype=np.int32)
+    return Events(jnp.asarray(count), **{name: jnp.asarray(x) for name, x in rows.items()})
 
 
-def with_row(events: Events, happened: jax.Array, values: dict[str, jax.Array]) -> Events:
-    """One row more if it `happened` and one is left; beyond the last row nothing is written."""
+def with_row(events: Events, happened: Bool[Array, ""], values: dict[str, jax.Array]) -> Events:
+    """Events with the `values` of fields in the next row if one `happened` and a row is left."""
     size = events.time.shape[0]
     row = jnp.where(happened, events.count, size)
     new = {
@@ -103,7 +106,7 @@ def with_row(events: Events, happened: jax.Array, values: dict[str, jax.Array]) 
 
 
 class Motion(eqx.Module):
-    """A motion: samples at equal times, events, energies, status.
+    """A motion, or a batch B of them: samples at equal times, events, energies, status.
 
     Samples that were not reached are NaN. The ledger
     `T + V - (T + V)(t_0) = force_work + base_work + sum contact_work` holds at every sample.
@@ -123,27 +126,27 @@ class Motion(eqx.Module):
         status: () code, 0 = ok; see `raise_on_failure`.
     """
 
-    time: jax.Array  # (S,)
-    q: jax.Array  # (S, n)
-    velocity: jax.Array  # (S, n)
-    kinetic_energy: jax.Array  # (S,) [J]
-    potential_energy: jax.Array
-    force_work: jax.Array
-    base_work: jax.Array
-    contact_work: jax.Array  # (S, 2, m): normal, tangential; <= 0 where contacts dissipate
-    gaps: jax.Array  # (S, m)
+    time: Float[Array, "*B S"]
+    q: Float[Array, "*B S nq"]
+    velocity: Float[Array, "*B S n"]
+    kinetic_energy: Float[Array, "*B S"]
+    potential_energy: Float[Array, "*B S"]
+    force_work: Float[Array, "*B S"]
+    base_work: Float[Array, "*B S"]
+    contact_work: Float[Array, "*B S 2 M"]  # normal, tangential; of a pile M = 1, else m
+    gaps: Float[Array, "*B S M"]
     events: Events
-    steps: jax.Array
-    status: jax.Array
+    steps: Int[Array, "*B"]
+    status: Int[Array, "*B"]
 
     @property
-    def energy(self) -> jax.Array:
-        """T + V (S,) [J]."""
+    def energy(self) -> Float[Array, "*B S"]:
+        """T + V [J]."""
         return self.kinetic_energy + self.potential_energy
 
     @property
-    def ledger_residual(self) -> jax.Array:
-        """(S,) [J]: what the ledger leaves unexplained."""
+    def ledger_residual(self) -> Float[Array, "*B S"]:
+        """Error of the ledger [J]: `T + V - (T + V)(t_0)` without all works."""
         work = self.force_work + self.base_work + jnp.sum(self.contact_work, axis=(-2, -1))
         return self.energy - self.energy[..., :1] - work
 
@@ -163,7 +166,7 @@ class Motion(eqx.Module):
         return {"q0": self.q[last], "v0": self.velocity[last], "t_end": times}
 
     def _reached(self) -> int:
-        """How many samples were reached."""
+        """Number of samples that were reached, of one motion."""
         if np.ndim(self.status):
             raise ValueError("A batch of motions has no common end: pick one motion of it.")
         return int(np.isfinite(np.asarray(self.q)).all(axis=-1).sum())
@@ -185,15 +188,18 @@ class Motion(eqx.Module):
             first, second = getattr(self, name)[:count], getattr(later, name)[1:]
             added = first[-1] if name.endswith("_work") else 0.0
             samples[name] = jnp.concatenate([first, second + added])
-        # what came after the last sample comes again
+        # events after the last sample occur in `later` again
         known = np.asarray(self.events.kind > 0) & (np.asarray(self.events.time) <= last)
         events = jax.tree.map(lambda x: np.asarray(x)[known] if np.ndim(x) else x, self.events)
         events = dataclasses.replace(events, count=jnp.int32(known.sum()))
-        table = joined([events, later.events], known.sum() + later.events.time.shape[0])
+        table = joined([events, later.events], int(known.sum()) + later.events.time.shape[0])
         return dataclasses.replace(later, **samples, events=table, steps=self.steps + later.steps)
 
     def explain_failure(self, row: Status, lanes: np.ndarray) -> str:
-        """Status of the law in the failed motions `lanes` with status `row`, for the message."""
+        """End of a message: names of the law's status codes in the failed motions `lanes`.
+
+        Empty unless their status, of which `row` is the table's row, is `law_failed`.
+        """
         if row.name != "law_failed":
             return ""
         codes = np.asarray(self.events.status).reshape(self.status.size, -1)[lanes]
@@ -214,7 +220,7 @@ class Motion(eqx.Module):
         return path
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything, ready for JSON (NaN: None)."""
+        """Samples, events by the names of their kinds, and status, ready for JSON (NaN: None)."""
         n = int(self.events.count)
         rows = {k: np.asarray(v)[:n] for k, v in vars(self.events).items() if k != "count"}
         events = rows | {"kind": [EVENT_KINDS[k] for k in rows["kind"]]}
@@ -261,7 +267,7 @@ def _arrays(motion: Motion) -> dict[str, jax.Array]:
 
 
 def read_motion(path: Path) -> Motion:
-    """The motion, or batch, that `Motion.save` wrote."""
+    """Read a motion, or batch, that `Motion.save` wrote; a ValueError says what else a file is."""
     wrong = f"Argument `path` must be a file of `Motion.save`, but '{path}' "
     try:
         with np.load(path, allow_pickle=False) as file:
@@ -286,7 +292,7 @@ def read_motion(path: Path) -> Motion:
 
 
 def _work_report(works: dict[str, Any]) -> str:
-    """What gave and what took energy; work that is rounding of the largest is left out."""
+    """Sentence of the works [J] by source, `gave` > 0 and `took` < 0; roundings are left out."""
     least = _ROUNDING * max(abs(float(work)) for work in works.values())
     parts = [
         f"{source} {'took' if work < 0 else 'gave'} {abs(float(work)):.4g} J"
@@ -297,7 +303,7 @@ def _work_report(works: dict[str, Any]) -> str:
 
 
 def _batch_report(motion: Motion) -> str:
-    """How many motions of a batch have which status."""
+    """Line with the number of motions of a batch, and how many have each status."""
     codes, counts = np.unique(np.asarray(motion.status), return_counts=True)
     parts = ", ".join(f"{n} {STATUS[c].name}" for c, n in zip(codes, counts, strict=True))
     return f"{np.size(motion.status)} motions: {parts}"

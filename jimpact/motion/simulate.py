@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, Int, Shaped
 
 from jimpact.core.law import Law
 from jimpact.laws.forces import Force
@@ -133,7 +134,7 @@ def simulate(
 
 
 def _on_host(arguments: Any) -> bool:
-    """Whether the motion runs at once: not within jit, vmap or derivatives."""
+    """True where the motion runs at once: not within jit, vmap or derivatives."""
     return not is_traced(arguments) and is_top_level_call()
 
 
@@ -148,7 +149,10 @@ def _waited(run: Callable[..., Motion], arguments: Any, progress: float | None) 
 def _in_runs(
     start: Start, law: Law, settings: Settings, samples: int, most: int, progress: float | None
 ) -> Motion:
-    """The motion in runs of `CHUNK` events, each of which goes on where the last one ended."""
+    """Motion in runs of `CHUNK` events, each of which goes on where the last one ended.
+
+    `most`: events in all; `progress` as of `EventDriven`.
+    """
     numbers: Any = empty_checkpoint(start.q, start.v, start.contacts, samples)
     parts: list[Events] = []
     duration = float(settings.duration)
@@ -171,8 +175,8 @@ def _events(
     past: Past | None,
     samples: int,
     max_events: int,
-) -> tuple[Motion, jax.Array | None]:
-    """The motion by events, and what the next run takes over."""
+) -> tuple[Motion, Float[Array, " size"] | None]:
+    """Motion by events, and with a `past` the numbers of the next one."""
     problem = _problem(start, law, settings, samples, past)
     course, numbers = event_driven(problem, max_events)
     return _recorded(start.system, problem.times, course), numbers
@@ -187,7 +191,7 @@ def _forced(
     max_events: int,
     until_apart: bool,
 ) -> Motion:
-    """The motion with contact forces."""
+    """Motion in which contact forces act throughout."""
     problem = _problem(start, force, settings, samples)
     course = compliant_motion(problem, max_events, until_apart)
     return _recorded(start.system, problem.times, course)
@@ -195,9 +199,9 @@ def _forced(
 
 @quick_jit
 def _stepped(
-    start: Start, law: Law, substeps: jax.Array, samples: int, joint: bool, max_events: int
+    start: Start, law: Law, substeps: Int[Array, ""], samples: int, joint: bool, max_events: int
 ) -> Motion:
-    """The motion by time stepping."""
+    """Motion by time stepping, `substeps` between two samples."""
     times = _equal_times(start, samples)
     course = time_stepping(start, law, times, substeps, joint, max_events)
     return _recorded(start.system, times, course)
@@ -206,36 +210,45 @@ def _stepped(
 def _problem(
     start: Start, law: Law | Force, settings: Settings, samples: int, past: Past | None = None
 ) -> MotionProblem:
-    """What determines the motion between events, sampled at equally spaced instants."""
+    """Data of a motion in flights, sampled at equally spaced instants."""
     times = _equal_times(start, samples)
     system, mu = start.system, start.friction
     return MotionProblem(system, law, mu, settings, start.q, start.v, times, start.contacts, past)
 
 
-def _recorded(system: System, times: jax.Array, course: Course) -> Motion:
-    """The record of a course, with its energies and gaps."""
+def _recorded(system: System, times: Float[Array, " S"], course: Course) -> Motion:
+    """Record of a course: its samples, energies T and V, gaps, events and status."""
     at = course.samples
     reached = jnp.isfinite(at.t)
     over = _one_by_one if is_pile(system) else jax.vmap
 
-    def sampled(function: Callable[..., jax.Array], *args: jax.Array) -> jax.Array:
-        """A function of the samples; a NaN does not reach the derivatives of other samples."""
-        rows = (jnp.where(reached.reshape(-1, *[1] * (x.ndim - 1)), x, x[:1]) for x in args)
+    def at_samples(
+        function: Callable[..., jax.Array], *args: Float[Array, "S ..."]
+    ) -> Float[Array, "S ..."]:
+        """Values of a function at all samples, NaN where they were not reached.
+
+        There it is evaluated at the first sample, so that no NaN reaches derivatives of others.
+        """
+
+        def by_sample(values: Shaped[Array, " S"], ndim: int) -> Shaped[Array, "S ..."]:
+            """Values (S,) with axes of length 1 behind, `ndim` in all."""
+            return values.reshape(-1, *[1] * (ndim - 1))
+
+        rows = (jnp.where(by_sample(reached, x.ndim), x, x[:1]) for x in args)
         values = over(function)(*rows)
-        each = (-1, *[1] * (values.ndim - 1))
         # times that were not reached are NaN, and so are their derivatives
-        return jnp.where(reached.reshape(each), values, at.t.reshape(each))
+        return jnp.where(by_sample(reached, values.ndim), values, by_sample(at.t, values.ndim))
 
     return Motion(
         time=times,
         q=at.q,
         velocity=at.v,
-        kinetic_energy=sampled(lambda q, v: kinetic(system, q, v), at.q, at.v),
-        potential_energy=sampled(lambda q: potential(system, q), at.q),
+        kinetic_energy=at_samples(lambda q, v: kinetic(system, q, v), at.q, at.v),
+        potential_energy=at_samples(lambda q: potential(system, q), at.q),
         force_work=at.work,
         base_work=at.base_work,
         contact_work=at.contact_work,
-        gaps=sampled(lambda q, t: recorded_gaps(system, q, t), at.q, times),
+        gaps=at_samples(lambda q, t: recorded_gaps(system, q, t), at.q, times),
         events=course.events,
         steps=course.steps,
         status=course.status,
@@ -243,11 +256,11 @@ def _recorded(system: System, times: jax.Array, course: Course) -> Motion:
 
 
 def _one_by_one(function: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
-    """As `jax.vmap`, in turn: branches that one sample does not take cost nothing."""
+    """The function over rows, as `jax.vmap`, but in turn: a branch not taken costs nothing."""
     return lambda *rows: jax.lax.map(lambda row: function(*row), rows)
 
 
-def _equal_times(start: Start, samples: int) -> jax.Array:
-    """`samples` instants from start to end."""
+def _equal_times(start: Start, samples: int) -> Float[Array, " S"]:
+    """Times [s] of samples equally spaced from start to end, both included."""
     share = jnp.arange(samples, dtype=start.time.dtype) / (samples - 1)
     return start.time + share * (start.end - start.time)

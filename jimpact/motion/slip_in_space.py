@@ -25,6 +25,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
 
 from jimpact.motion.persistent_contact import (
     BEGINS,
@@ -64,16 +65,21 @@ _RIDGE = 1e-6
 
 
 class SlipAxes(NamedTuple):
-    """Of the m contacts at the beginning of a step."""
+    """Directions and speeds of slip at the beginning of a step, of each contact."""
 
-    along: jax.Array  # d (m, 2)
-    speed: jax.Array  # |u_0| (m,), 0 where slip starts
-    least: jax.Array  # (m,) slip that at least lies ahead
-    last: jax.Array  # (m,) whether little of it is left
+    along: Float[Array, "m 2"]  # direction d, in the tangents of the body
+    speed: Float[Array, " m"]  # |u_0| [m/s], 0 where slip starts
+    least: Float[Array, " m"]  # [m/s] the slip along d counts as at least that
+    last: Bool[Array, " m"]  # |u_0| <= LAST of the speed scale: the landing on its end is next
 
 
-def slip_axes(contacts: Contacts, mu: jax.Array, modes: Modes, speed_scale: jax.Array) -> SlipAxes:
-    """The axes of a step that begins here."""
+def slip_axes(
+    contacts: Contacts, mu: Float[Array, " m"], modes: Modes, speed_scale: Float[Array, ""]
+) -> SlipAxes:
+    """Axes of a step that begins at these contacts: d = u / |u|, or `_first_directions` of u = 0.
+
+    `speed_scale`: the largest gap velocity or slip that the motion could have [m/s].
+    """
     assert contacts.tangent is not None
     m = len(mu)
     u = by_contact(contacts.tangent.rate, m)
@@ -94,8 +100,11 @@ def slip_axes(contacts: Contacts, mu: jax.Array, modes: Modes, speed_scale: jax.
     return SlipAxes(along, speed, jnp.where(starts, FIRST * speed_scale, least), last)
 
 
-def slip_within(axes: SlipAxes, modes: Modes, rate: jax.Array) -> jax.Array:
-    """Unit vectors (m, 2) of slip along the axes of the step; `rate` (t,) is along them, too."""
+def slip_within(axes: SlipAxes, modes: Modes, rate: Float[Array, " t"]) -> Float[Array, "m 2"]:
+    """Directions of slip in the axes of the step: `max(|u . d|, least) d + (u . n) n`, normalized.
+
+    It is d where slip begins, or has not started. `rate` is the slip u in these axes [m/s].
+    """
     u = by_contact(rate, len(axes.speed))
     # behind its end slip counts as in front of it: its direction would be stiff at the least one
     ahead = jnp.maximum(jnp.abs(u[:, 0]), axes.least)
@@ -105,19 +114,25 @@ def slip_within(axes: SlipAxes, modes: Modes, rate: jax.Array) -> jax.Array:
     return direction(jnp.stack([ahead, across], axis=1))
 
 
-def straightened(axes: SlipAxes, modes: Modes, rate: jax.Array) -> Modes:
-    """The modes in which slip (t,) at the end of a step is held across its direction where it ends.
+def straightened(axes: SlipAxes, modes: Modes, rate: Float[Array, " t"]) -> Modes:
+    """Modes that hold slip across its direction (`BEGINS`) where a step brings it to its end.
 
-    Of the last of a slip its step knows one direction only, and drifts across it by as much as is
-    left at its end: the next step would begin in any direction, and derivatives with it.
+    `rate` is the slip at the end of the step, in its axes [m/s]. The step before the end of a slip
+    knows one direction only, and drifts across it by as much as is left: the next step would begin
+    in any direction, and derivatives with it.
     """
     ahead = by_contact(rate, len(axes.speed))[:, 0]
     ends = modes.active & ~modes.stick & axes.last & (jnp.abs(ahead) < axes.speed)
     return modes._replace(sign=jnp.where(ends, BEGINS, modes.sign))
 
 
-def log_rates(axes: SlipAxes, modes: Modes, contacts: Contacts, force: Forces) -> jax.Array:
-    """Rates (m,) of `ln |u|` where contacts slide, 0 elsewhere and where little of u is left."""
+def log_rates(
+    axes: SlipAxes, modes: Modes, contacts: Contacts, force: Forces
+) -> Float[Array, " m"]:
+    """Rates `(ln |u|)' = u . u' / |u|^2` [1/s] where contacts slide, |u| at least `axes.least`.
+
+    0 elsewhere, and where slip is the `last` before its end.
+    """
     assert contacts.tangent is not None
     assert force.tangential is not None
     m = len(axes.speed)
@@ -129,17 +144,26 @@ def log_rates(axes: SlipAxes, modes: Modes, contacts: Contacts, force: Forces) -
     return jnp.where(slides, jnp.sum(u * growth, axis=1) / jnp.where(slides, square, 1.0), 0.0)
 
 
-def turning_errors(axes: SlipAxes, rtol: float, speed_scale: jax.Array) -> jax.Array:
-    """Errors (m,) of `ln |u|` that a step may make: more where little of the slip is left."""
+def turning_errors(
+    axes: SlipAxes, rtol: float, speed_scale: Float[Array, ""]
+) -> Float[Array, " m"]:
+    """Errors of `ln |u|` that a step may make: `TURNING rtol max(1, speed_scale / |u_0|)`.
+
+    At most `MOST_TURNING`, and that where the slip is the `last` before its end.
+    """
     share = speed_scale / jnp.where(axes.last, 1.0, axes.speed)
     errors = TURNING * rtol * jnp.maximum(share, 1.0)
     return jnp.where(axes.last, MOST_TURNING, jnp.minimum(errors, MOST_TURNING))
 
 
 def _first_directions(
-    contacts: Contacts, mu: jax.Array, modes: Modes, starts: jax.Array, moving: jax.Array
-) -> jax.Array:
-    """Directions d (m, 2) of slip: those in which it `starts`, elsewhere the `moving` ones.
+    contacts: Contacts,
+    mu: Float[Array, " m"],
+    modes: Modes,
+    starts: Bool[Array, " m"],
+    moving: Float[Array, "m 2"],
+) -> Float[Array, "m 2"]:
+    """Directions d of slip from rest where it `starts`, elsewhere the `moving` ones.
 
     Equation: slip starts along its own acceleration, `d x u' = 0` with `u' = a + W lambda` and the
     friction `lambda_t = -mu lambda_n d`: Newton's iterations on the angles of d, which begin
@@ -153,13 +177,13 @@ def _first_directions(
     some = starts & (length(against) > 0)
     angle = jnp.arctan2(jnp.where(some, against[:, 1], 0.0), jnp.where(some, against[:, 0], 1.0))
 
-    def unit(angle: jax.Array) -> jax.Array:
-        """Directions (m, 2)."""
+    def unit(angle: Float[Array, " m"]) -> Float[Array, "m 2"]:
+        """Directions d = (cos, sin) of the angles where slip starts, else the moving ones."""
         turned = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
         return jnp.where(starts[:, None], turned, moving)
 
-    def across(angle: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """`d x u'` (m,) where slip starts; again as what `jacfwd` returns beside the Jacobian."""
+    def across(angle: Float[Array, " m"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+        """`d x u'` where slip starts, twice: `jacfwd` returns the second beside the Jacobian."""
         d = unit(angle)
         sliding = forces(contacts, mu, plain, d)
         assert sliding.tangential is not None
@@ -170,8 +194,8 @@ def _first_directions(
 
     eye = jnp.eye(m, dtype=mu.dtype)
 
-    def newton(_: int, angle: jax.Array) -> jax.Array:
-        """One step of Newton's, of at most `_MOST_TURN`."""
+    def newton(_: Int[Array, ""], angle: Float[Array, " m"]) -> Float[Array, " m"]:
+        """Angles after one Newton step on `d x u' = 0`, of at most `_MOST_TURN`."""
         jacobian, turn = jax.jacfwd(across, has_aux=True)(angle)
         size = jax.lax.stop_gradient(jnp.max(jnp.abs(jacobian)))
         size = jnp.where(size > 0, size, 1.0)

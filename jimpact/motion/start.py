@@ -6,11 +6,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from jimpact.bodies.base import check_penetration, check_range
 from jimpact.core.law import Law
 from jimpact.core.scene import check_mass
-from jimpact.motion.dynamics import is_pile, mass_at, recorded_gaps, seen_from_base
+from jimpact.motion.dynamics import Mass, is_pile, mass_at, recorded_gaps, seen_from_base
 from jimpact.motion.system import System, check_functions
 from jimpact.tools.checks import as_float_array, check_shape, check_values, is_traced
 from jimpact.tools.compiling import precise_jit
@@ -29,30 +30,30 @@ MORE_CLOSED = 10
 
 
 class Start(NamedTuple):
-    """Where a motion of n velocities and m contacts begins."""
+    """Checked start of a motion: system, state, times, friction, and which gaps are closed."""
 
     system: System  # arrays that its functions close over are leaves, where they are traced
-    q: jax.Array  # (n,)
-    v: jax.Array  # (n,)
-    time: jax.Array  # () [s]
-    end: jax.Array  # () [s]
-    friction: jax.Array | None  # mu (m,), () of a pile; None: no contact has friction
-    closed_below: jax.Array  # () [m] contacts with smaller gaps are closed
-    gap_rounding: jax.Array  # () [m] smaller gaps are rounding
+    q: Float[Array, " nq"]
+    v: Float[Array, " n"]
+    time: Float[Array, ""]  # [s]
+    end: Float[Array, ""]  # [s]
+    friction: Float[Array, "..."] | None  # mu (m,), () of a pile; None: no contact has friction
+    closed_below: Float[Array, ""]  # [m] contacts with smaller gaps are closed
+    gap_rounding: Float[Array, ""]  # [m] smaller gaps are rounding
     contacts: int  # m
-    in_space: bool  # whether contacts with friction have two tangents each
+    in_space: bool  # contacts with friction have two tangents each
 
 
 def start_of(
     system: System,
     law: Law,
-    q: jax.Array,
-    v: jax.Array,
+    q: Float[Array, "..."],
+    v: Float[Array, "..."],
     t_end: Any,
     closed_below: float | None = None,
     may_penetrate: bool = False,
 ) -> Start:
-    """The start of a motion at q (n,), v (n,) that ends at `t_end`, or lasts from t_start to it.
+    """Start of a motion at q, v that ends at `t_end`, a time or the pair (t_start, t_end) [s].
 
     `closed_below` [m] as of `EventDriven`.
 
@@ -119,12 +120,12 @@ def _check_coordinates(
 
 
 class _AtStart(NamedTuple):
-    """What the functions of a system give at the start."""
+    """Values of the functions of a system at the start."""
 
-    mass: jax.Array  # M (n,) or (n, n)
-    gaps: jax.Array  # (m,), of a pile the least one (1,)
-    valid: jax.Array  # () margin of the range of the gap function
-    base: jax.Array | None  # (BASE_INSTANTS, d) [m] displacements at equally spaced instants
+    mass: Mass
+    gaps: Float[Array, " m"]  # [m], of a pile the least one alone
+    valid: Float[Array, ""]  # margin of the range of the gap function
+    base: Float[Array, "instants d"] | None  # [m] displacements at BASE_INSTANTS instants
     others: list[Any]  # values of all other functions: traced where one closes over traced arrays
     contacts: int  # m
     tangents: int | None  # number of tangential displacements; None: no friction is possible
@@ -132,9 +133,16 @@ class _AtStart(NamedTuple):
 
 @precise_jit
 def _at_start(
-    system: System, q: jax.Array, v: jax.Array, start: jax.Array, end: jax.Array
+    system: System,
+    q: Float[Array, " nq"],
+    v: Float[Array, " n"],
+    start: Float[Array, ""],
+    end: Float[Array, ""],
 ) -> _AtStart:
-    """The functions of a system at the start; they are checked here, where they are traced."""
+    """Values of the functions of a system at (q, v, start), which `check_functions` has checked.
+
+    The base is taken at equally spaced instants from start to end.
+    """
     check_functions(system, q, v, start)
     body = system.body
     base = None
@@ -156,9 +164,9 @@ def _at_start(
 
 
 def _check_values_at_start(
-    system: System, here: _AtStart, start: jax.Array, end: jax.Array
+    system: System, here: _AtStart, start: Float[Array, ""], end: Float[Array, ""]
 ) -> None:
-    """Raise for values of the functions that no motion can begin with."""
+    """Raise for a mass, a range or a base motion that no motion can begin with."""
     if callable(system.body.mass):
         check_mass(here.mass)
     check_range("q0", system.body, here.valid)
@@ -173,11 +181,13 @@ def _check_values_at_start(
         )
 
 
-def _with_closures_as_leaves(system: System, q: jax.Array, v: jax.Array, t: jax.Array) -> System:
-    """The system; where functions close over traced arrays these become its leaves."""
+def _with_closures_as_leaves(
+    system: System, q: Float[Array, " nq"], v: Float[Array, " n"], t: Float[Array, ""]
+) -> System:
+    """System in which traced arrays that its functions close over are leaves."""
 
     def converted(function: Any, *args: jax.Array) -> Any:
-        """The function as a pytree of the arrays that it closes over, if they are traced."""
+        """Function as a pytree of the arrays that it closes over, if they are traced."""
         if isinstance(function, eqx.Module) or not callable(function):
             return function
         args = tuple(jnp.zeros(x.shape, x.dtype) for x in args)
@@ -187,7 +197,7 @@ def _with_closures_as_leaves(system: System, q: jax.Array, v: jax.Array, t: jax.
         return new if is_traced(new) else function
 
     def parts(s: System) -> list[Any]:
-        """All functions of a system."""
+        """Functions of a system: force, potential, base, and those of its body."""
         return [s.force, s.potential, s.base, *s.body.functions]
 
     args = [(q, v, t), (q,), (t,), *[(q,)] * len(system.body.functions)]
@@ -196,9 +206,13 @@ def _with_closures_as_leaves(system: System, q: jax.Array, v: jax.Array, t: jax.
 
 
 def _closed_gaps(
-    q: jax.Array, f: jax.Array, closed_below: float | None
-) -> tuple[jax.Array, jax.Array]:
-    """Gaps () [m] below which a contact is closed, and below which a gap is rounding."""
+    q: Float[Array, " nq"], f: Float[Array, " m"], closed_below: float | None
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Gap [m] below which a contact is closed, and gap [m] below which it is rounding.
+
+    Equation: `closed_below`, by default `max(CLOSED_BELOW, MORE_CLOSED noise max(|q|, |f|))`; and
+    `max(ROUNDING_GAP closed_below, noise max(|q|, |f|))`.
+    """
     q, f = jax.lax.stop_gradient((q, f))
     numpy: Any = jnp if is_traced((q, f)) else np  # on the host nothing is compiled
     off = precision(q.dtype).noise * numpy.maximum(numpy.abs(q).max(), numpy.abs(f).max())
@@ -207,8 +221,8 @@ def _closed_gaps(
     return jnp.asarray(below, q.dtype), jnp.asarray(rounding, q.dtype)
 
 
-def _friction_of(system: System, law: Law, here: _AtStart) -> jax.Array | None:
-    """mu (m,), () of a pile: that of the system, or of the law; None without friction."""
+def _friction_of(system: System, law: Law, here: _AtStart) -> Float[Array, "..."] | None:
+    """Coefficients mu (m,), () of a pile: of the system, or else of the law; None if all are 0."""
     own = system.friction is not None
     mu = system.friction if own else getattr(law, "friction", None)
     if mu is None:

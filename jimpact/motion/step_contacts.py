@@ -1,13 +1,15 @@
 """The contacts of one step of time stepping: products with their directions, dense or of a pile.
 
-Both classes have the same methods; of a pile only contacts that are closed are stored, and products
-go over the pairs of bodies, block by block.
+Both classes have the same methods. Each of m contacts has b directions: its normal, then with
+friction its tangents (1 in the plane, 2 in space). Of a pile (`Bodies` with `room`) only contacts
+that are closed are stored, and products go over the pairs of bodies, block by block.
 """
 
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
 
 from jimpact.bodies.closed_pairs import ActivePairs, block, over_blocks, with_block
 from jimpact.core.law import Law
@@ -20,48 +22,48 @@ from jimpact.tools.checks import check_per_contact, check_shape
 class AllContacts(NamedTuple):
     """All contacts of a body in one step; those that are open are 0."""
 
-    gap: jax.Array  # (m,), of open contacts, too
-    normals: jax.Array  # (n, m), of open contacts, too
-    closed: jax.Array  # (m,)
-    directions: jax.Array  # (n, m, b): normals, tangents
-    moved: jax.Array  # M^-1 of them
-    matrix: jax.Array  # (m, b, m, b) Delassus matrix
+    gap: Float[Array, " m"]  # [m] of open contacts, too
+    normals: Float[Array, "n m"]  # of open contacts, too
+    closed: Bool[Array, " m"]
+    directions: Float[Array, "n m b"]  # D, 0 of open contacts
+    moved: Float[Array, "n m b"]  # M^-1 D
+    matrix: Float[Array, "m b m b"]  # Delassus matrix D^T M^-1 D
 
-    def rates(self, v: jax.Array) -> jax.Array:
-        """Gap velocities and slips (m, b) of v (n,)."""
+    def rates(self, v: Float[Array, " n"]) -> Float[Array, "m b"]:
+        """Gap velocities and slips `D^T v` [m/s]."""
         return jnp.tensordot(v, self.directions, axes=1)
 
-    def fastest(self, v: jax.Array) -> jax.Array:
-        """Gap velocity () that the speeds of v could give."""
+    def fastest(self, v: Float[Array, " n"]) -> Float[Array, ""]:
+        """Bound [m/s] of the gap velocities that speeds as in v could give."""
         return jnp.max(jnp.abs(v) @ jnp.abs(self.directions[:, :, 0]))
 
-    def velocity_change(self, x: jax.Array) -> jax.Array:
-        """Change of velocity (n,) by impulses x (m, b)."""
+    def velocity_change(self, x: Float[Array, "m b"]) -> Float[Array, " n"]:
+        """Change of velocity `M^-1 D x` by impulses x [N s]."""
         return jnp.tensordot(self.moved, x, axes=2)
 
-    def generalized_impulse(self, x: jax.Array) -> jax.Array:
-        """Generalized impulse (n,) of impulses x (m, b)."""
+    def generalized_impulse(self, x: Float[Array, "m b"]) -> Float[Array, " n"]:
+        """Generalized impulse `D x` of impulses x [N s]."""
         return jnp.tensordot(self.directions, x, axes=2)
 
-    def product(self, x: jax.Array) -> jax.Array:
-        """Rates (m, b) that impulses x (m, b) give."""
+    def product(self, x: Float[Array, "m b"]) -> Float[Array, "m b"]:
+        """Rates `D^T M^-1 D x` [m/s] that impulses x [N s] give."""
         return jnp.tensordot(self.matrix, x, axes=2)
 
     @property
-    def diagonal(self) -> jax.Array:
-        """Of the Delassus matrix (m, b)."""
+    def diagonal(self) -> Float[Array, "m b"]:
+        """Diagonal of the Delassus matrix."""
         m, b = self.matrix.shape[:2]
         return jnp.diagonal(self.matrix.reshape(m * b, m * b)).reshape(m, b)
 
-    def warm_start(self, last: Any) -> jax.Array:
-        """Impulses (m, b) of the last step."""
+    def warm_start(self, last: Any) -> Float[Array, "m b"]:
+        """Impulses of the last step, 0 of contacts that are open now."""
         return jnp.where(self.closed[:, None], last, 0.0)
 
-    def kept(self, x: jax.Array) -> jax.Array:
-        """Impulses x (m, b) in the form in which the next step reads them."""
+    def kept(self, x: Float[Array, "m b"]) -> Float[Array, "m b"]:
+        """Impulses x in the form in which `warm_start` of the next step reads them."""
         return x
 
-    def recorded(self, values: jax.Array) -> jax.Array:
+    def recorded(self, values: Float[Array, "*d"]) -> Float[Array, "*e"]:
         """Values of contacts (.., m) as the record holds them."""
         return values
 
@@ -69,26 +71,27 @@ class AllContacts(NamedTuple):
 class PileImpulses(NamedTuple):
     """Impulses of the closed contacts of a pile, by increasing numbers of the contacts."""
 
-    number: jax.Array  # (m,)
-    impulse: jax.Array  # (m, b)
+    number: Int[Array, " m"]
+    impulse: Float[Array, "m b"]  # [N s]
 
 
 class ActiveContacts(NamedTuple):
     """The closed contacts of a pile in one step; methods as those of `AllContacts`."""
 
     pairs: ActivePairs
-    inverse: jax.Array  # 1 / M (k + 1, velocities of a body), 0 for walls
+    inverse: Float[Array, "bodies+1 velocities"]  # 1 / M of each body, 0 for walls (the last row)
 
     @property
-    def closed(self) -> jax.Array:
-        """(m,)."""
+    def closed(self) -> Bool[Array, " m"]:
+        """True for closed contacts, false for room that is left."""
         return self.pairs.closed
 
-    def rates(self, v: jax.Array) -> jax.Array:
-        """Gap velocities and slips (m, b) of v (n,)."""
+    def rates(self, v: Float[Array, " n"]) -> Float[Array, "m b"]:
+        """Gap velocities and slips `D^T v` [m/s]."""
         of_bodies = jnp.pad(v.reshape(-1, self.inverse.shape[1]), ((0, 1), (0, 0)))
 
-        def one(row: jax.Array, rates: jax.Array) -> jax.Array:
+        def one(row: Int[Array, ""], rates: Float[Array, "m b"]) -> Float[Array, "m b"]:
+            """Rates with those of one block of contacts, `D . v` of their two bodies."""
             bodies, directions = (block(x, row) for x in (self.pairs.bodies, self.pairs.directions))
             values = jnp.sum(directions * of_bodies[bodies][:, None], axis=(2, 3))
             return with_block(rates, values, row)
@@ -96,18 +99,19 @@ class ActiveContacts(NamedTuple):
         start = jnp.zeros(self.pairs.directions.shape[:2], v.dtype)
         return over_blocks(self.pairs.filled, one, start)
 
-    def fastest(self, v: jax.Array) -> jax.Array:
-        """Gap velocity () that the speeds of v could give."""
+    def fastest(self, v: Float[Array, " n"]) -> Float[Array, ""]:
+        """Bound [m/s] of the gap velocities that speeds as in v could give."""
         return 2 * jnp.max(jnp.abs(v))
 
-    def velocity_change(self, x: jax.Array) -> jax.Array:
-        """Change of velocity (n,) by impulses x (m, b)."""
+    def velocity_change(self, x: Float[Array, "m b"]) -> Float[Array, " n"]:
+        """Change of velocity `M^-1 D x` by impulses x [N s]."""
         return self.generalized_impulse(x) * self.inverse[:-1].reshape(-1)
 
-    def generalized_impulse(self, x: jax.Array) -> jax.Array:
-        """Generalized impulse (n,) of impulses x (m, b)."""
+    def generalized_impulse(self, x: Float[Array, "m b"]) -> Float[Array, " n"]:
+        """Generalized impulse `D x` of impulses x [N s]."""
 
-        def one(row: jax.Array, impulses: jax.Array) -> jax.Array:
+        def one(row: Int[Array, ""], impulses: Float[Array, "k u"]) -> Float[Array, "k u"]:
+            """Impulses `sum D x` on the bodies, with those of one block of contacts."""
             bodies, directions = (block(y, row) for y in (self.pairs.bodies, self.pairs.directions))
             each = jnp.sum(directions * block(x, row)[:, :, None, None], axis=1)
             return impulses.at[bodies].add(each)
@@ -115,15 +119,16 @@ class ActiveContacts(NamedTuple):
         start = jnp.zeros_like(self.inverse)
         return over_blocks(self.pairs.filled, one, start)[:-1].reshape(-1)
 
-    def product(self, x: jax.Array) -> jax.Array:
-        """Rates (m, b) that impulses x (m, b) give."""
+    def product(self, x: Float[Array, "m b"]) -> Float[Array, "m b"]:
+        """Rates `D^T M^-1 D x` [m/s] that impulses x [N s] give."""
         return self.rates(self.velocity_change(x))
 
     @property
-    def diagonal(self) -> jax.Array:
-        """Of the Delassus matrix (m, b)."""
+    def diagonal(self) -> Float[Array, "m b"]:
+        """Diagonal of the Delassus matrix (m, b): `sum D^2 / M` over both bodies."""
 
-        def one(row: jax.Array, diagonal: jax.Array) -> jax.Array:
+        def one(row: Int[Array, ""], diagonal: Float[Array, "m b"]) -> Float[Array, "m b"]:
+            """Diagonal with the part of one block of contacts."""
             bodies, directions = (block(x, row) for x in (self.pairs.bodies, self.pairs.directions))
             squares = directions**2 * self.inverse[bodies][:, None]
             return with_block(diagonal, jnp.sum(squares, axis=(2, 3)), row)
@@ -131,38 +136,43 @@ class ActiveContacts(NamedTuple):
         start = jnp.zeros(self.pairs.directions.shape[:2], self.inverse.dtype)
         return over_blocks(self.pairs.filled, one, start)
 
-    def warm_start(self, last: Any) -> jax.Array:
-        """Impulses (m, b) of the last step, 0 where the contact was open."""
+    def warm_start(self, last: Any) -> Float[Array, "m b"]:
+        """Impulses of the last step at the same contacts, found by number; 0 of new ones."""
         row = jnp.searchsorted(last.number, self.pairs.number)
         row = jnp.minimum(row, last.number.size - 1)
         same = self.closed & (last.number[row] == self.pairs.number)
         return jnp.where(same[:, None], last.impulse[row], 0.0)
 
-    def kept(self, x: jax.Array) -> PileImpulses:
-        """Impulses x (m, b) in the form in which the next step reads them."""
+    def kept(self, x: Float[Array, "m b"]) -> PileImpulses:
+        """Impulses x in the form in which `warm_start` of the next step reads them."""
 
         def in_order() -> PileImpulses:
+            """Impulses by increasing number, so that the next step can search for them."""
             order = jnp.argsort(self.pairs.number)
             return PileImpulses(self.pairs.number[order], x[order])
 
         as_it_is = PileImpulses(self.pairs.number, x)
         return jax.lax.cond(self.pairs.filled > 0, in_order, lambda: as_it_is)
 
-    def recorded(self, values: jax.Array) -> jax.Array:
+    def recorded(self, values: Float[Array, "*d"]) -> Float[Array, "*e"]:
         """Values of contacts (.., m) as the record holds them: their sum (.., 1)."""
         return jnp.sum(values, axis=-1, keepdims=True)
 
 
 def contacts_of_step(
     system: System,
-    q: jax.Array,
-    t: jax.Array,
-    q_end: jax.Array,
-    t_end: jax.Array,
-    closed_below: jax.Array,
+    q: Float[Array, " nq"],
+    t: Float[Array, ""],
+    q_end: Float[Array, " nq"],
+    t_end: Float[Array, ""],
+    closed_below: Float[Array, ""],
     friction: bool,
 ) -> AllContacts | ActiveContacts:
-    """The contacts of a step whose middle is at (q, t), and its end, without contacts, at q_end."""
+    """Contacts of a step whose middle is at (q, t), and its end, without contacts, at q_end.
+
+    Closed are those with a gap of at most `closed_below` [m] at one of these; directions and mass
+    are those in the middle.
+    """
     at, end = seen_from_base(system, q, t), seen_from_base(system, q_end, t_end)
     mass = mass_at(system, q)
     if is_pile(system):

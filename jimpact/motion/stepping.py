@@ -25,12 +25,14 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
 
 from jimpact.bodies.closed_pairs import ActivePairs
 from jimpact.core.impacts import impact
 from jimpact.core.law import Law, within_domains
 from jimpact.core.scene import Scene
 from jimpact.motion.dynamics import (
+    Mass,
     carried_along,
     definite,
     free_acceleration,
@@ -87,9 +89,9 @@ class _StepProblem(NamedTuple):
 
     system: System
     law: Law
-    mu: jax.Array | None
-    h: jax.Array  # () [s]
-    closed_below: jax.Array  # () [m]
+    mu: Float[Array, "..."] | None  # (m,), () of a pile
+    h: Float[Array, ""]  # [s] length of a step
+    closed_below: Float[Array, ""]  # [m]
     joint: bool  # see `time_stepping`
 
 
@@ -97,59 +99,59 @@ class _Progress(NamedTuple):
     """The motion up to now."""
 
     state: State
-    speed: jax.Array  # () largest gap velocity that velocities could give so far
-    last_impulses: jax.Array | PileImpulses  # of the last step
-    residual_velocity: jax.Array  # gap velocity () that these leave unsolved
-    inverse_step_size: jax.Array  # of the solver, see `solve_many`
-    steps_since_impact: jax.Array  # (m,) of each contact
-    closing: jax.Array  # (m,) rates of gaps that close before they are next evaluated; others 0
+    speed: Float[Array, ""]  # [m/s] largest gap velocity that velocities could give so far
+    last_impulses: Float[Array, "m b"] | PileImpulses  # [N s] of the last step
+    residual_velocity: Float[Array, ""]  # [m/s] gap velocity that these leave unsolved
+    inverse_step_size: Float[Array, ""]  # of the solver, see `solve_many`
+    steps_since_impact: Int[Array, " m"]
+    closing: Float[Array, " m"]  # [m/s] rates of gaps that close before the next step; others 0
     events: Events
-    status: jax.Array
-    reported: jax.Array  # a status that is not a failure
+    status: Int[Array, ""]
+    reported: Int[Array, ""]  # a status that is not a failure
 
 
 class _Setup(NamedTuple):
-    """One step before it is solved: contacts in its middle, and the law's impulses there."""
+    """Data of a step before it is solved: contacts in its middle, and the law's impulses there."""
 
-    middle: jax.Array  # () time in the middle of the step
-    end: jax.Array  # () time at its end
-    q: jax.Array  # in the middle
-    mass: jax.Array
-    base_velocity: jax.Array  # (n,)
+    middle: Float[Array, ""]  # [s] time in the middle of the step
+    end: Float[Array, ""]  # [s] time at its end
+    q: Float[Array, " nq"]  # q_m, in the middle
+    mass: Mass
+    base_velocity: Float[Array, " n"]
     contacts: AllContacts | ActiveContacts
-    speed: jax.Array  # as in `_Progress`
-    noise: jax.Array  # () gap velocities below it are rounding
-    slow: jax.Array  # (m,) those that the free acceleration makes in a step, and rounding
+    speed: Float[Array, ""]  # as in `_Progress`
+    noise: Float[Array, ""]  # [m/s] smaller gap velocities are rounding
+    slow: Float[Array, " m"]  # [m/s] gap velocities of SLOW steps of the free acceleration, noise
     tolerance: float  # of the solver
-    strikes: jax.Array  # (m,) whether there is an impact
-    law_velocity: jax.Array  # (n,) velocity to which the law is applied
-    law_impulse: jax.Array  # (m, b) of a law that does not join the problem
-    law_status: jax.Array
-    rates: jax.Array  # (m, b) of gaps and slips, after those impulses, before forces
-    offset: jax.Array  # w (m, b) with friction against the slip at the end
-    offset_for_mean: jax.Array  # w (m, b) with friction against the mean slip
+    strikes: Bool[Array, " m"]  # the contact has an impact
+    law_velocity: Float[Array, " n"]  # velocity to which the law is applied
+    law_impulse: Float[Array, "m b"]  # [N s] of a law that does not join the problem
+    law_status: Int[Array, ""]
+    rates: Float[Array, "m b"]  # [m/s] of gaps and slips, after those impulses, before forces
+    offset: Float[Array, "m b"]  # w with friction against the slip at the end
+    offset_for_mean: Float[Array, "m b"]  # w with friction against the mean slip
 
 
 class _Trial(NamedTuple):
-    """One iteration of the solution of a step."""
+    """Iterate of the solution of a step."""
 
-    v: jax.Array  # at its end
-    mean: jax.Array  # velocity
-    force: jax.Array
+    v: Float[Array, " n"]  # v' at its end
+    mean: Float[Array, " n"]  # mean velocity (v + v') / 2
+    force: Float[Array, " n"]  # F of the argument `force` at it
     solution: Many
-    adds_energy: jax.Array  # () whether the impulses add energy
-    tries: jax.Array  # () iterations so far, this one included
+    adds_energy: Bool[Array, ""]  # the impulses do
+    tries: Int[Array, ""]  # iterations so far, this one included
 
 
 def time_stepping(
     start: Start,
     law: Law,
-    times: jax.Array,
-    substeps: jax.Array,
+    times: Float[Array, " S"],
+    substeps: Int[Array, ""],
     joint: bool,
     max_events: int,
 ) -> Course:
-    """The motion with `substeps` () steps between neighbours of `times` (S,).
+    """The motion with `substeps` equal steps between neighbours of the sampled `times` [s].
 
     `joint`: the law is a condition on v' that joins the problem of the step (`Law.joins_step`).
     """
@@ -159,10 +161,12 @@ def time_stepping(
     first = _begin(problem, start.q, start.v, times, substeps, max_events)
     dtype = times.dtype
 
-    def to_sample(progress: _Progress, t: jax.Array) -> tuple[_Progress, State]:
-        """The motion up to the next sample, from t."""
+    def to_sample(progress: _Progress, t: Float[Array, ""]) -> tuple[_Progress, State]:
+        """Motion from the sample at t to the next one, and the state there; NaN after a failure."""
 
-        def one(i: jax.Array, progress: _Progress) -> _Progress:
+        def one(i: Int[Array, ""], progress: _Progress) -> _Progress:
+            """Step number i from t, unless the motion has failed."""
+
             def go() -> _Progress:
                 return _one_step(problem, progress, t + i.astype(dtype) * h)
 
@@ -179,8 +183,17 @@ def time_stepping(
     return Course(samples, end.events, steps, status)
 
 
-def step_of_pile(start: Start, law: Law) -> tuple[ActivePairs, jax.Array, jax.Array, jax.Array]:
-    """The one step of a pile from start to end: contacts, impulses (K, b), v' (n,), status ()."""
+class PileStep(NamedTuple):
+    """One step of a pile."""
+
+    pairs: ActivePairs
+    impulse: Float[Array, "m b"]  # [N s] normal, then tangential
+    velocity: Float[Array, " n"]  # v' at its end
+    status: Int[Array, ""]
+
+
+def step_of_pile(start: Start, law: Law) -> PileStep:
+    """The one step of a pile from the time of `start` to its end."""
     times = jnp.stack([start.time, start.end])
     h = start.end - start.time
     problem = _StepProblem(start.system, law, start.friction, h, start.closed_below, joint=True)
@@ -191,24 +204,25 @@ def step_of_pile(start: Start, law: Law) -> tuple[ActivePairs, jax.Array, jax.Ar
     status, reported = _status(problem, first, setup, trial, state)
     contacts = setup.contacts
     assert isinstance(contacts, ActiveContacts)
-    return contacts.pairs, trial.solution.impulse, trial.v, jnp.where(status > 0, status, reported)
+    code = jnp.where(status > 0, status, reported)
+    return PileStep(contacts.pairs, trial.solution.impulse, trial.v, code)
 
 
 def _begin(
     problem: _StepProblem,
-    q0: jax.Array,
-    v0: jax.Array,
-    times: jax.Array,
-    substeps: jax.Array,
+    q0: Float[Array, " nq"],
+    v0: Float[Array, " n"],
+    times: Float[Array, " S"],
+    substeps: Int[Array, ""],
     max_events: int,
 ) -> _Progress:
-    """A motion before its first step."""
+    """Motion at the start: impulses of the last step are 0, its status that of the start."""
     system, law, mu, _, closed_below, _ = problem
     zero, dtype = jnp.zeros((), q0.dtype), q0.dtype
     m = recorded_gaps(system, q0, times[0]).shape[0]
 
-    def first() -> tuple[jax.Array, Any]:
-        """Rates of contacts, and their impulses as steps keep them."""
+    def first() -> tuple[Float[Array, "m b"], Any]:
+        """Rates of contacts, and impulses as steps keep them: their shapes are used alone."""
         at = contacts_of_step(system, q0, times[0], q0, times[0], closed_below, mu is not None)
         rates = at.rates(v0)
         return rates, at.kept(rates)
@@ -237,8 +251,8 @@ def _begin(
     )
 
 
-def _one_step(problem: _StepProblem, progress: _Progress, t: jax.Array) -> _Progress:
-    """Advance the motion by one step of length h."""
+def _one_step(problem: _StepProblem, progress: _Progress, t: Float[Array, ""]) -> _Progress:
+    """Motion after one step of length h from t."""
     setup = _set_up(problem, progress, t)
     trial = _solve(problem, progress, setup)
     state, energy = _end_state(problem, progress, setup, trial)
@@ -259,15 +273,22 @@ def _one_step(problem: _StepProblem, progress: _Progress, t: jax.Array) -> _Prog
 
 
 def _loads(
-    system: System, q: jax.Array, v: jax.Array, t: jax.Array, mass: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Forces (n,), and the acceleration (n,) without contacts."""
+    system: System,
+    q: Float[Array, " nq"],
+    v: Float[Array, " n"],
+    t: Float[Array, ""],
+    mass: Mass,
+) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """Force F(q, v, t) of the argument `force`, and the acceleration v' without contacts."""
     force = user_force(system, q, v, t)
     return force, free_acceleration(system, q, v, force, mass)
 
 
-def _set_up(problem: _StepProblem, progress: _Progress, t: jax.Array) -> _Setup:
-    """The step that begins at t: its contacts, which of them strike, and the law's impulses."""
+def _set_up(problem: _StepProblem, progress: _Progress, t: Float[Array, ""]) -> _Setup:
+    """Data of the step that begins at t: contacts in its middle, impacts, offsets w.
+
+    A closed contact strikes where `gamma < -slow`. The law acts there unless it is `joint`.
+    """
     system, law, mu, h, closed_below, joint = problem
     state, dtype, body = progress.state, progress.state.q.dtype, system.body
     middle, end = t + 0.5 * h, t + h
@@ -323,9 +344,9 @@ def _set_up(problem: _StepProblem, progress: _Progress, t: jax.Array) -> _Setup:
 
 
 def _coefficients(
-    problem: _StepProblem, strikes: jax.Array, dtype: jnp.dtype
-) -> tuple[jax.Array, jax.Array]:
-    """e, and e_t (m,) where contacts strike, of a law with `joins_step`; 0 for another law."""
+    problem: _StepProblem, strikes: Bool[Array, " m"], dtype: jnp.dtype
+) -> tuple[Float[Array, "..."], Float[Array, " m"]]:
+    """Restitution e () or (m,), and e_t where contacts strike; 0 unless the law `joins_step`."""
     e, e_t = jnp.zeros((), dtype), jnp.zeros((), dtype)
     if problem.joint:
         law: Any = problem.law
@@ -335,16 +356,20 @@ def _coefficients(
 
 
 def _solve(problem: _StepProblem, progress: _Progress, setup: _Setup) -> _Trial:
-    """The impulses of the step, with forces at its mean velocity, that add no energy."""
+    """Impulses p and velocity v' of the step, of the problem at the head of this file.
+
+    Equation: `gamma' = D^T v + h D^T a + W p`, with the acceleration a at the mean velocity: it is
+    iterated. If the impulses add energy, `offset_for_mean` is taken from then on.
+    """
     system, h, contacts, v0 = problem.system, problem.h, setup.contacts, progress.state.v
     constant = system.force is None and not callable(system.mass)
     least = 1 if constant and system.body.coordinates is None else MEAN
 
     def iteration(last: _Trial) -> _Trial:
-        """The step with the forces at its mean velocity, as far as that is known."""
+        """Solution of the step with the loads at the mean velocity of the `last` trial."""
         force, free = _loads(system, setup.q, last.mean, setup.middle, setup.mass)
-        pulled = setup.rates + h * contacts.rates(free)
-        right_side = pulled + jnp.where(last.tries < least, setup.offset, setup.offset_for_mean)
+        with_loads = setup.rates + h * contacts.rates(free)  # D^T v + h D^T a
+        right_side = with_loads + jnp.where(last.tries < least, setup.offset, setup.offset_for_mean)
         solution = solve_many(
             contacts.product,
             contacts.diagonal,
@@ -357,12 +382,13 @@ def _solve(problem: _StepProblem, progress: _Progress, setup: _Setup) -> _Trial:
         )
         x = solution.impulse
         v = v0 + h * free + contacts.velocity_change(setup.law_impulse + x)
-        after = pulled + contacts.product(x)
+        after = with_loads + contacts.product(x)  # gamma' and slips
         energy = 0.5 * jnp.vdot(x, setup.rates + after)
         adds_energy = energy > (setup.noise + solution.residual_velocity) * jnp.sum(jnp.abs(x))
         return _Trial(v, 0.5 * (v0 + v), force, solution, adds_energy, last.tries + 1)
 
-    def goes_on(trial: _Trial) -> jax.Array:
+    def goes_on(trial: _Trial) -> Bool[Array, ""]:
+        """True before `least` tries, then while energy is added, up to twice as many."""
         return (trial.tries < least) | (trial.adds_energy & (trial.tries < 2 * least))
 
     zero = 0 * setup.speed
@@ -379,8 +405,12 @@ def _solve(problem: _StepProblem, progress: _Progress, setup: _Setup) -> _Trial:
 
 def _end_state(
     problem: _StepProblem, progress: _Progress, setup: _Setup, trial: _Trial
-) -> tuple[State, jax.Array]:
-    """The state at the end, with its work, and the energy (2, m) that each contact gave."""
+) -> tuple[State, Float[Array, "2 m"]]:
+    """State at the end of the step, and the energy [J] that each contact gave.
+
+    Equation: `q' = q_m + h v' / 2`; works at the mean velocity u, `h F . u` of the force, `p . D^T
+    (u - B y_b')` of contacts (normal, tangential), `D p . B y_b'` of the base.
+    """
     h, state, contacts = problem.h, progress.state, setup.contacts
     x = setup.law_impulse + trial.solution.impulse
     work = x * contacts.rates(trial.mean - setup.base_velocity)
@@ -398,8 +428,13 @@ def _end_state(
 
 def _status(
     problem: _StepProblem, progress: _Progress, setup: _Setup, trial: _Trial, state: State
-) -> tuple[jax.Array, jax.Array]:
-    """The status after the step, and what is reported without being a failure."""
+) -> tuple[Int[Array, ""], Int[Array, ""]]:
+    """Status code after the step, and the code that is reported without ending the motion.
+
+    The latter is `coarse_step` where a hard impact follows within APART steps of another one, or
+    bodies have passed each other, or in a pile a body moves farther than the reach of its list of
+    neighbours; `unsolved_step` where the solver leaves a misfit above OFF.
+    """
     system, contacts = problem.system, setup.contacts
     fails = jnp.asarray(FAILS)[setup.law_status]
     status = jnp.where(fails, CODE["law_failed"], progress.status)
@@ -433,14 +468,14 @@ def _status(
     return status.astype(jnp.int32), reported.astype(jnp.int32)
 
 
-def _closing_at_start(problem: _StepProblem, begin: State, contacts: int) -> jax.Array:
-    """Rates (m,) of gaps that close before the middle of the first step, 0 elsewhere."""
-    system, (q, v, t) = problem.system, begin[:3]
+def _closing_at_start(problem: _StepProblem, begin: State, contacts: int) -> Float[Array, " m"]:
+    """Rates [m/s] of gaps that close before the middle of the first step, 0 elsewhere."""
+    system, q, v, t = problem.system, begin.q, begin.v, begin.t
     if is_pile(system):
         return jnp.zeros(contacts, q.dtype)
 
-    def later(s: jax.Array) -> jax.Array:
-        """Gaps (m,) after the time s."""
+    def later(s: Float[Array, ""]) -> Float[Array, " m"]:
+        """Gaps [m] after the time s at the velocity v."""
         return gaps(system, system.body.moved(q, s * v), t + s)
 
     gap, rate = jax.jvp(later, (0 * t,), (jnp.ones_like(t),))
@@ -449,8 +484,8 @@ def _closing_at_start(problem: _StepProblem, begin: State, contacts: int) -> jax
 
 def _closing_after(
     problem: _StepProblem, progress: _Progress, setup: _Setup, trial: _Trial
-) -> jax.Array:
-    """Rates (m,) of gaps that close before the middle of the next step, 0 elsewhere."""
+) -> Float[Array, " m"]:
+    """Rates [m/s] of gaps that close before the middle of the next step, 0 elsewhere."""
     contacts = setup.contacts
     if isinstance(contacts, ActiveContacts):
         return progress.closing
@@ -458,15 +493,20 @@ def _closing_after(
     return _closing(contacts.gap, rate, problem.h, problem.closed_below)
 
 
-def _closing(gap: jax.Array, rate: jax.Array, h: jax.Array, closed_below: jax.Array) -> jax.Array:
-    """Rates (m,) of open gaps that close within the time h, 0 elsewhere."""
+def _closing(
+    gap: Float[Array, " m"],
+    rate: Float[Array, " m"],
+    h: Float[Array, ""],
+    closed_below: Float[Array, ""],
+) -> Float[Array, " m"]:
+    """Rates [m/s] of open gaps with `gap + h rate < 0`, 0 elsewhere."""
     return jnp.where((gap > closed_below) & (gap + h * rate < 0), rate, 0.0)
 
 
 def _recorded_impact(
-    problem: _StepProblem, events: Events, setup: _Setup, trial: _Trial, energy: jax.Array
+    problem: _StepProblem, events: Events, setup: _Setup, trial: _Trial, energy: Float[Array, "2 m"]
 ) -> Events:
-    """The events with the impact of this step, if there is one; a pile records none."""
+    """Events with one row more where a contact strikes in this step; a pile records none."""
     contacts, x, after = setup.contacts, setup.law_impulse, trial.v
     if isinstance(contacts, ActiveContacts):
         return events
@@ -491,15 +531,21 @@ def _recorded_impact(
 
 
 def _offsets(
-    e: jax.Array, e_t: jax.Array, rates: jax.Array, added: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """w (m, b) of `0 <= p _|_ gamma' + w >= 0`, for friction at the end and at the mean slip.
+    e: Float[Array, "..."],
+    e_t: Float[Array, " m"],
+    rates: Float[Array, "m b"],
+    added: Float[Array, " m"],
+) -> tuple[Float[Array, "m b"], Float[Array, "m b"]]:
+    """Offsets w of `0 <= p _|_ gamma' + w >= 0`, for friction at the end and at the mean slip.
+
+    Equation: `w_n = e (gamma + added) - added` where gamma < 0, else gamma; `w_t = e_t u` for
+    friction against the slip at the end, `w_t = u` for the mean slip.
 
     Args:
         e: coefficient () or (m,) of normal restitution.
-        e_t: that of tangential restitution (m,), 0 where no contact strikes.
-        rates: gap velocities and slips (m, b) without the forces of the step.
-        added: gap velocity (m,) that the forces add before the impact, 0 where there is none.
+        e_t: that of tangential restitution, 0 where no contact strikes.
+        rates: gap velocities gamma and slips u [m/s] without the forces of the step.
+        added: gap velocity [m/s] that the forces add before the impact, 0 where there is none.
 
     Where `w >= rates`, as always in normal direction, impulses add no energy.
     """
@@ -513,9 +559,9 @@ def _offsets(
 
 
 def _law_impulses(
-    law: Law, scene: Scene, v: jax.Array, noise: jax.Array, shape: tuple[int, ...]
-) -> tuple[jax.Array, jax.Array]:
-    """Impulses (m, b) of the law, and its status."""
+    law: Law, scene: Scene, v: Float[Array, " n"], noise: Float[Array, ""], shape: tuple[int, ...]
+) -> tuple[Float[Array, "m b"], Int[Array, ""]]:
+    """Impulses [N s] of the law at each contact, normal then tangential, and its status."""
     out: Any = impact(law, scene, v, noise)
     x = out.impulse[:, None]
     if shape[1] > 1:

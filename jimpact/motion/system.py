@@ -6,6 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from jimpact.bodies.base import STANDARD_GRAVITY, Body, LinearPotential, Potential
 from jimpact.bodies.functions import FunctionBody
@@ -19,6 +20,7 @@ from jimpact.tools.checks import (
 )
 
 Base = Callable[[jax.Array], jax.Array]  # t () -> displacement y_b (d,) [m]
+# functions of a system that are differentiated: whole numbers would have derivative 0
 DIFFERENTIATED = ("gap_function", "tangent_function", "potential", "base")
 
 
@@ -70,8 +72,8 @@ class System(eqx.Module):
     force: Callable[[jax.Array, jax.Array, jax.Array], jax.Array] | None
     potential: Potential | None
     base: Base | None
-    base_directions: jax.Array | None
-    friction: jax.Array | None
+    base_directions: Float[Array, "n d"] | None
+    friction: Float[Array, "..."] | None
 
     @staticmethod
     def _instead_of(value: Any) -> str:
@@ -159,8 +161,8 @@ class System(eqx.Module):
         return self.body.mass
 
 
-def _acceleration_of(gravity: Any) -> jax.Array:
-    """The size () [m/s^2] of an acceleration that points downwards; True: the standard one."""
+def _acceleration_of(gravity: Any) -> Float[Array, ""]:
+    """Size >= 0 [m/s^2] of an acceleration that points downwards; True: the standard one."""
     acceleration = as_float_array("gravity", STANDARD_GRAVITY if gravity is True else gravity)
     check_shape("gravity", acceleration, (), "the size of the acceleration")
     if not is_traced(acceleration) and float(acceleration) < 0:
@@ -220,9 +222,9 @@ class HarmonicBase(eqx.Module):
     [0.1, 0.0]
     """
 
-    amplitude: jax.Array
-    frequency: jax.Array
-    phase: jax.Array
+    amplitude: Float[Array, "..."]
+    frequency: Float[Array, "..."]
+    phase: Float[Array, "..."]
     direction: str = eqx.field(static=True)
 
     def __init__(self, amplitude: Any, frequency: Any, phase: Any = 0.0, direction: str = "line"):
@@ -237,8 +239,8 @@ class HarmonicBase(eqx.Module):
             )
         self.direction = direction
 
-    def __call__(self, t: jax.Array) -> jax.Array:
-        """Displacement (1,) or (2,) [m]."""
+    def __call__(self, t: Any) -> Float[Array, " d"]:
+        """Displacement [m] along the line, or (x, y)."""
         y = self.amplitude * jnp.sin(2 * jnp.pi * self.frequency * t + self.phase)
         if self.direction == "line":
             return y[None]
@@ -247,7 +249,10 @@ class HarmonicBase(eqx.Module):
 
 
 def check_functions(system: System, q: jax.Array, v: jax.Array, t: jax.Array) -> None:
-    """Raise where a function of the system cannot be called, or returns what cannot be used."""
+    """Raise where a function of the system cannot be called, or returns another shape or type.
+
+    At (q, v, t), traced in the precision of q; nothing is computed.
+    """
     body, n, precision = system.body, v.shape[0], q.dtype
     mass = _shape_of("mass", body.mass_matrix, {"q": q}, precision)
     if mass not in ((n,), (n, n)):
@@ -277,7 +282,11 @@ def check_functions(system: System, q: jax.Array, v: jax.Array, t: jax.Array) ->
 
 
 def _shape_of(name: str, function: Any, values: dict[str, jax.Array], precision: Any) -> Any:
-    """The shape that a function of the system returns; None where that is None."""
+    """Shape that a function returns for traced `values` of its arguments; None where that is None.
+
+    Raises a TypeError where it cannot be traced, returns whole numbers to be differentiated, or a
+    finer precision.
+    """
 
     def call(*traced: jax.Array) -> jax.Array | None:
         out = function(*traced)
@@ -308,7 +317,7 @@ def _shape_of(name: str, function: Any, values: dict[str, jax.Array], precision:
 
 
 def _check_returned(name: str, shape: Any, allowed: str, fits: bool) -> None:
-    """Raise unless what a function of the system returns `fits`."""
+    """Raise a ValueError for the shape that a function returns, unless it `fits`."""
     if not fits:
         raise ValueError(
             f"Argument `system` must have a `{name}` that returns shape {allowed}, "

@@ -1,4 +1,4 @@
-"""What determines a motion, what a run writes down, and the derivatives of that.
+"""The data of a motion, the table that a run fills, and the derivatives of that.
 
 JAX pushes tangents through the loop of a run: all that is decided (lengths of steps, events, modes)
 has none. Both modes then follow from its Jacobian (`derive.py`).
@@ -12,12 +12,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, Int
 
 from jimpact.motion.flow import Settings, State, packed, unpacked
 from jimpact.motion.record import KIND_CODE, Events
 from jimpact.motion.system import System
 from jimpact.motion.transitions import After, tangent_count_of
 from jimpact.numerics.derive import by_jacobian
+from jimpact.numerics.stepper import put
 
 # Power of the largest number that makes tangents of 1e-31 (float32) infinite the second time, but
 # none below 1e3 the first time.
@@ -25,33 +27,33 @@ LARGE = 0.9
 
 
 class Past(NamedTuple):
-    """What a run takes over from the one before it."""
+    """State of a run at its end, from which the next one goes on."""
 
-    most: jax.Array  # () events that are still allowed
-    numbers: jax.Array  # (k,) see `_pack_checkpoint`; 0 where the motion begins
+    most: Int[Array, ""]  # events that are still allowed
+    numbers: Float[Array, " size"]  # see `_pack_checkpoint`; 0 where the motion begins
 
 
 class MotionProblem(NamedTuple):
-    """What determines a motion."""
+    """All data of a motion between events."""
 
     system: System
     law: Any  # `Law` of impacts, or the `Force` of contacts that acts throughout
-    mu: jax.Array | None
+    mu: Float[Array, " m"] | None
     settings: Settings
-    q0: jax.Array
-    v0: jax.Array
-    times: jax.Array  # (S,)
+    q0: Float[Array, " nq"]
+    v0: Float[Array, " n"]
+    times: Float[Array, " S"]  # [s] of the samples
     contacts: int  # m
     past: Past | None = None  # where the motion may go on, run after run
 
     @property
     def tangents(self) -> int:
-        """The number of tangential impulses."""
+        """Number t of tangential impulses."""
         return tangent_count_of(self.system, self.q0, self.contacts)
 
     @property
     def start(self) -> State:
-        """The state at the beginning."""
+        """State at the beginning, of rigid contacts: no work has been done."""
         zero = jnp.zeros((), self.q0.dtype)
         rest = jnp.zeros((2, self.contacts), self.q0.dtype)
         return State(self.q0, self.v0, self.times[0], zero, zero, rest, rest[:0])
@@ -60,38 +62,55 @@ class MotionProblem(NamedTuple):
 class Course(NamedTuple):
     """A whole motion: states at the sampled times (NaN: not reached), events, steps, status."""
 
-    samples: State
+    samples: State  # of arrays with a first axis S
     events: Events
-    steps: jax.Array
-    status: jax.Array
+    steps: Int[Array, ""]
+    status: Int[Array, ""]
 
 
 class MotionTable(NamedTuple):
-    """What a motion writes down; rows beyond those reached hold anything."""
+    """Rows of samples and events that a run fills; rows beyond those reached hold anything.
 
-    samples: jax.Array  # (S + 1, rows of the state)
-    events: jax.Array  # (E + 1, w)
-    marks: jax.Array  # (E + 1, 2 + m) kind, status of the law, contacts
+    The last row of each takes what is discarded, as every pass writes one.
+    """
+
+    samples: Float[Array, "S+1 rows"]  # of the state, see `flow.packed`
+    events: Float[Array, "E+1 w"]  # see `event_numbers`
+    marks: Int[Array, "E+1 2+m"]  # kind, status of the law, contacts that take part
+
+    def with_event(
+        self, numbers: Float[Array, " w"], marks: Int[Array, " marks"], row: Int[Array, ""]
+    ) -> "MotionTable":
+        """The table with an event in this row; see `event_numbers` and `marks`."""
+        events = put(self.events, numbers, row)
+        return self._replace(events=events, marks=put(self.marks, marks.astype(jnp.int32), row))
+
+    def with_sample(self, state: State, row: Int[Array, ""]) -> "MotionTable":
+        """The table with this state as the sample of this row."""
+        return self._replace(samples=put(self.samples, packed(state)[:, 0], row))
 
 
 class MotionEnd(NamedTuple):
     """A run at its end."""
 
     table: MotionTable
-    reached: jax.Array  # samples
-    event_count: jax.Array
-    steps: jax.Array
-    status: jax.Array
-    smooth: jax.Array  # (2,) samples and events before normals jumped
-    more: jax.Array | None  # what the next run takes over
+    reached: Int[Array, ""]  # number of samples
+    event_count: Int[Array, ""]
+    steps: Int[Array, ""]
+    status: Int[Array, ""]
+    smooth: Int[Array, "2"]  # numbers of samples and events before a normal jumped
+    more: Float[Array, " size"] | None  # `Past.numbers` of the next run
 
 
 def differentiable(problem: Any, run: Callable[[Any], MotionEnd]) -> MotionEnd:
-    """`run(problem)` with derivatives in both modes; NaN of what is not reached, or not smooth."""
+    """`run(problem)` with derivatives in both modes, of its samples and events.
+
+    They are NaN in rows that the motion does not reach, or that come after a normal has jumped.
+    """
     end: MotionEnd = by_jacobian(run, problem)
 
-    def known(rows: jax.Array, count: jax.Array) -> jax.Array:
-        """Rows, of which the first `count` () and the last one have derivatives, others NaN."""
+    def known(rows: Float[Array, "r w"], count: Int[Array, ""]) -> Float[Array, "r w"]:
+        """Rows, of which the first `count` and the last one have derivatives, others NaN."""
         index = jnp.arange(len(rows), dtype=count.dtype)
         there = (index < count) | (index == len(rows) - 1)
         some = jnp.where(there[:, None], rows, jax.lax.stop_gradient(rows))
@@ -105,7 +124,7 @@ def differentiable(problem: Any, run: Callable[[Any], MotionEnd]) -> MotionEnd:
 
 
 def empty_table(problem: MotionProblem, start: State, max_events: int) -> MotionTable:
-    """The table of a motion that begins in this state."""
+    """Table of a motion that begins in this state, its first sample; other rows are 0."""
     return MotionTable(
         no_samples(start, problem.times),
         jnp.zeros((max_events + 1, event_width(problem)), start.q.dtype),
@@ -113,24 +132,19 @@ def empty_table(problem: MotionProblem, start: State, max_events: int) -> Motion
     )
 
 
-def put(rows: jax.Array, value: jax.Array, index: jax.Array) -> jax.Array:
-    """The table with a row written."""
-    return jax.lax.dynamic_update_index_in_dim(rows, value.astype(rows.dtype), index, 0)
-
-
-def no_samples(start: State, targets: jax.Array) -> jax.Array:
-    """A table of the states at the samples, and a last row for discarded entries."""
+def no_samples(start: State, targets: Float[Array, " S"]) -> Float[Array, "S+1 rows"]:
+    """Rows of the states at the samples, of which the first is known; the last is for discards."""
     row = packed(start)[:, 0]
     return jnp.zeros((targets.shape[0] + 1, len(row)), row.dtype).at[0].set(row)
 
 
-def nan_unless(known: jax.Array, rows: jax.Array) -> jax.Array:
-    """Rows (r, w), NaN where not `known` (r,); other than those of `where`, derivatives pass."""
+def nan_unless(known: Bool[Array, " r"], rows: Float[Array, "r w"]) -> Float[Array, "r w"]:
+    """Rows, NaN where not `known`; unlike with `jnp.where`, all derivatives pass."""
     return rows + jnp.where(known, 0.0, jnp.nan).astype(rows.dtype)[:, None]
 
 
-def nan_derivatives(inputs: Any, known: jax.Array) -> jax.Array:
-    """Zeros (r, 1); where not `known` (r,) all their derivatives by all inputs are NaN.
+def nan_derivatives(inputs: Any, known: Bool[Array, " r"]) -> Float[Array, "r 1"]:
+    """Zeros; where not `known` all their derivatives by all inputs are NaN.
 
     A motion that has ended does not determine what would come later. In reverse mode what nobody
     differentiates (a cotangent of 0) leaves the gradient as it is.
@@ -140,8 +154,10 @@ def nan_derivatives(inputs: Any, known: jax.Array) -> jax.Array:
 
 
 @jax.custom_jvp
-def _undetermined(arrays: list[jax.Array], unknown: jax.Array) -> jax.Array:
-    """Zeros (r,), of which the `unknown` (r,) have derivatives NaN, of every order.
+def _undetermined(
+    arrays: list[Float[Array, "..."]], unknown: Bool[Array, " r"]
+) -> Float[Array, " r"]:
+    """Zeros, of which the `unknown` have derivatives NaN, of every order.
 
     As those of a sine of all inputs, multiplied by something infinite: they are not 0.
     """
@@ -150,7 +166,11 @@ def _undetermined(arrays: list[jax.Array], unknown: jax.Array) -> jax.Array:
 
 @_undetermined.defjvp
 def _undetermined_tangent(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
-    """Of the sine. What has a tangent or cotangent of 0 remains 0."""
+    """Zeros and their tangents: large numbers times the cosine of all inputs, where unknown.
+
+    Equation: `d = L w_i cos(1 + sum_j w_j x_j) sum_j L dx_j`, L of `_enlarged`: infinite or NaN
+    unless all dx_j are 0, as are its own derivatives.
+    """
     arrays, unknown = primals
     flat = jnp.concatenate([jnp.where(jnp.isfinite(x), x, 0.0).ravel() for x in arrays])
     flat = _reversed(flat)  # and an infinite cotangent becomes NaN
@@ -163,42 +183,44 @@ def _undetermined_tangent(primals: Any, tangents: Any) -> tuple[jax.Array, jax.A
 
 
 def _weights(count: int) -> np.ndarray:
-    """Numbers of which no usual combination is 0."""
+    """Weights `sqrt(2 + j)`, of which no usual combination is 0."""
     return np.sqrt(np.arange(2.0, 2 + count))
 
 
-def _enlarged(x: jax.Array, chosen: jax.Array) -> jax.Array:
-    """x times a number so large, where `chosen`, that the second time gives infinity: NaN."""
+def _enlarged(x: Float[Array, "*d"], chosen: Bool[Array, ""]) -> Float[Array, "*d"]:
+    """`L x` where `chosen`, L = max^LARGE: the second time gives infinity, then NaN."""
     factor = jnp.where(chosen, float(jnp.finfo(x.dtype).max) ** LARGE, 1.0).astype(x.dtype)
     return _reversed(factor * _reversed(x))  # and so is its transpose
 
 
-def _reversed(x: jax.Array) -> jax.Array:
+def _reversed(x: Float[Array, "*d"]) -> Float[Array, "*d"]:
     """-x, NaN of infinity; so is its transpose."""
     return x + (-2) * x
 
 
-def sampled_states(samples: jax.Array, start: State, reached: jax.Array) -> State:
-    """States of a table, NaN where they were not reached."""
+def sampled_states(
+    samples: Float[Array, "table rows"], like: State, reached: Int[Array, ""]
+) -> State:
+    """States (S, ..) from S + 1 rows, NaN beyond the first `reached`; `like` has their shapes."""
     is_reached = jnp.arange(samples.shape[0] - 1, dtype=reached.dtype) < reached
     rows = nan_unless(is_reached, samples[:-1])
-    return jax.vmap(lambda row: unpacked(start, row[:, None]))(rows)
+    return jax.vmap(lambda row: unpacked(like, row[:, None]))(rows)
 
 
 def event_width(problem: MotionProblem) -> int:
-    """Numbers of an event."""
+    """Count of the numbers of `event_numbers`: 3 + nq + 2 n + 3 m + t."""
     return 3 + problem.q0.size + 2 * problem.v0.size + 3 * problem.contacts + problem.tangents
 
 
-def event_numbers(before: State, after: After) -> jax.Array:
-    """Those of one event, in a row."""
+def event_numbers(before: State, after: After) -> Float[Array, " w"]:
+    """Row of an event: t, q, v-, v+, impulses (m, then t), energies (2 m), time and gap passed."""
     jump = after.jump
     parts = (before.t, before.q, before.v, jump.v, jump.impulse, jump.tangential, jump.energy)
     return ravel_pytree((parts, after.passed))[0]
 
 
-def recorded_events(table: MotionTable, count: jax.Array, problem: MotionProblem) -> Events:
-    """The record of events; NaN or 0 in rows that are not used."""
+def recorded_events(table: MotionTable, count: Int[Array, ""], problem: MotionProblem) -> Events:
+    """Record of the first `count` events of a table; NaN or 0 in rows that are not used."""
     used = jnp.arange(len(table.events) - 1, dtype=count.dtype) < count
     marks = jnp.where(used[:, None], table.marks[:-1], 0)
     rows = nan_unless(used, table.events[:-1])

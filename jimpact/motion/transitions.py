@@ -1,9 +1,16 @@
-"""What happens at an event: the impact, the end of an accumulation, new modes of contact."""
+"""Events of rigid contacts: the impact, the end of an accumulation, new modes of contact.
+
+*Fired* are the margins that a step has brought to 0: m of gaps or normal forces, with friction m
+more of the cone or the slip. An *accumulation* is an infinite sequence of impacts in finite time.
+An *impact without collision* (`paroxysm`) is that of contacts which friction jams: no contact
+forces exist, although no contact approaches.
+"""
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
 
 from jimpact.core.impacts import impact
 from jimpact.core.law import Law
@@ -52,25 +59,33 @@ STOPPED = 1e-7
 
 
 class Jump(NamedTuple):
-    """What the contacts do to the velocities at one event; all impulses [N s]."""
+    """Velocities after an event, and the impulses, energies and status that belong to them."""
 
-    v: jax.Array
-    impulse: jax.Array  # (m,)
-    tangential: jax.Array  # (m,), in space (2 m,)
-    energy: jax.Array  # (2, m): change by each contact, normal and tangential
-    base_work: jax.Array
-    code: jax.Array  # of the law
+    v: Float[Array, " n"]
+    impulse: Float[Array, " m"]  # [N s] normal
+    tangential: Float[Array, " t"]  # [N s]
+    energy: Float[Array, "2 m"]  # [J] change by each contact, normal and tangential
+    base_work: Float[Array, ""]  # [J]
+    code: Int[Array, ""]  # status of the law
 
 
 def no_jump(state: State, m: int, tangents: int) -> Jump:
-    """Nothing happens, at m contacts with so many tangential impulses."""
-    zero = jnp.zeros_like(state.work)
-    none, side = jnp.zeros(m, state.v.dtype), jnp.zeros(tangents, state.v.dtype)
-    return Jump(state.v, none, side, jnp.zeros((2, m), none.dtype), zero, jnp.int32(CODE["ok"]))
+    """Jump with the velocities of the state and impulses 0, m normal and `tangents` others."""
+    dtype = state.v.dtype
+    return Jump(
+        v=state.v,
+        impulse=jnp.zeros(m, dtype),
+        tangential=jnp.zeros(tangents, dtype),
+        energy=jnp.zeros((2, m), dtype),
+        base_work=jnp.zeros_like(state.work),
+        code=jnp.int32(CODE["ok"]),
+    )
 
 
-def scene_at(system: System, q: jax.Array, t: jax.Array, closed: jax.Array) -> Scene:
-    """The scene that a law sees: normals and tangents at q; open contacts are out of reach."""
+def scene_at(
+    system: System, q: Float[Array, " nq"], t: Float[Array, ""], closed: Bool[Array, " m"]
+) -> Scene:
+    """Scene of an impact at q: mass, normals, tangents; gap 0 of closed contacts, inf of others."""
     _, normals, tangents = system.body.directions(seen_from_base(system, q, t))
     away = jnp.where(closed, 0.0, jnp.inf).astype(q.dtype)
     return Scene(mass_at(system, q), normals, tangents, away)
@@ -79,15 +94,17 @@ def scene_at(system: System, q: jax.Array, t: jax.Array, closed: jax.Array) -> S
 def impact_jump(
     system: System,
     law: Law,
-    t: jax.Array,
+    t: Float[Array, ""],
     state: State,
-    closed: jax.Array,
-    noise: jax.Array,
-    approach: jax.Array | None,
+    closed: Bool[Array, " m"],
+    noise: Float[Array, ""],
+    approach: Float[Array, ""] | None,
 ) -> Jump:
-    """`impact` in the frame of the base, and what it does to energies.
+    """Jump by `impact` in the frame of the base: v is seen as `v - B y_b'`.
 
-    Gap velocities up to `noise` are rounding, on the scale of the motion; `approach`: see `impact`.
+    Equation: a contact gives `p N^T (v- + v+) / 2` [J], tangentially `p_t . H^T (v- + v+) / 2`, the
+    base `(N p + H p_t) . B y_b'`. Gap velocities up to `noise` [m/s] are rounding; `approach`: see
+    `impact`.
     """
     m = closed.shape[0]
     scene = scene_at(system, state.q, t, closed)
@@ -97,30 +114,30 @@ def impact_jump(
     mean = 0.5 * (out.velocity + relative)
     push = scene.normals @ out.impulse
     normal = (scene.normals.T @ mean) * out.impulse
-    tangential, side = jnp.zeros(m, normal.dtype), jnp.zeros(m, normal.dtype)
+    tangential, friction = jnp.zeros(m, normal.dtype), jnp.zeros(m, normal.dtype)
     if scene.tangents is not None:
         tangential = out.tangential_impulse
-        side = by_contact((scene.tangents.T @ mean) * tangential, m).sum(axis=1)
+        friction = by_contact((scene.tangents.T @ mean) * tangential, m).sum(axis=1)
         push = push + scene.tangents @ tangential
-    energy = jnp.stack([normal, side])
+    energy = jnp.stack([normal, friction])
     return Jump(out.velocity + carried, out.impulse, tangential, energy, push @ carried, out.status)
 
 
-def tangent_count_of(system: System, q: jax.Array, m: int) -> int:
-    """The number of tangential impulses of m contacts; m without tangents, too."""
+def tangent_count_of(system: System, q: Float[Array, " nq"], m: int) -> int:
+    """Number t of tangential impulses of m contacts; m for a body without tangents."""
     tangents = jax.eval_shape(system.body.tangents, q)
     return m if tangents is None else int(tangents.shape[1])
 
 
 class Passed(NamedTuple):
-    """What of an accumulation is passed at once, as estimated; 0 where there is none."""
+    """Rest of an accumulation that is passed at once, as estimated; 0 where there is none."""
 
-    time: jax.Array  # () [s]
-    gap: jax.Array  # () [m] to which its contacts might open within it
+    time: Float[Array, ""]  # [s] that the impacts left out would take
+    gap: Float[Array, ""]  # [m] to which contacts might open within it
 
 
 class After(NamedTuple):
-    """The smooth part of an event."""
+    """Parts of an event that have derivatives."""
 
     state: State
     jump: Jump
@@ -128,41 +145,49 @@ class After(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What happens at an event, and how it goes on."""
+    """An event: state and modes after it, and the numbers that the record holds."""
 
     after: After
-    strikes: jax.Array  # () whether there is an impact
+    strikes: Bool[Array, ""]  # there is an impact
     scales: Scales
     modes: Modes
-    kind: jax.Array
-    contacts: jax.Array  # (m,)
-    code: jax.Array  # of the law, or that there are several solutions
-    status: jax.Array
-    approach: jax.Array  # where there are no contact forces: of the impact without collision next
-    several: jax.Array  # whether there are several
+    kind: Int[Array, ""]  # index of `record.EVENT_KINDS`
+    contacts: Bool[Array, " m"]  # that take part
+    code: Int[Array, ""]  # status of the law, or that there are several solutions
+    status: Int[Array, ""]  # of the motion
+    # [m/s] gap velocity of the impact without collision that must come next, 0 where none must
+    approach: Float[Array, ""]
+    several: Bool[Array, ""]  # contact forces are not unique
 
 
 def resolve(
     system: System,
     law: Law,
-    mu: jax.Array | None,
+    mu: Float[Array, " m"] | None,
     settings: Settings,
     state: State,
     before: Modes,
-    fired: jax.Array,
+    fired: Bool[Array, " f"],
     scales: Scales,
-    struck: jax.Array,
-    approach: jax.Array,
+    struck: Bool[Array, " m"],
+    approach: Float[Array, ""],
 ) -> Outcome:
-    """Impact if a closed contact approaches; contacts come to rest; new modes.
+    """Resolve an event: impact if a closed contact approaches; contacts come to rest; new modes.
+
+    Args:
+        before: modes up to now.
+        fired: (m,), with friction (2 m,) margins that have come to 0.
+        scales: largest values of the motion so far.
+        struck: contacts that had an impact before.
+        approach: [m/s] of an impact without collision that is due, else 0.
 
     A closed contact remains closed if it leaves by no more than rounding, or slower than
     `settings.accumulation` and would be pressed back: the rest of its infinite sequence of
     impacts is then passed at once (its gap velocity is set to 0, energy is lost).
 
     Where friction leaves no contact forces, the next event, at the same instant, is an impact
-    without collision: the limit of that of contacts that approach ever more slowly. `approach` ()
-    is how fast they do at this one, 0 where it is an ordinary event.
+    without collision: the limit of that of contacts that approach ever more slowly. They do at
+    `approach` here.
 
     Clusters: where contacts share bodies, accumulations are nested: their numbers of impacts
     multiply. A contact that shares a body with another one that is closed or was `struck` before
@@ -170,8 +195,8 @@ def resolve(
     That is done for all of them at once, and only if no other contact is reached within the time
     that is passed: the state after it is then that at the end of the sequence.
     """
-    strike = _impact_first(system, law, settings, state, scales, approach)
-    tight = strike.closed & (jnp.abs(strike.contacts.normal.rate) <= strike.rest)
+    strike = _impact_if_any(system, law, settings, state, scales, approach)
+    tight = strike.closed & (jnp.abs(strike.contacts.normal.rate) <= strike.rest)  # f' = 0
     m = before.active.shape[0]
     stopped = jnp.zeros(m, bool)
     if settings.spatial:
@@ -182,33 +207,46 @@ def resolve(
     choice, held, released = _next_modes(
         system, mu, settings, strike, result, at_rest, before, fired
     )
-    status, code, wedges = _status(strike, jump, choice, held)
-    took = jnp.where(strike.happens, jump.impulse != 0, jnp.any(fired.reshape(-1, m), axis=0))
-    took = took | choice.parts
+    status, code, next_approach = _status(strike, jump, choice, held)
+    any_fired = jnp.any(fired.reshape(-1, m), axis=0)  # of the margins of each contact
+    taking_part = jnp.where(strike.happens, jump.impulse != 0, any_fired) | choice.parts
     after = After(_with_jump(state, jump), jump, result.passed)
     parts = released[:m] | choice.parts
     kind = _kind(strike.happens, strike.jams, jnp.any(result.ends), parts, fired)
     return Outcome(
-        after, strike.happens, strike.scales, choice.modes, kind, took, code, status, wedges,
-        choice.several,
-    )  # fmt: skip
+        after=after,
+        strikes=strike.happens,
+        scales=strike.scales,
+        modes=choice.modes,
+        kind=kind,
+        contacts=taking_part,
+        code=code,
+        status=status,
+        approach=next_approach,
+        several=choice.several,
+    )
 
 
 def slip_stops(
-    settings: Settings, before: Modes, fired: jax.Array, speed: jax.Array, speed_scale: jax.Array
-) -> jax.Array:
-    """Which contacts (m,) that slid, and whose margin has `fired`, have stopped at this `speed`.
+    settings: Settings,
+    before: Modes,
+    fired: Bool[Array, " m"],
+    speed: Float[Array, " m"],
+    speed_scale: Float[Array, ""],
+) -> Bool[Array, " m"]:
+    """True where a contact that slid, and whose margin of friction has `fired`, has stopped.
 
-    In space a step may turn slip by so much that it lands although slip goes on.
+    In space only where its slip `speed` [m/s] is at most STOPPED of the scale: a step may turn slip
+    by so much that it lands on `u . d = 0` although slip goes on.
     """
     slid = fired & ~before.stick
     return slid & (speed <= STOPPED * speed_scale) if settings.spatial else slid
 
 
 def _fired_in_space(
-    settings: Settings, strike: "_Strike", before: Modes, fired: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """What has `fired` (2 m,), and where slip in space has stopped (m,).
+    settings: Settings, strike: "_Strike", before: Modes, fired: Bool[Array, " f"]
+) -> tuple[Bool[Array, " f"], Bool[Array, " m"]]:
+    """Margins that have fired (2 m,) without those that are no events, and stopped contacts (m,).
 
     A step may turn slip by so much that it lands although slip goes on, or slip may no longer
     only begin: these are no events.
@@ -223,51 +261,66 @@ def _fired_in_space(
 class _Strike(NamedTuple):
     """An event after its impact, if there is one."""
 
-    t: jax.Array  # ()
+    t: Float[Array, ""]
     before: Contacts
     contacts: Contacts  # with the velocities after it
-    closed: jax.Array  # (m,)
-    happens: jax.Array  # () whether there is an impact
-    jams: jax.Array  # () whether it is one without collision
-    approach: jax.Array  # () of that one, else 0
+    closed: Bool[Array, " m"]
+    happens: Bool[Array, ""]  # there is an impact
+    jams: Bool[Array, ""]  # it is one without collision
+    approach: Float[Array, ""]  # [m/s] of that one, else 0
     scales: Scales
-    rest: jax.Array  # () gap velocities that are rounding
+    rest: Float[Array, ""]  # [m/s] smaller gap velocities are rounding
     jump: Jump
 
 
-def _impact_first(
+def _impact_if_any(
     system: System,
     law: Law,
     settings: Settings,
     state: State,
     scales: Scales,
-    approach: jax.Array,
+    approach: Float[Array, ""],
 ) -> _Strike:
-    """The impact, where a closed contact approaches or one without collision is due."""
+    """The impact of contacts with f' < -rest at closed gaps, or one without collision if due.
+
+    Its jump is empty where neither is so.
+    """
     t = state.t
     before = contacts_at(system, state.q, state.v, t, settings.friction)
     closed = before.normal.value <= settings.closed_below
-    scales = _grown(system, settings, scales, before, state)
-    rest = _rest(settings, scales)
+    scales = _largest_scales(system, settings, scales, before, state)
+    rest = _rest_speed(settings, scales)
     jams = approach > 0
     strikes = jnp.any(closed & (before.normal.rate < -rest)) | jams
-    jump = _struck(system, law, settings, state, strikes, approach, closed, scales)
+    jump = _jump_if(strikes, system, law, settings, state, approach, closed, scales)
     contacts = contacts_at(system, state.q, jump.v, t, settings.friction)
-    return _Strike(t, before, contacts, closed, strikes, jams, approach, scales, rest, jump)
+    return _Strike(
+        t=t,
+        before=before,
+        contacts=contacts,
+        closed=closed,
+        happens=strikes,
+        jams=jams,
+        approach=approach,
+        scales=scales,
+        rest=rest,
+        jump=jump,
+    )
 
 
 def _brought_slow_to_rest(
     system: System,
-    mu: jax.Array | None,
+    mu: Float[Array, " m"] | None,
     settings: Settings,
     strike: _Strike,
-    struck: jax.Array,
-    tight: jax.Array,
-    stopped: jax.Array,
+    struck: Bool[Array, " m"],
+    tight: Bool[Array, " m"],
+    stopped: Bool[Array, " m"],
 ) -> "_Resting":
-    """What comes to rest: contacts (m,) that are `tight`, and slow ones.
+    """Contacts brought to rest: `tight` ones (f' = 0), and slow ones that would be pressed back.
 
-    Slip comes to rest where it has `stopped` (m,) or is slow.
+    Slow: |f'| at most `accumulation` times the largest gap velocity, or a hop within the rounding
+    of gaps. Slip comes to rest, too, where it has `stopped` or is as slow.
     """
     contacts, scales, closed = strike.contacts, strike.scales, strike.closed
     m, gamma = tight.shape[0], contacts.normal.rate
@@ -280,17 +333,16 @@ def _brought_slow_to_rest(
     if contacts.tangent is not None:
         stick = stopped | (length(by_contact(contacts.tangent.rate, m)) <= slowly)
 
-    def resting(slow: jax.Array) -> _Resting:
-        """What comes to rest if `slow` contacts (m,) may.
+    def resting(slow: Bool[Array, " m"]) -> _Resting:
+        """Velocities after the `slow` contacts that would come back are stopped.
 
-        A slow contact stops where its normal force in `0 <= lambda _|_ W lambda + approach >= 0`
-        is positive: it would come back.
+        These have a positive force in `0 <= lambda _|_ W lambda + approach >= 0`.
         """
         pressed, kept_closed, force = pressed_together(contacts, slow, _slack(strike))
         stopped = tight | (slow & pressed)
         stop = _brought_to_rest(system, contacts, mu, stopped, stick, strike.t, strike.jump)
         # redundant contacts come to rest with others
-        left = gamma + contacts.delassus[:m] @ stop.impulse
+        left = gamma + contacts.delassus[:m] @ stop.impulse  # gap velocities after it
         at_rest = closed & (jnp.abs(left) <= strike.rest)
         # a contact accumulates if it was brought to rest from more than rounding
         ends = at_rest & ~tight & strike.happens & ~strike.jams
@@ -308,22 +360,31 @@ def _brought_slow_to_rest(
     return selected(undisturbed, cluster, alone)
 
 
-def _slack(strike: _Strike) -> jax.Array:
-    """Gap accelerations () that are rounding."""
+def _slack(strike: _Strike) -> Float[Array, ""]:
+    """Gap acceleration [m/s^2] below which it is rounding: a share of the largest one."""
     return rest_acceleration(strike.rest.dtype) * strike.scales.acceleration
 
 
 def _next_modes(
     system: System,
-    mu: jax.Array | None,
+    mu: Float[Array, " m"] | None,
     settings: Settings,
     strike: _Strike,
     result: "_Resting",
     state: State,
     before: Modes,
-    fired: jax.Array,
-) -> tuple[ModeChoice, jax.Array, jax.Array]:
-    """The modes after the event at this state, contacts (m,) at rest, and constraints released."""
+    fired: Bool[Array, " f"],
+) -> tuple[ModeChoice, Bool[Array, " m"], Bool[Array, " f"]]:
+    """Modes after an event, by complementarity of forces and accelerations at resting contacts.
+
+    Equation: `0 <= lambda_n _|_ a_n >= 0` with `a = W lambda + approach` at `state`; with friction
+    `|lambda_t| <= mu lambda_n`, and equality against the slip, see `choose_with_friction`. Without
+    friction `pressed_together` has solved it; a contact that neither presses nor parts stays closed
+    unless its force has just fallen to 0.
+
+    Returns modes; contacts at rest; constraints (normal, with friction tangential) that the step
+    has `fired` and that held before: they are released.
+    """
     contacts, rest = strike.contacts, strike.rest
     if mu is not None:  # what velocities before the rest would still turn, redundant contacts fight
         contacts = contacts_at(system, state.q, state.v, strike.t, True)
@@ -341,38 +402,43 @@ def _next_modes(
 
 
 def _status(
-    strike: _Strike, jump: Jump, choice: ModeChoice, held: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Status of the motion, that of the law, and the approach of an impact without collision."""
+    strike: _Strike, jump: Jump, choice: ModeChoice, held: Bool[Array, " m"]
+) -> tuple[Int[Array, ""], Int[Array, ""], Float[Array, ""]]:
+    """Status of the motion, that of the law, and approach [m/s] of a following paroxysm.
+
+    A paroxysm is an impact without collision: in the plane it is due where the modes are not
+    consistent and a contact at rest (`held`) slips. Where it changed nothing, or none is possible,
+    the status is `no_contact_force`.
+    """
     fails = jnp.asarray(FAILS)[jump.code]
     status = jnp.where(fails, CODE["law_failed"], CODE["ok"])
-    code, wedges = jump.code, jnp.zeros_like(strike.rest)
+    code, next_approach = jump.code, jnp.zeros_like(strike.rest)
     now, earlier = strike.contacts.tangent, strike.before.tangent
     if now is not None and earlier is not None:
         change = jnp.max(jnp.abs(now.rate - earlier.rate))
         if not in_space(strike.contacts):
-            wedges = jnp.where(choice.consistent, 0.0, _approach(choice, now.rate, held))
+            next_approach = jnp.where(choice.consistent, 0.0, _approach(choice, now.rate, held))
         jammed = strike.jams & (change <= SUPPLIED * strike.approach)
-        none = jammed | (~choice.consistent & (wedges == 0))
+        none = jammed | (~choice.consistent & (next_approach == 0))
         status = jnp.where(none, CODE["no_contact_force"], status)
         code = jnp.where(choice.several, jnp.maximum(code, CODE["several_outcomes"]), code)
-    return status, code, wedges
+    return status, code, next_approach
 
 
 class _Resting(NamedTuple):
-    """What comes to rest of slow contacts (m,), and the velocities after it."""
+    """Contacts at rest after slow ones were stopped, and the jump with that."""
 
-    pressed: jax.Array  # (m,) contacts with a normal force
-    kept_closed: jax.Array  # (m,) those that neither press nor part
-    at_rest: jax.Array  # (m,) closed, without gap velocity
-    force: jax.Array  # (m,) normal forces [N]
-    ends: jax.Array  # (m,) contacts whose impacts accumulate here
+    pressed: Bool[Array, " m"]  # with a normal force
+    kept_closed: Bool[Array, " m"]  # neither force nor gap acceleration
+    at_rest: Bool[Array, " m"]  # closed, without gap velocity
+    force: Float[Array, " m"]  # normal forces [N]
+    ends: Bool[Array, " m"]  # contacts whose impacts accumulate here
     jump: Jump
     passed: Passed
 
 
-def _share_bodies(contacts: Contacts, touched: jax.Array) -> jax.Array:
-    """Which contacts (m,) feel another one that is `touched`."""
+def _share_bodies(contacts: Contacts, touched: Bool[Array, " m"]) -> Bool[Array, " m"]:
+    """True where a contact i is coupled to a `touched` one j: `|W_ij| > eps sqrt(W_ii W_jj)`."""
     m = touched.shape[0]
     w = jnp.abs(contacts.delassus[:m, :m])
     size = jnp.sqrt(jnp.diagonal(w))
@@ -380,52 +446,63 @@ def _share_bodies(contacts: Contacts, touched: jax.Array) -> jax.Array:
     return jnp.any(others & (w > LEAST_COUPLING * jnp.outer(size, size)), axis=1)
 
 
-def _undisturbed(system: System, contacts: Contacts, result: _Resting, t: jax.Array) -> jax.Array:
-    """Whether () no other contact is reached within the time that is passed, by parabolas."""
+def _undisturbed(
+    system: System, contacts: Contacts, result: _Resting, t: Float[Array, ""]
+) -> Bool[Array, ""]:
+    """True where no other contact closes within the time that an accumulation takes.
+
+    Gaps fall as parabolas `f + f' s + f'' s^2 / 2` with the forces of the resting contacts.
+    """
     m = result.at_rest.shape[0]
     gap, normals = jnp.maximum(contacts.normal.value, 0.0), contacts.normal.gradient
     rate = normals.T @ (result.jump.v - carried_along(system, result.jump.v, t))
     fall = contacts.approach[:m] + contacts.delassus[:m, :m] @ result.force
     square = rate * rate - 2 * fall * gap
     root = jnp.sqrt(jnp.maximum(square, 0.0))
+    # time of the zero: with f' < 0 in a form without cancellation
     later = (rate + root) / jnp.where(fall < 0, -fall, 1.0)
     reached = jnp.where(rate < 0, 2 * gap / jnp.where(rate < 0, root - rate, 1.0), later)
     never = (square < 0) | ((rate >= 0) & (fall >= 0))
     return jnp.all(result.at_rest | never | (reached > result.passed.time))
 
 
-def _approach(choice: ModeChoice, slip: jax.Array, held: jax.Array) -> jax.Array:
-    """Gap velocity () of the approach to an impact without collision, 0 where nothing slips."""
+def _approach(
+    choice: ModeChoice, slip: Float[Array, " m"], held: Bool[Array, " m"]
+) -> Float[Array, ""]:
+    """Gap velocity [m/s] of an impact without collision: a share of the largest slip of `held`.
+
+    The share is the root of rounding, and MORE of what is left of the regularity.
+    """
     left = jnp.clip(choice.regularity, 0.0, 2 * precision(slip.dtype).root)
     share = precision(slip.dtype).root + MORE * left
     return jax.lax.stop_gradient(share * jnp.max(jnp.where(held, jnp.abs(slip), 0.0)))
 
 
-def velocity_noise(settings: Settings, acceleration: jax.Array) -> jax.Array:
-    """Velocities () that arise at this acceleration () within the rounding of time."""
+def velocity_noise(settings: Settings, acceleration: Float[Array, ""]) -> Float[Array, ""]:
+    """Velocity [m/s] that this acceleration [m/s^2] gives within the rounding of time."""
     duration = jnp.abs(jax.lax.stop_gradient(settings.duration))
     return precision(duration.dtype).accumulated * duration * acceleration
 
 
-def _rest(settings: Settings, scales: Scales) -> jax.Array:
-    """Gap velocities () that are rounding."""
+def _rest_speed(settings: Settings, scales: Scales) -> Float[Array, ""]:
+    """Gap velocity [m/s] below which it is 0: a share of `scales.speed`, and `velocity_noise`."""
     rounding = velocity_noise(settings, scales.acceleration)
     return not_rounding(REST_SPEED, rounding.dtype) * scales.speed + rounding
 
 
-def _struck(
+def _jump_if(
+    strikes: Bool[Array, ""],
     system: System,
     law: Law,
     settings: Settings,
     state: State,
-    strikes: jax.Array,
-    approach: jax.Array,
-    closed: jax.Array,
+    approach: Float[Array, ""],
+    closed: Bool[Array, " m"],
     scales: Scales,
 ) -> Jump:
-    """The impact where it `strikes`, else nothing."""
+    """`impact_jump` of the closed contacts if one `strikes`, else `no_jump`."""
     lead = approach if settings.friction else None
-    noise = _rest(settings, scales)
+    noise = _rest_speed(settings, scales)
     m = closed.shape[0]
     return jax.lax.cond(
         strikes,
@@ -435,7 +512,7 @@ def _struck(
 
 
 def _with_jump(state: State, jump: Jump) -> State:
-    """The state after a jump."""
+    """State with the velocities after a jump, and the works that it did."""
     return state._replace(
         v=jump.v,
         base_work=state.base_work + jump.base_work,
@@ -445,23 +522,28 @@ def _with_jump(state: State, jump: Jump) -> State:
 
 def _with_friction(
     contacts: Contacts,
-    mu: jax.Array,
+    mu: Float[Array, " m"],
     before: Modes,
-    held: jax.Array,
-    released: jax.Array,
-    rest: jax.Array,
-    slack: jax.Array,
+    held: Bool[Array, " m"],
+    released: Bool[Array, " 2*m"],
+    rest: Float[Array, ""],
+    slack: Float[Array, ""],
 ) -> ModeChoice:
-    """Modes with friction."""
+    """`choose_with_friction` of the `held` contacts; slips above `rest` [m/s] slide."""
     assert contacts.tangent is not None
     slides = length(by_contact(contacts.tangent.rate, len(mu))) > rest
     return choose_with_friction(contacts, mu, before, held, released, slides, slack)
 
 
-def _grown(
+def _largest_scales(
     system: System, settings: Settings, scales: Scales, contacts: Contacts, state: State
 ) -> Scales:
-    """The largest values so far, those of this instant included."""
+    """Largest values of the motion so far, those of this state included; without derivatives.
+
+    Equation: `max |f'|`; `speed_of` the kinetic energy, absolute and seen from the base, at least
+    `sqrt(a closed_below)`; a, the largest of |f''| without contact forces, the sum of the sizes of
+    its terms, and the speed over the duration.
+    """
     m = contacts.normal.rate.shape[0]
     relative = state.v - carried_along(system, state.v, state.t)
     energy = jnp.maximum(kinetic(system, state.q, state.v), kinetic(system, state.q, relative))
@@ -480,22 +562,26 @@ def _grown(
 class _Stop(NamedTuple):
     """Contacts that are brought to rest."""
 
-    jump: Jump  # after it
-    impulse: jax.Array  # (k,) that does it [N s]
-    force: jax.Array  # (m,) that will keep contacts closed [N]
-    energy: jax.Array  # () that it takes [J]
+    jump: Jump  # with the velocities after it
+    impulse: Float[Array, " k"]  # that does it [N s]
+    force: Float[Array, " m"]  # that will keep contacts closed [N]
+    energy: Float[Array, ""]  # that it takes [J]
 
 
 def _brought_to_rest(
     system: System,
     contacts: Contacts,
-    mu: jax.Array | None,
-    held: jax.Array,
-    stick: jax.Array,
-    t: jax.Array,
+    mu: Float[Array, " m"] | None,
+    held: Bool[Array, " m"],
+    stick: Bool[Array, " m"],
+    t: Float[Array, ""],
     jump: Jump,
 ) -> _Stop:
-    """Gap velocities of `held` contacts set to 0, tangential ones of those that `stick`, too."""
+    """Gap velocities of `held` contacts set to 0, and the slip of those that `stick`.
+
+    Equation: `W p = -rates` and `W force = -approach` in these rows, `v += M^-1 D p`; the contacts
+    give the energy `p rates / 2`, as their mean velocity is half of that before.
+    """
     m = held.shape[0]
     modes, rates = (
         no_modes(m, jump.v.dtype)._replace(active=held, stick=stick),
@@ -507,43 +593,53 @@ def _brought_to_rest(
     columns = jnp.stack([rates, contacts.approach[:size]], axis=1)
     p, force = constraint_impulse(contacts, mu, modes, columns).T
     # work at the mean velocity: half of that before, 0 after
-    work, side = 0.5 * p * rates, jnp.zeros_like(jump.tangential)
+    work, tangential = 0.5 * p * rates, jnp.zeros_like(jump.tangential)
     energy = jnp.stack([work[:m], jnp.zeros_like(work[:m])])
     if contacts.tangent is not None:
-        energy, side = energy.at[1].set(by_contact(work[m:], m).sum(axis=1)), p[m:]
+        energy, tangential = energy.at[1].set(by_contact(work[m:], m).sum(axis=1)), p[m:]
     # the gaps, up to `closed_below`, are closed by the flight that follows
     fallen = jnp.where(held, jnp.maximum(force[:m], 0.0) * contacts.normal.value, 0.0)
     carried = carried_along(system, jump.v, t)
     jump = jump._replace(
         v=jump.v + contacts.moved @ p,
         impulse=jump.impulse + p[:m],
-        tangential=jump.tangential + side,
+        tangential=jump.tangential + tangential,
         energy=(jump.energy + energy).at[0].add(-fallen),
         base_work=jump.base_work + (contacts.directions @ p) @ carried,
     )
     return _Stop(jump, p, force[:m], -jnp.sum(work))
 
 
-def _passed(stop: _Stop, ends: jax.Array, lost: jax.Array) -> Passed:
-    """By the energy in hops that the stop takes, and what the impact took.
+def _passed(stop: _Stop, ends: Bool[Array, " m"], lost: Float[Array, ""]) -> Passed:
+    """Time and gap of the hops that a stop leaves out, from its energy and what the impact `lost`.
 
     Under the force F that will keep a contact closed a hop takes 2 p / F, and energy E lifts it by
     E / F at most. If each impact keeps r^2 of the energy, and k contacts strike in turn, hops
-    take `2 k p / F (1 + r + ..)` together: exact for a single contact.
+    take `2 k p / F (1 + r + ..)` together: exact for a single contact. r^2 is the energy [J] that
+    the stop takes, over itself and `lost`, that of the last impact; `ends`: the k contacts.
     """
-    p, left = stop.impulse[: len(ends)], stop.energy
+    p, energy = stop.impulse[: len(ends)], stop.energy
     pressed = ends & (stop.force > 0)
-    safe, some = jnp.where(pressed, stop.force, 1.0), jnp.any(pressed) & (left > 0)
-    r = jnp.sqrt(jnp.where(some, left, 0.25) / jnp.where(some, left + jnp.maximum(lost, 0), 1.0))
-    hop = jnp.max(jnp.where(pressed, 2 * jnp.abs(p) / safe, 0.0))
-    lift = jnp.max(jnp.where(pressed, left / safe, 0.0))
+    force, some = jnp.where(pressed, stop.force, 1.0), jnp.any(pressed) & (energy > 0)
+    before = jnp.where(some, energy + jnp.maximum(lost, 0), 1.0)  # energy before the last impact
+    r = jnp.sqrt(jnp.where(some, energy, 0.25) / before)  # 1/2 where nothing is passed: not used
+    hop = jnp.max(jnp.where(pressed, 2 * jnp.abs(p) / force, 0.0))
+    lift = jnp.max(jnp.where(pressed, energy / force, 0.0))
     return Passed(jnp.sum(ends.astype(p.dtype)) * hop / (1 - r), lift)
 
 
 def _kind(
-    strikes: jax.Array, jams: jax.Array, ends: jax.Array, parts: jax.Array, fired: jax.Array
-) -> jax.Array:
-    """The kind of event, `none` at a beginning without impact."""
+    strikes: Bool[Array, ""],
+    jams: Bool[Array, ""],
+    ends: Bool[Array, ""],
+    parts: Bool[Array, " m"],
+    fired: Bool[Array, " f"],
+) -> Int[Array, ""]:
+    """Kind of the event; the later of these that holds.
+
+    none (at the start), contact, friction: a margin has `fired`; detachment: a contact `parts`;
+    impact where one `strikes`: accumulation if it `ends` one, paroxysm if it `jams`.
+    """
     m = len(parts)
     kind = jnp.where(jnp.any(fired[:m]), KIND_CODE["contact"], KIND_CODE["none"])
     kind = jnp.where(jnp.any(fired[m:]), KIND_CODE["friction"], kind)

@@ -5,10 +5,16 @@ Between the instants tau_i and tau_(i+1) of two impacts the places are
 v+ = (P_(i+1) - P_i) / h - a h / 2 after the first, v- = (P_(i+1) - P_i) / h + a h / 2 before the
 second. Places and instants are found by Gauss-Newton; an arc meets its neighbours only, so that the
 normal matrix is banded.
+
+K impacts have K + 2 ends of K + 1 flights: the impacts, the first and the last frame. The unknowns
+of the fit are (P_i, tau_i) of each end in turn, n + 1 values, then those of acceleration (n) and
+drag (1) that are free. Slopes of one flight are in 3 n + 3 values: P_i, tau_i, P_(i+1), tau_(i+1),
+a, k.
 """
 
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import solveh_banded
@@ -30,10 +36,9 @@ SETTLED = 1e-7
 class Arcs:
     """Arcs between K + 2 ends, of which the first and the last are no impacts.
 
-    Fields: instants (K + 2,), places (K + 2, n), acceleration (n,), drag [1/m]; free: whether the
-    acceleration is, and the drag; covariance of (places, instant) of each end in turn, then of
-    those that are; members: frames of each flight; residual (T, n) in units of sigma, NaN where no
-    frame was used.
+    Fields: instants tau (K + 2,) [s], places P (K + 2, n) [m, rad], acceleration a (n,) [m/s^2],
+    drag k [1/m]; free: (acceleration, drag), true for unknown ones; covariance of the unknowns;
+    members: frames of each flight; residual (T, n) in units of sigma, NaN where no frame was used.
     """
 
     instants: np.ndarray
@@ -46,7 +51,10 @@ class Arcs:
     residual: np.ndarray
 
     def velocities(self) -> tuple[np.ndarray, np.ndarray]:
-        """v- (K, n) and v+ (K, n) of each impact."""
+        """Velocities v- (K, n) and v+ (K, n) [m/s, rad/s] of each impact, see the head of the file.
+
+        Drag adds the end rates of `bent` to those of parabolas.
+        """
         h = np.diff(self.instants)
         mean, bend = np.diff(self.places, axis=0) / h[:, None], self.acceleration / 2
         first, last = mean - bend * h[:, None], mean + bend * h[:, None]
@@ -58,12 +66,16 @@ class Arcs:
         return last[:-1], first[1:]
 
     def gain(self) -> np.ndarray:
-        """Derivatives (K, 2, n, N) of v- and v+ in the N values of `covariance`."""
+        """Derivatives (K, 2, n, N) of v- and v+ in the N unknowns of `covariance`.
+
+        Of a flight with duration h and mean velocity w: `v = w -/+ a h / 2` at its first and last
+        end, w = (P_1 - P_0) / h, dw/dtau_1 = -w / h.
+        """
         K, n = len(self.instants) - 2, self.places.shape[1]
         h, columns = np.diff(self.instants), _columns(n, self.free)
         mean, bend = np.diff(self.places, axis=0) / h[:, None], self.acceleration / 2
         gain, size = np.zeros((K, 2, n, len(self.covariance))), n + 1
-        for i in range(K + 1):  # of flight i v+ of the impact before it, v- of the one after it
+        for i in range(K + 1):  # flight i has v+ of the impact before it, v- of the one after it
             slopes, each = np.zeros((2, n, 3 * n + 3)), np.arange(n)
             for end, sign in ((0, -1.0), (1, 1.0)):
                 slope = mean[i] / h[i] - sign * bend  # of the velocity in -h
@@ -87,7 +99,7 @@ class Arcs:
         return float(np.sqrt(self.covariance[-1, -1])) if self.free[1] else 0.0
 
     def covariance_of_velocities(self) -> np.ndarray:
-        """(2nK, 2nK), of (v-, v+) of each impact in turn."""
+        """Covariance `G C G^T` (2nK, 2nK) of (v-, v+) of each impact in turn, G of `gain`."""
         flat = self.gain().reshape(-1, len(self.covariance))
         return flat @ self.covariance @ flat.T
 
@@ -105,7 +117,10 @@ def fit_arcs(
     drag: float = 0.0,
     free_drag: bool = False,
 ) -> Arcs:
-    """The arcs of these flights by maximum likelihood.
+    """The arcs of these flights by maximum likelihood: least squares of (q - arc) / sigma.
+
+    Gauss-Newton steps in places, instants and what is free, each instant bounded; after every step
+    frames are divided among the flights anew.
 
     Args:
         t: (T,) times.
@@ -130,25 +145,27 @@ def fit_arcs(
     places = between(tau, t, q)
     members, moving = _members(t, pool, tau, contact, flights), False
     for k in range(1 if frozen else STEPS):
-        _, change = _step(t, q, sigma, members, (tau, places, a, drag), unknown, moving)
-        new = tau + change[0]
+        values = ArcValues(tau, places, a, drag)
+        _, change = _step(t, q, sigma, members, values, unknown, moving)
+        new = tau + change.tau
         room = LARGEST_MOVE * np.diff(tau)
         new[1:-1] = np.clip(new[1:-1], tau[1:-1] - room[:-1], tau[1:-1] + room[1:])
         new[1:-1] = np.clip(new[1:-1], last - BEYOND * step, first + BEYOND * step)
         moved, moving = np.abs(new - tau).max(initial=0.0), True
-        tau, places, a, drag = new, places + change[1], a + change[2], drag + change[3]
+        tau, places = new, places + change.places
+        a, drag = a + change.a, drag + change.drag
         if k < SETTLING and not frozen:
             members = _members(t, pool, tau, contact, flights)
         if k > 0 and moved <= SETTLED * step:
             break
-    at = (tau, places, a, drag)
-    normal, _ = _step(t, q, sigma, members, at, unknown, not frozen)
+    values = ArcValues(tau, places, a, drag)
+    normal, _ = _step(t, q, sigma, members, values, unknown, not frozen)
     residual = np.full(q.shape, np.nan)
     for i, frames in enumerate(members):
-        residual[frames] = (q[frames] - _arc(t[frames], i, *at)) / sigma
+        residual[frames] = (q[frames] - _arc(t[frames], i, values)) / sigma
     ends = np.arange(len(tau))
-    covariance = _inverse(*normal, ends if frozen else ends[[0, -1]])
-    return Arcs(*at, unknown, covariance, members, residual)
+    covariance = _inverse(normal, ends if frozen else ends[[0, -1]])
+    return Arcs(*values, unknown, covariance, members, residual)
 
 
 def _pairs(x: np.ndarray) -> np.ndarray:
@@ -157,14 +174,17 @@ def _pairs(x: np.ndarray) -> np.ndarray:
 
 
 def _columns(n: int, free: tuple[bool, bool]) -> np.ndarray:
-    """Which of acceleration and drag, n + 1 values, are unknown."""
+    """Indices of the free ones among acceleration (n) and drag (1)."""
     return np.flatnonzero([free[0]] * n + [free[1]])
 
 
 def _members(
     t: np.ndarray, pool: np.ndarray, tau: np.ndarray, contact: float, flights: list[np.ndarray]
 ) -> list[np.ndarray]:
-    """Frames between the instants, those in contact left out; as they were where few are left."""
+    """Frames of each flight by the instants tau: those in contact, tau_i +/- contact / 2, are out.
+
+    If a flight had less than 3 frames so, all of them stay as they are in `flights`.
+    """
     low = np.concatenate([[-np.inf], tau[1:-1] + contact / 2])
     high = np.concatenate([tau[1:-1] - contact / 2, [np.inf]])
     x = t[pool]
@@ -172,13 +192,21 @@ def _members(
     return inside if min(map(len, inside)) >= 3 else flights
 
 
-At = tuple[np.ndarray, np.ndarray, np.ndarray, float]  # instants, places, acceleration, drag
+class ArcValues(NamedTuple):
+    """Values of all arcs, or a step in them."""
+
+    tau: np.ndarray  # instants (K + 2,) [s]
+    places: np.ndarray  # P (K + 2, n)
+    a: np.ndarray  # acceleration (n,)
+    drag: float  # k [1/m]
 
 
-def _arc(
-    x: np.ndarray, i: int, tau: np.ndarray, places: np.ndarray, a: np.ndarray, drag: float
-) -> np.ndarray:
-    """Places (F, n) in flight i."""
+def _arc(x: np.ndarray, i: int, values: ArcValues) -> np.ndarray:
+    """Places (F, n) of flight i at times x (F,).
+
+    Equation: `P_i (1 - s) + P_(i+1) s - a (x - tau_i) (tau_(i+1) - x) / 2`, and D of `bent`.
+    """
+    tau, places, a, drag = values
     s = ((x - tau[i]) / (tau[i + 1] - tau[i]))[:, None]
     bend = ((x - tau[i]) * (tau[i + 1] - x) / 2)[:, None]
     arc = places[i] * (1 - s) + places[i + 1] * s - a * bend
@@ -188,9 +216,9 @@ def _arc(
     return arc
 
 
-def _slopes(x: np.ndarray, i: int, at: At, with_drag: bool) -> np.ndarray:
-    """Slopes (F, n, 3 n + 3) of the places in flight i, in the values of `bent_slopes`."""
-    (tau, places, a, drag), n = at, at[1].shape[1]
+def _slopes(x: np.ndarray, i: int, values: ArcValues, with_drag: bool) -> np.ndarray:
+    """Derivatives (F, n, 3 n + 3) of `_arc` in the ends of flight i, acceleration and drag."""
+    (tau, places, a, drag), n = values, values.places.shape[1]
     h, each, size = tau[i + 1] - tau[i], np.arange(n), n + 1
     s, slopes = (x - tau[i]) / h, np.zeros((len(x), n, 3 * n + 3))
     rise = (places[i + 1] - places[i]) / h
@@ -203,7 +231,12 @@ def _slopes(x: np.ndarray, i: int, at: At, with_drag: bool) -> np.ndarray:
     return slopes
 
 
-Normal = tuple[np.ndarray, np.ndarray, np.ndarray]  # banded (upper), border (N, b), corner (b, b)
+class NormalMatrix(NamedTuple):
+    """Normal matrix J^T J of the fit: banded for the ends (N values), bordered by b common ones."""
+
+    bands: np.ndarray  # (width + 1, N) upper bands, as `scipy.linalg.solveh_banded` takes them
+    border: np.ndarray  # (N, b)
+    corner: np.ndarray  # (b, b)
 
 
 def _step(
@@ -211,50 +244,56 @@ def _step(
     q: np.ndarray,
     sigma: np.ndarray,
     members: list[np.ndarray],
-    at: At,
+    values: ArcValues,
     free: tuple[bool, bool],
     moving: bool,
-) -> tuple[Normal, tuple[np.ndarray, np.ndarray, np.ndarray, float]]:
-    """The normal matrix, and a step of Gauss-Newton of instants, places, acceleration and drag.
+) -> tuple[NormalMatrix, ArcValues]:
+    """Normal matrix at these values, and the Gauss-Newton step from them.
 
-    `moving`: whether instants are; places alone are a linear problem.
+    Equation: `J^T J step = J^T r`, r = (q - arc) / sigma over frames that were seen, J the
+    derivatives of arc / sigma. Instants stay unless `moving`, those of the first and the last end
+    always. `members`: frames of each flight; `free`: acceleration, drag are unknown.
     """
-    (tau, *_, drag), n = at, q.shape[1]
+    (tau, *_, drag), n = values, q.shape[1]
     size, columns = n + 1, _columns(n, free)
-    whole = np.zeros((len(tau), 2 * size, 2 * size))  # of each flight
+    blocks = np.zeros((len(tau), 2 * size, 2 * size))  # J^T J of each flight in its two ends
     border = np.zeros((len(tau) * size, len(columns)))
     corner, right_b = np.zeros((len(columns), len(columns))), np.zeros(len(columns))
     right = np.zeros(len(tau) * size)
-    used = np.concatenate([np.arange(2 * size), 2 * size + columns])
+    used = np.concatenate([np.arange(2 * size), 2 * size + columns])  # of the 3 n + 3 slopes
     for i, frames in enumerate(members):
         x = t[frames]
-        rest = (q[frames] - _arc(x, i, *at)) / sigma
-        slopes = _slopes(x, i, at, bool(drag) or free[1])[:, :, used] / sigma[:, None]
+        rest = (q[frames] - _arc(x, i, values)) / sigma
+        slopes = _slopes(x, i, values, bool(drag) or free[1])[:, :, used] / sigma[:, None]
         ok = np.isfinite(rest)
         J, rows = slopes[ok], slice(i * size, (i + 2) * size)
         square, gradient = J.T @ J, J.T @ rest[ok]
-        whole[i] = square[: 2 * size, : 2 * size]
+        blocks[i] = square[: 2 * size, : 2 * size]
         right[rows] += gradient[: 2 * size]
         border[rows] += square[: 2 * size, 2 * size :]
         corner, right_b = corner + square[2 * size :, 2 * size :], right_b + gradient[2 * size :]
     instants = np.arange(len(tau)) * size + n
     fixed = instants[[0, -1]] if moving else instants
-    normal = _banded(whole, len(tau), size, fixed), border, corner
+    normal = NormalMatrix(_banded(blocks, len(tau), size, fixed), border, corner)
     border[fixed], right[fixed] = 0.0, 0.0
     solved, common = _solve(normal, right, right_b)
-    values, shared = solved.reshape(len(tau), size), np.zeros(n + 1)
+    of_ends, shared = solved.reshape(len(tau), size), np.zeros(n + 1)
     shared[columns] = common
-    return normal, (values[:, n], values[:, :n], shared[:n], float(shared[n]))
+    return normal, ArcValues(of_ends[:, n], of_ends[:, :n], shared[:n], float(shared[n]))
 
 
-def _banded(whole: np.ndarray, ends: int, size: int, fixed: np.ndarray) -> np.ndarray:
-    """The upper bands of the normal matrix; `fixed` parameters have 1 on the diagonal alone."""
+def _banded(blocks: np.ndarray, ends: int, size: int, fixed: np.ndarray) -> np.ndarray:
+    """Upper bands (2 size, ends size) of the sum of the blocks of neighbouring ends.
+
+    Row `width - d` holds the d-th diagonal above the main one. Unknowns `fixed` keep 1 on the
+    diagonal, and 0 elsewhere.
+    """
     width, count = 2 * size - 1, ends * size
     bands = np.zeros((width + 1, count))
     for i in range(2 * size):
         for j in range(i, 2 * size):
             columns = np.arange(ends - 1) * size + j
-            bands[width - (j - i), columns] += whole[: ends - 1, i, j]
+            bands[width - (j - i), columns] += blocks[: ends - 1, i, j]
     for k in fixed:
         for d in range(width + 1):
             bands[width - d, k] = 0.0
@@ -264,8 +303,14 @@ def _banded(whole: np.ndarray, ends: int, size: int, fixed: np.ndarray) -> np.nd
     return bands
 
 
-def _solve(normal: Normal, right: np.ndarray, right_b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Both parts of the step, by elimination of the banded one."""
+def _solve(
+    normal: NormalMatrix, right: np.ndarray, right_b: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Solution (x (N,), y (b,)) of the bordered system, by elimination of x.
+
+    Equation: `A x + B y = right`, `B^T x + C y = right_b`: `(C - B^T A^-1 B) y = right_b - B^T A^-1
+    right`. A has the bands, B is the border, C the corner.
+    """
     bands, border, corner = normal
     scale = 1 / np.sqrt(np.maximum(bands[-1], 1e-300))
     both = np.column_stack([right, border])
@@ -277,7 +322,7 @@ def _solve(normal: Normal, right: np.ndarray, right_b: np.ndarray) -> tuple[np.n
 
 
 def _scaled(bands: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """The bands of S A S, S = diag(scale), so that units do not matter for rounding."""
+    """Bands of `S A S`, S = diag(scale), so that units do not matter for rounding."""
     width, count = bands.shape[0] - 1, bands.shape[1]
     scaled = np.zeros_like(bands)
     for d in range(width + 1):
@@ -285,10 +330,13 @@ def _scaled(bands: np.ndarray, scale: np.ndarray) -> np.ndarray:
     return scaled
 
 
-def _inverse(
-    bands: np.ndarray, border: np.ndarray, corner: np.ndarray, fixed: np.ndarray
-) -> np.ndarray:
-    """The covariance; `fixed` ends have instants without any."""
+def _inverse(normal: NormalMatrix, fixed: np.ndarray) -> np.ndarray:
+    """Covariance: inverse of the normal matrix by blocks; instants of `fixed` ends have variance 0.
+
+    Equation: with `R = (C - B^T A^-1 B)^-1` it is
+    `[[A^-1 + A^-1 B R B^T A^-1, -A^-1 B R], [-R B^T A^-1, R]]`.
+    """
+    bands, border, corner = normal
     scale = 1 / np.sqrt(np.maximum(bands[-1], 1e-300))
     inverse = scale[:, None] * solveh_banded(_scaled(bands, scale), np.diag(scale))
     size = len(bands) // 2

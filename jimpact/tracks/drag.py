@@ -23,14 +23,19 @@ _FIT = np.linalg.inv(chebyshev.chebvander(_POINTS, NODES - 1))
 
 
 def _twice_integrated() -> np.ndarray:
-    """(NODES + 2, NODES): from coefficients of D'' to those of D on [-1, 1], 0 at both ends."""
-    whole = chebyshev.chebint(np.eye(NODES), 2)
-    left, right = (chebyshev.chebval(end, whole) for end in (-1.0, 1.0))
-    whole[0] -= (left + right) / 2
-    whole[1] -= (right - left) / 2
-    return whole
+    """Matrix (NODES + 2, NODES) from Chebyshev coefficients of D'' to those of D, D(-1) = D(1) = 0.
+
+    The line through the ends of the second integral is taken away: coefficients 0 and 1.
+    """
+    integrals = chebyshev.chebint(np.eye(NODES), 2)
+    left, right = (chebyshev.chebval(end, integrals) for end in (-1.0, 1.0))
+    integrals[0] -= (left + right) / 2
+    integrals[1] -= (right - left) / 2
+    return integrals
 
 
+# Matrices from values of D'' at the points: to coefficients of D and of D', to D' at the points and
+# at both ends
 _TWICE = _twice_integrated() @ _FIT
 _ONCE = chebyshev.chebder(_TWICE)
 _RATES = chebyshev.chebvander(_POINTS, NODES) @ _ONCE
@@ -40,7 +45,10 @@ _END_RATES = chebyshev.chebvander(np.array([-1.0, 1.0]), NODES) @ _ONCE
 def bent(
     x: np.ndarray, tau: np.ndarray, places: np.ndarray, a: np.ndarray, k: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """D (B, F, n) at times x (F,), and D' at both ends (B, 2, n), of B flights.
+    """Deviation D (B, F, n) [m] of B flights by drag at times x (F,), D' at both ends (B, 2, n).
+
+    Equation: `D'' = -k |v| v`, v the velocity of the arc without drag plus D', at Chebyshev points;
+    Picard: D'' from the last D'.
 
     Args:
         x: times (F,).
@@ -76,9 +84,10 @@ def bent(
 def bent_slopes(
     x: np.ndarray, tau: np.ndarray, places: np.ndarray, a: np.ndarray, k: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """D (F, n) and D' (2, n) of one flight, and their slopes (F, n, P) and (2, n, P).
+    """D (F, n) and D' at the ends (2, n) of one flight; their derivatives (F, n, P) and (2, n, P).
 
     In P = 3 n + 3 values: place and instant of the first end, of the last one, acceleration, drag.
+    By difference quotients: all P + 1 flights at once, each with one value moved.
     """
     n, h = len(a), tau[1] - tau[0]
     length = np.linalg.norm(places[1] - places[0]) + np.linalg.norm(a) * h**2 / 2
@@ -99,7 +108,7 @@ def bent_slopes(
 
 
 def straightened(t: np.ndarray, q: np.ndarray, k: float) -> np.ndarray:
-    """Places (T, n) as they were without drag, up to a line in each flight.
+    """Places (T, n) [m] as they were without drag k [1/m]: `q + k int int |v| v`, up to lines.
 
     The acceleration of drag, by velocities over four frames, is integrated twice and taken away:
     good enough to find flights. Velocities near an impact are wrong, but only for two frames.
@@ -113,7 +122,7 @@ def straightened(t: np.ndarray, q: np.ndarray, k: float) -> np.ndarray:
 
 
 def between(times: np.ndarray, t: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Places (.., n) at times, linear between frames that were seen."""
+    """Places (F, n) at `times` (F,), linear between those frames (t, q) that were seen."""
     seen = np.isfinite(q)
     columns = [np.interp(times, t[ok], x[ok]) for x, ok in zip(q.T, seen.T)]
     return np.stack(columns, axis=1)

@@ -132,7 +132,16 @@ def _arcs_of(
     shortest: int,
     window: float | None,
 ) -> tuple[Arcs, np.ndarray, list[str]]:
-    """The arcs of all flights, standard errors (n,), `estimated` or as given, and findings."""
+    """Arcs of all flights, standard errors sigma (n,), and findings.
+
+    1. Divide the frames into flights; leave out those in which the body is held.
+    2. Fit arcs, and join flights until all jumps are impacts.
+    3. If sigma is `estimated`, take it from the residuals and repeat 2.
+    4. With drag: fit arcs that it bends; of unknown drag divide the frames once more before.
+    5. With a `window` [s]: fit by frames near the impacts only.
+
+    `given`: sigma (n,); `known`: acceleration (n,), None: unknown; `drag` None: unknown.
+    """
     x, free, q = t - t.mean(), known is None, q.copy()
     flights, a, k = flights_and_acceleration(x, q, given, known, shortest, drag)
     straight = straightened(x, q, k) if k else q
@@ -185,7 +194,10 @@ def _with_drag(
     free: tuple[bool, bool],
     contact: float,
 ) -> Arcs:
-    """The arcs that drag bends, from first values of acceleration, drag and instants."""
+    """Arcs that drag bends; `start`: first values of acceleration, drag and instants.
+
+    `free`: acceleration and drag are unknown.
+    """
     a, k, instants = start
     return fit_arcs(x, q, sigma, flights, a, free[0], contact, instants, drag=k, free_drag=free[1])
 
@@ -199,7 +211,10 @@ def _in_poses(
     inertia: Any,
     options: dict[str, Any],
 ) -> Track:
-    """The impacts in poses: by their places, then with the turning of each flight."""
+    """Track of poses (T, 7): impacts by the places, then angular velocities by the quaternions.
+
+    `options`: all other arguments of `find_impacts`.
+    """
     if quaternion is None:
         raise ValueError("Argument `inertia` is for poses, whose order `quaternion` must name.")
     if options["units"] is not None:
@@ -219,7 +234,7 @@ def _in_poses(
 
 
 def _checked(t: Any, q: Any, shortest: int, units: Any) -> tuple[np.ndarray, np.ndarray, Any]:
-    """Times (T,), coordinates (T, n) and their units."""
+    """Checked times (T,) [s], coordinates (T, n) and their units (n,), 'm' or 'rad'."""
     for name, value in (("t", t), ("q", q)):
         check_concrete(name, value)
         as_float_array(name, value)  # raises for what are no numbers
@@ -261,7 +276,7 @@ def _checked(t: Any, q: Any, shortest: int, units: Any) -> tuple[np.ndarray, np.
 
 
 def _of_coordinates(name: str, value: Any, n: int) -> np.ndarray:
-    """A number for all coordinates, or one for each, as (n,)."""
+    """Argument `name`, a number for all coordinates or one for each, checked, as (n,)."""
     check_concrete(name, value)
     as_float_array(name, value)  # raises for what are no numbers
     array = np.asarray(value, float)
@@ -275,7 +290,7 @@ def _of_coordinates(name: str, value: Any, n: int) -> np.ndarray:
 
 
 def _unwrapped(q: np.ndarray, units: tuple[str, ...]) -> np.ndarray:
-    """Angles without steps of 2 pi."""
+    """Coordinates (T, n) in which angles, in frames that were seen, have no steps of 2 pi."""
     q = q.copy()
     for c in np.flatnonzero(np.array(units) == "rad"):
         seen = np.isfinite(q[:, c])
@@ -292,9 +307,11 @@ def _of_true_impacts(
     free: bool,
     contact: float,
 ) -> tuple[Arcs, list[np.ndarray]]:
-    """The arcs, flights joined (the smallest jump first) until all jumps are impacts.
+    """Arcs, and the flights joined until every jump of velocity is an impact.
 
-    Instants stay at first: where there is no jump, nothing determines them.
+    A jump below SMALLEST_JUMP standard errors is none: the flights on both sides are joined, the
+    weaker one of neighbouring jumps first. Instants are fixed until all jumps exceed that, as
+    nothing determines an instant without a jump. `a`: acceleration (n,), fitted if `free`.
     """
     frozen = len(flights) > 1
     while True:
@@ -313,9 +330,10 @@ def _of_true_impacts(
 
 
 def _jumps(arcs: Arcs) -> np.ndarray:
-    """The largest jump of a velocity of each impact (K,), in standard errors."""
+    """Largest of `|v+ - v-| / sigma` over the coordinates of each impact (K,), sigma its error."""
     (pre, post), covariance = arcs.velocities(), arcs.covariance_of_velocities()
-    (K, n), signs = pre.shape, np.hstack([-np.eye(pre.shape[1]), np.eye(pre.shape[1])])
+    K, n = pre.shape
+    signs = np.hstack([-np.eye(n), np.eye(n)])  # v+ - v- = signs (v-, v+)
     sizes = np.zeros(K)
     for k in range(K):
         own = slice(2 * n * k, 2 * n * (k + 1))
@@ -332,7 +350,7 @@ def _windowed(
     contact: float,
     window: float,
 ) -> Arcs:
-    """The same by frames of each flight near its impacts only.
+    """Arcs by frames of each flight within `window` [s] of its impacts only.
 
     A flight keeps its one arc, so that velocities of both its ends stay those of one arc.
     """
@@ -351,7 +369,10 @@ def _windowed(
 
 
 def _of_residuals(sigma: np.ndarray, arcs: Arcs) -> np.ndarray:
-    """Standard errors (n,) by the residuals; each coordinate bears its part of the instants."""
+    """Standard errors (n,): `sigma sqrt(chi^2 / freedom)` of the residuals of each coordinate.
+
+    Freedom: frames, less K + 2 places, 1/n of K instants, 1 for a free acceleration.
+    """
     n, ends = len(sigma), len(arcs.instants)
     seen = np.isfinite(arcs.residual).sum(axis=0)
     freedom = np.maximum(seen - ends - (ends - 2) / n - arcs.free[0], 1.0)
@@ -367,7 +388,7 @@ def _as_track(
     units: tuple[str, ...],
     lines: tuple[str, ...],
 ) -> Track:
-    """The track of these arcs, with what is wrong with it."""
+    """Track of these arcs: impacts with velocities and covariance; `lines` are its warnings."""
     (pre, post), covariance = arcs.velocities(), arcs.covariance_of_velocities()
     n, size = q.shape[1], q.shape[1] + 1
     impacts = []

@@ -1,4 +1,7 @@
-"""Whether a track is one of ballistic flights: what its residuals and its frames show."""
+"""Findings: sentences that say why a track may not be one of ballistic flights.
+
+*Held* is a body that has no acceleration where a flight has a known one: it rests, slides or rolls.
+"""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -47,7 +50,10 @@ HELD = SMALLEST_JUMP**2 / 2
 
 
 def findings_of_input(q: np.ndarray, sigma: np.ndarray, units: tuple[str, ...]) -> list[str]:
-    """What is suspect in the frames, before anything is fitted."""
+    """Findings in the frames q (T, n) alone: repeated ones, angles that are perhaps in degrees.
+
+    Steps of angles between frames seen in a row must stay below a quarter of a turn.
+    """
     found, seen = [], np.isfinite(q).all(axis=1)
     places = q[seen]
     if len(places) > 2:
@@ -77,10 +83,11 @@ def findings_of_input(q: np.ndarray, sigma: np.ndarray, units: tuple[str, ...]) 
 def findings_of_turns(
     e: np.ndarray, sigma: np.ndarray, residual: np.ndarray, p_values: np.ndarray, taken: float
 ) -> list[str]:
-    """What is wrong with the orientations e (T, 4) of poses, a sentence each.
+    """Findings in the orientations of poses, quaternions e (T, 4).
 
-    `residual` (T, 3) in units of sigma; `p_values` (K,) of the meetings at impacts; `taken`: values
-    that were fitted.
+    Turns between frames above a quarter; a large sigma (3,) [rad]; chi^2 of `residual` (T, 3), in
+    units of sigma, above what the frames less `taken` fitted values allow; `p_values` (K,) of
+    orientations that meet at impacts.
     """
     found, seen = [], e[np.isfinite(e).all(axis=1)]
     cosines = np.minimum(np.abs((seen[1:] * seen[:-1]).sum(axis=1)), 1.0)
@@ -115,9 +122,10 @@ def findings_of_turns(
 def findings_of_signs(
     t: np.ndarray, q: np.ndarray, sigma: np.ndarray, acceleration: np.ndarray, shortest: int
 ) -> list[str]:
-    """Coordinates that curve the other way than their known acceleration, as y of pixels does.
+    """Findings of coordinates that curve against their known acceleration, as y of pixels does.
 
-    By the cost of the flights of the first frames; only where their curvature has the other sign.
+    Where the second differences have the other sign: if flights of the first LOOK_BACK frames cost
+    less (chi^2 and prices) with the sign of this acceleration changed.
     """
     some, found = slice(0, LOOK_BACK), []
     seen = np.isfinite(q[some]).any(axis=0).all()
@@ -136,7 +144,10 @@ def findings_of_signs(
 
 
 def findings_of_noise(differences: np.ndarray, residuals: np.ndarray, first: int = 1) -> list[str]:
-    """Coordinates, from number `first`, with residuals far above the noise from frame to frame."""
+    """Findings of coordinates whose residuals exceed UNEXPLAINED times the noise `differences`.
+
+    Both (n,) are standard errors; coordinates are numbered from `first`.
+    """
     return [
         f"Coordinate {c + first} has residuals of {residuals[c]:.2g}, but noise of "
         f"{differences[c]:.2g} from frame to frame: is an impact missing, or do the flights bend?"
@@ -145,7 +156,7 @@ def findings_of_noise(differences: np.ndarray, residuals: np.ndarray, first: int
 
 
 def findings(t: np.ndarray, q: np.ndarray, sigma: np.ndarray, arcs: Arcs) -> list[str]:
-    """What is wrong with a fitted track, a sentence each."""
+    """Findings in a fitted track: curvatures, large residuals, unused frames, doubtful impacts."""
     found = [*_of_curvatures(t, sigma, arcs), *_of_sizes(arcs), *_unused(t, q, arcs)]
     found += _of_bends(t, q, sigma, arcs)
     if len(arcs.instants) == 2:
@@ -160,26 +171,26 @@ def free_flights(
     acceleration: np.ndarray,
     flights: list[np.ndarray],
 ) -> list[np.ndarray]:
-    """The flights without those at both ends in which the body is held; one at least.
+    """The flights without those at both ends in which the body is held; at least one is left.
 
-    A body at rest, or on a table, has no acceleration where a flight has a known one; frames of it
-    are taken for short flights with impacts between. A run of flights at an end is held where one
-    parabola explains it as well, or by the sum of `held_rather` over it.
+    Frames of a held body are taken for short flights with impacts between. A run of flights at an
+    end is held where one parabola explains it as well (chi^2 and prices of flights), or where the
+    sum of `held_rather` over it exceeds HELD.
     """
     if not acceleration.any():
         return flights
     rest = (q - acceleration * t[:, None] ** 2 / 2) / sigma
     held = held_rather(t, rest, sigma, acceleration, flights)
     alone = np.array([chi_squared(t, q, sigma, acceleration, some) for some in flights])
-    start = price(*q.shape)
+    start = price(*q.shape)  # chi^2 that one more flight must save
 
     def more(run: np.ndarray) -> float:
-        """chi^2 by which one parabola explains a run of flights less well than they do."""
+        """Increase of chi^2 if one parabola replaces the arcs of a run of flights."""
         frames = np.sort(np.concatenate([flights[k] for k in run]))
         return _of_one_parabola(t, q, sigma, acceleration, frames) - float(alone[run].sum())
 
     def count(order: np.ndarray) -> int:
-        """How many of the first flights in this order are held."""
+        """Number of the first flights in this order that are held, by likelihood or parabola."""
         sums = np.cumsum(held[order])
         curved = int(np.argmax(sums)) + 1 if sums.size and sums.max() > HELD else 0
         few, many = 1, len(order)  # by bisection how many one parabola explains
@@ -205,7 +216,11 @@ def held_flights(
     acceleration: np.ndarray,
     flights: Sequence[np.ndarray],
 ) -> np.ndarray:
-    """Whether the body is held in each flight (F,): by itself, or in a run on one parabola."""
+    """True (F,) for flights in which the body is held: by `held_rather`, or on one parabola.
+
+    A run of flights is on one parabola as long as each further one, at its price, would cost more
+    by itself.
+    """
     if not acceleration.any():
         return np.zeros(len(flights), bool)
     rest = (q - acceleration * t[:, None] ** 2 / 2) / sigma
@@ -232,7 +247,7 @@ def held_rather(
     acceleration: np.ndarray,
     flights: Sequence[np.ndarray],
 ) -> np.ndarray:
-    """Logarithm (F,) of the likelihood that a body is held in a flight over that it is free.
+    """Log likelihood ratio (F,) of "held" over "free" in each flight.
 
     Equation: with the excess x of its acceleration over the known a, and the error s of x, the sum
     of `(x^2 - (x + a)^2) / (2 s^2)` over coordinates. `rest` (T, n) is what a fit leaves, in sigma.
@@ -244,7 +259,10 @@ def held_rather(
 def _of_one_parabola(
     t: np.ndarray, q: np.ndarray, sigma: np.ndarray, acceleration: np.ndarray, frames: np.ndarray
 ) -> float:
-    """chi^2 of frames on one parabola; inf where it is nearer to a known acceleration than to 0."""
+    """chi^2 of frames on one free parabola in each coordinate; inf if it curves like a flight.
+
+    That is: its acceleration is nearer to the known one than to 0.
+    """
     x, total = t[frames] - t[frames].mean(), 0.0
     for c, known in enumerate(acceleration):
         ok = np.isfinite(q[frames, c])
@@ -259,7 +277,7 @@ def _of_one_parabola(
 
 
 def findings_of_held(t: np.ndarray, flights: Sequence[np.ndarray]) -> list[str]:
-    """What a track says of the frames before the first and after the last of its free flights."""
+    """Findings of frames before the first and after the last free flight, which are left out."""
     why = (
         "there are no flights of this acceleration. Perhaps the body rests, slides, rolls or is "
         "held, it bounces faster than frames show, or the acceleration is wrong."
@@ -273,7 +291,11 @@ def findings_of_held(t: np.ndarray, flights: Sequence[np.ndarray]) -> list[str]:
 
 
 def _of_curvatures(t: np.ndarray, sigma: np.ndarray, arcs: Arcs) -> list[str]:
-    """Flights whose acceleration is not that of the fit."""
+    """Findings of flights with an acceleration beyond that of the fit, by its standard error.
+
+    The limit keeps false alarms over all flights and coordinates below a quarter of FALSE_ALARMS
+    on each side.
+    """
     excess, error = _excess(t, arcs.residual, sigma, arcs.members)
     limit = norm.isf(FALSE_ALARMS / 4 / excess.size)
     far = np.abs(excess) > limit * error
@@ -295,7 +317,11 @@ def _of_curvatures(t: np.ndarray, sigma: np.ndarray, arcs: Arcs) -> list[str]:
 def _excess(
     t: np.ndarray, rest: np.ndarray, sigma: np.ndarray, flights: Sequence[np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Acceleration (F, n) of what is left (T, n) in each flight, in sigma, and its error."""
+    """Acceleration x (F, n) of the residuals of each flight, and its standard error s.
+
+    Equation: least squares of `rest sigma = x c`, c = t^2 / 2 without its best line:
+    `x = c . rest sigma / |c|^2`, `s = sigma / |c|`. `rest` (T, n) is in units of sigma.
+    """
     excess, error = np.zeros((2, len(flights), len(sigma)))
     for i, frames in enumerate(flights):
         for c, scale in enumerate(sigma):
@@ -309,7 +335,7 @@ def _excess(
 
 
 def _of_bends(t: np.ndarray, q: np.ndarray, sigma: np.ndarray, arcs: Arcs) -> list[str]:
-    """Impacts without which a parabola of another acceleration explains both flights as well."""
+    """Finding of impacts whose flights one parabola explains within LEAST_GAIN of their chi^2."""
     doubtful = []
     for k, both in enumerate(map(np.concatenate, pairwise(arcs.members)), 1):
         with_impact = np.nansum(arcs.residual[both] ** 2)
@@ -324,7 +350,7 @@ def _of_bends(t: np.ndarray, q: np.ndarray, sigma: np.ndarray, arcs: Arcs) -> li
 
 
 def _of_sizes(arcs: Arcs) -> list[str]:
-    """Flights whose residuals are larger than sigma allows."""
+    """Findings of flights whose chi^2 has a p-value below FALSE_ALARMS / 2 / (their number)."""
     n, flights, found = arcs.places.shape[1], len(arcs.members), []
     # parameters of a flight: places and instants are shared with its neighbours
     taken = (n * (flights + 1) + flights - 1) / flights
@@ -343,7 +369,7 @@ def _of_sizes(arcs: Arcs) -> list[str]:
 
 
 def _unused(t: np.ndarray, q: np.ndarray, arcs: Arcs) -> list[str]:
-    """Frames that belong to no flight: at the ends, and in all."""
+    """Findings of seen frames that no flight uses: at both ends, and between."""
     seen, used = np.isfinite(q).any(axis=1), np.zeros(len(q), bool)
     used[np.concatenate(arcs.members)] = True
     found, order = [], np.flatnonzero(used)

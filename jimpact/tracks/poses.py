@@ -27,9 +27,10 @@ MEETINGS = 5  # times that the condition is taken anew; the third changes nothin
 def with_turns(
     track: Track, e: np.ndarray, sigma: np.ndarray | None, inertia: np.ndarray | None
 ) -> Track:
-    """The track of places with orientations e (T, 4): impacts with velocities (x', omega).
+    """Track of places with orientations e (T, 4): impacts with velocities (x', omega).
 
-    sigma (3,) of turns about the axes of the body [rad]; None: taken from the residuals.
+    Each flight is fitted as a free rotation; then flights are made to meet at impacts. sigma (3,)
+    of turns about the axes of the body [rad]; None: taken from the residuals.
     """
     frames = [some[np.isfinite(e[some, 0])] for some in track.flights]
     for k, some in enumerate(frames, 1):
@@ -50,7 +51,7 @@ def with_turns(
     arcs, flights, covariance, p_values = _met(track, [flight for flight, _ in fitted])
     residual = np.full((len(e), 3), np.nan)
     for flight, some, measured in zip(flights, frames, turns):
-        residual[some] = (flight.at(track.t[some])[0].inv() * measured).as_rotvec() / given
+        residual[some] = (flight.at(track.t[some]).turn.inv() * measured).as_rotvec() / given
     arcs = replace(arcs, residual=np.hstack([track.residual, residual]))
     taken = 6 * len(flights) - 2 * len(p_values)  # meetings give back three, for half an instant
     notes += findings_of_turns(e, given, residual, p_values, taken)
@@ -66,10 +67,12 @@ def with_turns(
 def _met(
     track: Track, flights: list[Turning]
 ) -> tuple[Arcs, list[Turning], np.ndarray, np.ndarray]:
-    """Arcs and rotations that meet at the instants, their covariance, and p-values (K,).
+    """Arcs and rotations whose orientations meet at impacts, their covariance, p-values (K,).
 
-    The least change of all, in units of their errors, with which they do: Gauss-Newton for normal
-    errors under a condition. The p-value is that of the changes that an impact asks for.
+    Equation: with the values x_0 of the fits, their covariance C and the turns g(x) between the
+    flights of each impact, the least `(x - x_0)^T C^-1 (x - x_0)` with g = 0:
+    `x - x_0 = C H^T S^-1 (H (x - x_0) - g)`, H = dg/dx, `S = H C H^T`, repeated; covariance
+    `C - C H^T S^-1 H C`. The p-value of an impact is that of chi^2 = g S^-1 g of its turn at x_0.
     """
     first, impacts = track.arcs, len(track.arcs.instants) - 2
     free = len(first.covariance)  # values of the arcs: places and instant of each end, acceleration
@@ -93,27 +96,27 @@ def _met(
 def _apart(
     arcs: Arcs, flights: list[Turning], zero: float, free: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Turns (3K,) from the flight before an impact to the one after it, and their slopes.
+    """Turns g (3K,) [rad] from the flight before each impact to that after it, and H = dg/dx.
 
-    zero: time of the zero of instants [s]; free: values of the arcs, before those of the flights.
+    Columns of H: `free` values of the arcs, 4 of each end (place, instant) first; then 6 of each
+    flight (turn, omega). `zero`: time of the zero of instants [s].
     """
     impacts = len(flights) - 1
     apart, H = np.zeros(3 * impacts), np.zeros((3 * impacts, free + 6 * len(flights)))
     for i, instant in enumerate(arcs.instants[1:-1] + zero):
         rows, own = slice(3 * i, 3 * i + 3), free + 6 * i
-        (before, w0, turn0, _), (after, w1, turn1, _) = (
-            flight.at(np.array([instant])) for flight in flights[i : i + 2]
-        )
-        between = before[0].inv() * after[0]
+        before, after = (flight.at(np.array([instant])) for flight in flights[i : i + 2])
+        between = before.turn[0].inv() * after.turn[0]
         apart[rows] = between.as_rotvec()
-        H[rows, own : own + 6] = -between.as_matrix().T @ turn0[0]
-        H[rows, own + 6 : own + 12] = turn1[0]
-        H[rows, 4 * (i + 1) + 3] = w1[0] - w0[0]  # an instant is the last of four values
+        H[rows, own : own + 6] = -between.as_matrix().T @ before.turn_slopes[0]
+        H[rows, own + 6 : own + 12] = after.turn_slopes[0]
+        # an instant is the last of the four values of an end
+        H[rows, 4 * (i + 1) + 3] = after.omega[0] - before.omega[0]
     return apart, H
 
 
 def _changed(arcs: Arcs, change: np.ndarray) -> Arcs:
-    """Arcs with other places, instants and acceleration."""
+    """Arcs after a change of the unknowns: (place, instant) of each end, acceleration, drag."""
     ends = 4 * len(arcs.instants)
     each, a, k = np.split(change, [ends, ends + 3 * arcs.free[0]])
     each = each.reshape(-1, 4)
@@ -129,7 +132,11 @@ def _changed(arcs: Arcs, change: np.ndarray) -> Arcs:
 def _with_velocities(
     track: Track, arcs: Arcs, flights: list[Turning], covariance: np.ndarray
 ) -> Track:
-    """The track with these flights: its impacts, and the covariance of their velocities."""
+    """Track whose impacts have velocities (x', omega) of these arcs and rotations.
+
+    Equation: covariance `G C G^T` of (v-, v+) of all impacts, G the derivatives in the values of
+    arcs and flights; `covariance` is C. An instant moves omega by omega'.
+    """
     free, (before, after) = len(arcs.covariance), arcs.velocities()
     impacts = len(before)
     gain = np.zeros((impacts, 2, 6, len(covariance)))
@@ -139,18 +146,19 @@ def _with_velocities(
     for k, instant in enumerate(times):
         for side in (0, 1):
             flight, first = flights[k + side], free + 6 * (k + side)
-            turn, omega, _, slopes = flight.at(np.array([instant]))
-            omegas[k, side], gain[k, side, 3:, first : first + 6] = omega[0], slopes[0]
-            gain[k, side, 3:, 4 * (k + 1) + 3] = flight.rate(omega[0])
+            at = flight.at(np.array([instant]))
+            omegas[k, side] = at.omega[0]
+            gain[k, side, 3:, first : first + 6] = at.omega_slopes[0]
+            gain[k, side, 3:, 4 * (k + 1) + 3] = flight.rate(at.omega[0])
             if side == 0:
-                quaternion = turn[0].as_quat(scalar_first=True)
+                quaternion = at.turn[0].as_quat(scalar_first=True)
                 poses.append(np.concatenate([arcs.places[k + 1], quaternion]))
     flat = gain.reshape(12 * impacts, len(covariance))
     whole = flat @ covariance @ flat.T
     found = []
     for k, (instant, pose) in enumerate(zip(times, poses)):
-        own, at = slice(12 * k, 12 * (k + 1)), 4 * (k + 1) + 3
+        own, row = slice(12 * k, 12 * (k + 1)), 4 * (k + 1) + 3  # the instant of the impact
         pre, post = (np.append(v[k], w) for v, w in zip((before, after), omegas[k]))
-        error = float(np.sqrt(covariance[at, at]))
+        error = float(np.sqrt(covariance[row, row]))
         found.append(TrackImpact(float(instant), error, pose, pre, post, whole[own, own]))
     return replace(track, impacts=tuple(found), covariance=whole, arcs=arcs)

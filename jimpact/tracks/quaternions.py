@@ -35,7 +35,7 @@ def as_poses(q: Any, order: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def as_inertia(inertia: Any) -> np.ndarray | None:
-    """(3, 3), or None where a body turns like a sphere."""
+    """Inertia (3, 3) from three moments or a matrix, checked; None where all moments are equal."""
     if inertia is None:
         return None
     array = np.asarray(inertia, float)
@@ -51,7 +51,10 @@ def as_inertia(inertia: Any) -> np.ndarray | None:
 
 
 def turns_since_first(e: np.ndarray) -> np.ndarray:
-    """Sums (T, 3) of the turns from frame to frame, about the axes of the body, NaN where lost."""
+    """Sums (T, 3) [rad] of turns from frame to frame about the axes of the body; NaN where lost.
+
+    A turn is the rotation vector of `R_k^-1 R_(k+1)`.
+    """
     seen, sums = np.isfinite(e).all(axis=1), np.full((len(e), 3), np.nan)
     measured = Rotation.from_quat(e[seen], scalar_first=True)
     steps = (measured[:-1].inv() * measured[1:]).as_rotvec()
@@ -60,7 +63,7 @@ def turns_since_first(e: np.ndarray) -> np.ndarray:
 
 
 def in_the_other_order(e: np.ndarray, order: str) -> tuple[np.ndarray, np.ndarray]:
-    """The quaternion (4,) if the file stood in the other order than `order`, and A (3, 3).
+    """Quaternion (4,) if the file stood in the other order than `order`, and the matrix A (3, 3).
 
     Poses turn evenly in either order, as it turns the unit sphere of quaternions only: frames
     alone cannot tell. omega = 2 e* e' becomes A omega.
@@ -71,6 +74,6 @@ def in_the_other_order(e: np.ndarray, order: str) -> tuple[np.ndarray, np.ndarra
 
 
 def _left(e: np.ndarray) -> np.ndarray:
-    """(4, 4), by which `e f` is its product with f."""
+    """Matrix L (4, 4) of the product of quaternions, `e f = L f`."""
     w, x, y, z = e
     return np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])

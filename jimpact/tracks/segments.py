@@ -1,4 +1,4 @@
-"""Where the flights of a track are: the cheapest partition into ballistic flights and lost frames.
+"""Flights of a track: the cheapest partition of its frames into ballistic flights and lost ones.
 
 A flight is a straight line in each coordinate once its acceleration is taken away. Its cost is
 chi^2 and a price for beginning one; dynamic programming finds the partition of least cost (Jackson
@@ -40,9 +40,13 @@ def noise(q: np.ndarray) -> np.ndarray:
 
 
 def _differences(x: np.ndarray, order: int, step: int = 1) -> np.ndarray:
-    """Differences of positions (T,); where every other frame is lost, of those that were seen."""
+    """Differences of this order, over `step` frames, of positions (T,), without those that are NaN.
+
+    Where all are, as every other frame is lost, differences of the frames that were seen.
+    """
 
     def all_of(x: np.ndarray) -> np.ndarray:
+        """Differences of x that are not NaN."""
         for _ in range(order):
             x = x[step:] - x[:-step]
         return x[np.isfinite(x)]
@@ -57,14 +61,20 @@ def _median(x: np.ndarray) -> float:
 
 
 def price(frames: int, n: int) -> float:
-    """Of a flight: by the Bayesian information criterion for 2n values and an instant, or more."""
+    """Price of a flight in chi^2: `(2n + 1) ln T` (BIC of 2n values and an instant) of T `frames`.
+
+    At least `SMALLEST_JUMP^2`.
+    """
     return max(float((2 * n + 1) * np.log(frames)), SMALLEST_JUMP**2)
 
 
 def flights_of(
     t: np.ndarray, q: np.ndarray, sigma: np.ndarray, acceleration: np.ndarray, shortest: int
 ) -> list[np.ndarray]:
-    """The frames of each flight, at least `shortest` seen in every coordinate."""
+    """Frames of each flight of the cheapest partition, neighbours joined where that is cheaper.
+
+    A flight has at least `shortest` frames seen in every coordinate.
+    """
     _, come = _partition(t, q, sigma, acceleration, shortest)
     ends = [len(q)]
     while ends[-1] > 0:
@@ -77,14 +87,18 @@ def flights_of(
 def cost_of_flights(
     t: np.ndarray, q: np.ndarray, sigma: np.ndarray, acceleration: np.ndarray, shortest: int
 ) -> float:
-    """What the cheapest partition costs: chi^2, the prices of flights and of lost frames."""
+    """Cost of the cheapest partition: chi^2, the prices of flights and of lost frames."""
     return float(_partition(t, q, sigma, acceleration, shortest)[0][-1])
 
 
 def _partition(
     t: np.ndarray, q: np.ndarray, sigma: np.ndarray, acceleration: np.ndarray, shortest: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Cost (T + 1,) of the frames before each, and where their last flight begins."""
+    """Least cost (T + 1,) of the first j frames, and the frame at which their last part begins.
+
+    Equation: `best_j = min(best_(j-1) + lost, min_i best_i + price + chi^2(i..j))`: frame j is
+    lost, or the last one of a flight from i; dynamic programming.
+    """
     frames, n = q.shape
     good = np.isfinite(q)
     lost, start = chi2.isf(LOST_SHARE, n) * good.any(axis=1), price(frames, n)
@@ -110,7 +124,12 @@ def _costs(
     acceleration: np.ndarray,
     shortest: int,
 ) -> np.ndarray:
-    """chi^2 (L,) of one flight from each of L frames to the last one; inf where too short."""
+    """chi^2 (L,) of one flight from each of L frames to the last one; inf where too short.
+
+    Equation: of a line through y = (q - a t^2 / 2) / sigma in every coordinate,
+    `S_yy - S_y^2 / S - (S_xy - S_x S_y / S)^2 / (S_xx - S_x^2 / S)`, S sums from the last frame on.
+    `good` (L, n): seen frames.
+    """
     x = (t - t[-1])[::-1, None]
     y = (q[::-1] - np.where(good, q, 0.0).sum(axis=0) / np.maximum(good.sum(axis=0), 1)) / sigma
     y = np.where(good[::-1], y - acceleration / sigma * x**2 / 2, 0.0)
@@ -133,7 +152,7 @@ def _joined(
     flights: list[np.ndarray],
     start: float,
 ) -> list[np.ndarray]:
-    """The flights, neighbours joined where one line for both is cheaper than two."""
+    """Flights, neighbours joined where chi^2 of both as one is less than of two, plus `start`."""
     joined: list[np.ndarray] = []
     for flight in flights:
         if joined:
@@ -147,7 +166,7 @@ def _joined(
 
 
 def without_polynomial(x: np.ndarray, y: np.ndarray, terms: int) -> np.ndarray:
-    """What is left of y (F,) or (F, k) without the best polynomials of so many terms in x (F,)."""
+    """Residual of y (F,) or (F, k) by least squares of polynomials of so many terms in x (F,)."""
     basis = np.linalg.qr(np.vander(x, terms))[0]
     return np.asarray(y - basis @ (basis.T @ y))
 
@@ -159,7 +178,7 @@ def chi_squared(
     acceleration: np.ndarray | None,
     frames: np.ndarray,
 ) -> float:
-    """chi^2 of one flight; of acceleration None it has one of its own."""
+    """chi^2 of frames as one flight of this acceleration (n,), or None: of the best one."""
     x, total = t[frames] - t[frames].mean(), 0.0
     for c, scale in enumerate(sigma):
         ok = np.isfinite(q[frames, c])
@@ -209,9 +228,11 @@ def _common_drag(
     acceleration: np.ndarray | None,
     flights: list[np.ndarray],
 ) -> float:
-    """By least squares, each flight with a line of its own, or a parabola of its own acceleration.
+    """Drag k [1/m] common to all flights by least squares: `k = sum s y / sum s^2`.
 
-    added_by_drag: to the places (T, n), by a drag of 1/m.
+    s is `added_by_drag` (T, n), the places added by a drag of 1/m, y the places less the known
+    acceleration, both without the line of each flight (without its parabola where the acceleration
+    is None), weighted by 1 / sigma^2.
     """
     above, below = 0.0, 0.0
     for frames in flights:
@@ -233,14 +254,14 @@ def _joined_at_any(
     acceleration: np.ndarray,
     flights: list[np.ndarray],
 ) -> list[np.ndarray]:
-    """The flights, neighbours joined where all cost less so, each time at their best acceleration.
+    """Flights, neighbours joined where the cost of all falls, each time at its best acceleration.
 
     At a slightly wrong one long flights are parted, and the parts show theirs less well.
     """
     start, flights = price(*q.shape), list(flights)
 
     def moments(frames: np.ndarray) -> np.ndarray:
-        """Sums (n, 3) over a flight without its line: of rest^2, rest curve and curve^2."""
+        """Sums (n, 3) of r^2, r c, c^2 over a flight; r = q - a c, c = t^2 / 2 without lines."""
         x, sums = t[frames] - t[frames].mean(), np.zeros((q.shape[1], 3))
         for c in range(q.shape[1]):
             ok = np.isfinite(q[frames, c])
@@ -251,7 +272,7 @@ def _joined_at_any(
         return sums
 
     def least(sums: np.ndarray) -> np.ndarray:
-        """chi^2 of all (.., n, 3) at their best acceleration."""
+        """chi^2 at the best acceleration: `sum r^2 - (sum r c)^2 / sum c^2`, over coordinates."""
         return (sums[..., 0] - sums[..., 1] ** 2 / np.maximum(sums[..., 2], 1e-300)).sum(axis=-1)
 
     alone = [moments(f) for f in flights]
@@ -271,7 +292,7 @@ def _joined_at_any(
 
 
 def curvature(t: np.ndarray, q: np.ndarray, shortest: int) -> np.ndarray:
-    """A first value (n,) of the acceleration: the median of second differences."""
+    """First value (n,) of the acceleration: median of second differences over `(step dt)^2`."""
     step = max(shortest, 2)  # over so many frames, of which most lie in one flight
     step = step if len(q) > 2 * step else 1
     found = np.zeros(q.shape[1])
@@ -284,7 +305,10 @@ def curvature(t: np.ndarray, q: np.ndarray, shortest: int) -> np.ndarray:
 
 
 def common_acceleration(t: np.ndarray, q: np.ndarray, flights: list[np.ndarray]) -> np.ndarray:
-    """By least squares of parabolas of one curvature, each flight with a line of its own."""
+    """Acceleration (n,) common to all flights by least squares: `a = sum c q / sum c^2`.
+
+    c = t^2 / 2 of a flight without its best line; each flight has a line of its own.
+    """
     found = np.zeros(q.shape[1])
     for c in range(q.shape[1]):
         above, below = 0.0, 0.0

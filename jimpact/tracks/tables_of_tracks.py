@@ -97,7 +97,7 @@ def read(
 
 
 def _units(unit: str | Sequence[str], names: list[str]) -> list[str]:
-    """The unit of each column."""
+    """Unit of each column, one of `UNITS`, from one for all or one each."""
     units = [unit] * len(names) if isinstance(unit, str) else list(unit)
     if len(units) != len(names) or not all(each in UNITS for each in units):
         raise ValueError(
@@ -117,7 +117,10 @@ def _cells(line: str, separator: str | None) -> list[str]:
 def _header(
     path: str | Path, lines: list[str], wanted: list[str], decimal: str
 ) -> tuple[int, str | None, list[str]]:
-    """The number of the line with the names (from 1), the separator and the names."""
+    """Number (from 1) of the line that holds the names `wanted`, its separator, and all its names.
+
+    The first line, and for it the first separator, with which all are among its cells.
+    """
     separators = [x for x in SEPARATORS if x != decimal]
     for k, line in enumerate(lines[:HEADER_LINES], 1):
         for separator in separators:
@@ -138,7 +141,7 @@ def _header(
 
 
 def _place(path: str | Path, header: list[str], name: str) -> int:
-    """Where a column is."""
+    """Index of the column of this name; a ValueError unless it is there once."""
     if (count := header.count(name.strip())) != 1:
         raise ValueError(f"{path}: column `{name}` must be there once, but is {count} times.")
     return header.index(name.strip())
@@ -155,7 +158,7 @@ def _check_unit_in_name(path: str | Path, name: str, unit: str) -> None:
 
 
 def _is_number(cell: str, decimal: str) -> bool:
-    """Whether a cell is a number; an empty one is none."""
+    """True for a cell that is a number with this decimal mark; an empty one is none."""
     try:
         float(cell.replace(decimal, "."))
     except ValueError:
@@ -171,7 +174,7 @@ def _numbers(
     names: list[str],
     decimal: str,
 ) -> list[float]:
-    """The numbers of a line; NaN where a cell is empty, or the line is shorter."""
+    """Numbers of a line in the columns `places`; NaN where a cell is empty or the line shorter."""
     values = []
     for place, name in zip(places, names):
         cell = cells[place] if place < len(cells) else ""

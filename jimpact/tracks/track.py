@@ -45,7 +45,10 @@ class TrackImpact:
     covariance: np.ndarray
 
     def not_in(self, order: str) -> "TrackImpact":
-        """The impact of a pose as if the file stood in the other order than `order`."""
+        """Impact as if the quaternions of the file stood in the other order than `order`.
+
+        omega becomes A omega, with A of `in_the_other_order`; its covariance follows.
+        """
         other, A = in_the_other_order(self.q[3:], order)
         gain = np.eye(12)
         gain[3:6, 3:6] = gain[9:, 9:] = A
@@ -80,24 +83,24 @@ class Track:
 
     @property
     def residual(self) -> np.ndarray:
-        """(T, n) in units of sigma; NaN where a frame was not used."""
+        """Residuals (T, n) in units of sigma; NaN where a frame was not used."""
         return self.arcs.residual
 
     @property
     def coordinates(self) -> np.ndarray:
-        """(T, n), q; of poses places, and turns about axes of the body since the first frame."""
+        """Coordinates q (T, n); of poses places, and turns about axes of the body since frame 1."""
         if self.order is None:
             return self.q
         return np.hstack([self.q[:, :3], turns_since_first(self.q[:, 3:])])
 
     @property
     def acceleration(self) -> np.ndarray:
-        """(n,) of all flights: as given, or as found."""
+        """Acceleration (n,) of all flights: as given, or as found."""
         return self.arcs.acceleration
 
     @property
     def drag(self) -> float:
-        """Of all flights [1/m]: as given, or as found."""
+        """Drag k of all flights [1/m]: as given, or as found."""
         return self.arcs.drag
 
     def __str__(self) -> str:
@@ -187,7 +190,7 @@ class Track:
         )
 
     def _between_free_flights(self) -> np.ndarray:
-        """Whether the body is held neither before nor after each impact (K,)."""
+        """True (K,) for impacts before and after which the body is free, not held."""
         n = len(self.acceleration)
         places, sigma = self.q[:, :n], self.sigma[:n]
         held = held_flights(self.t, places, sigma, self.acceleration, self.flights)
@@ -230,7 +233,10 @@ class Track:
 def _scenes_of(
     place: Scene | Body, impacts: Sequence[TrackImpact], near: float
 ) -> list[Scene | None]:
-    """The scene of each impact; None where no gap is closed, or contacts cannot have made it."""
+    """Scene of each impact; None where no gap is within `near` [m], or by `_can_be_of`.
+
+    `place`: a scene of all impacts, or a body, which each pose places.
+    """
     if isinstance(place, Scene):
         scenes: list[Scene | None] = [place] * len(impacts)
     else:
@@ -243,7 +249,11 @@ def _scenes_of(
 
 
 def _can_be_of(scene: Scene, impact: TrackImpact) -> bool:
-    """Whether a contact approaches, and impulses of pushing contacts make the jump."""
+    """True if a contact approaches, and contacts that push can have made the jump of velocities.
+
+    Equation: bounded least squares `|A (M^-1 [N, H, C] p - (v+ - v-))|`, normal p >= 0, within
+    OUT_OF_CONE in units of the errors of the jump, or within SHARE_OUT of the jump by energy.
+    """
     normals = np.asarray(scene.normals, float)[:, np.asarray(scene.closed)]
     speeds = np.abs(normals).T @ np.abs(impact.pre)
     if not (normals.T @ impact.pre < -ROUNDING * speeds).any():

@@ -1,6 +1,7 @@
 """Free rotation of a body, and the orientation and angular velocity of a flight from its frames."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -16,10 +17,11 @@ SETTLED = 1e-9  # [rad] of a step; ten times more is still far below noise
 
 @dataclass(frozen=True)
 class Turning:
-    """Orientation and angular velocity, in the axes of the body, in the middle of a flight.
+    """Free rotation of a flight: orientation and angular velocity omega in its middle.
 
-    Fields: middle [s]; turn; omega (3,) [rad/s]; covariance (6, 6) of (turn by axes of the body,
-    omega); inertia (3, 3) up to a factor, None: that of a sphere.
+    Fields: middle [s]; turn, the orientation; omega (3,) [rad/s] in the axes of the body;
+    covariance (6, 6) of (turn about axes of the body [rad], omega); inertia (3, 3) up to a factor,
+    None: that of a sphere.
     """
 
     middle: float
@@ -29,27 +31,27 @@ class Turning:
     inertia: np.ndarray | None
 
     def moved(self, step: np.ndarray) -> "Turning":
-        """The same after a change (6,) of turn and omega."""
+        """Rotation after a change (6,) of turn, about axes of the body [rad], and of omega."""
         turn = self.turn * Rotation.from_rotvec(step[:3])
         return Turning(self.middle, turn, self.omega + step[3:], self.covariance, self.inertia)
 
     def rate(self, omega: np.ndarray) -> np.ndarray:
-        """omega' (3,) at this omega (3,)."""
+        """Acceleration `omega' = -I^-1 (omega x I omega)` (3,) [rad/s^2], without torque."""
         if self.inertia is None:
             return np.zeros(3)
         return -np.linalg.solve(self.inertia, np.cross(omega, self.inertia @ omega))
 
-    def at(self, times: np.ndarray) -> tuple[Rotation, np.ndarray, np.ndarray, np.ndarray]:
-        """At times (F,): orientations, omega (F, 3), and the slopes of both (F, 3, 6) by `moved`.
+    def at(self, times: np.ndarray) -> "TurningAt":
+        """Orientations and angular velocities at times (F,) [s], and their derivatives.
 
-        Turns are about the axes that the body has at that time.
+        By difference quotients: free rotations from here, and from six starts moved by SMALL.
         """
         starts = [self, *(self.moved(step) for step in SMALL * np.eye(6))]
         turns = Rotation.concatenate([x.turn for x in starts])
         each = np.stack([x.omega for x in starts])
         turn, omega = free_rotation(turns, each, times - self.middle, self.inertia)
         turning = [(turn[0].inv() * other).as_rotvec() / SMALL for other in turn[1:]]
-        return (
+        return TurningAt(
             turn[0],
             omega[0],
             np.stack(turning, axis=2),
@@ -57,13 +59,22 @@ class Turning:
         )
 
 
+class TurningAt(NamedTuple):
+    """A free rotation at F times, and its derivatives in the six values of `Turning.moved`."""
+
+    turn: Rotation  # F orientations
+    omega: np.ndarray  # (F, 3) [rad/s]
+    turn_slopes: np.ndarray  # (F, 3, 6) of the turn about the axes of the body at that time
+    omega_slopes: np.ndarray  # (F, 3, 6)
+
+
 def free_rotation(
     turns: Rotation, omegas: np.ndarray, since: np.ndarray, inertia: np.ndarray | None
 ) -> tuple[list[Rotation], np.ndarray]:
-    """Of B starts the F orientations each, and omega (B, F, 3), at rising times `since` (F,).
+    """Free rotations from B starts: F orientations each, and omega (B, F, 3).
 
     Equation: `R' = R [omega]x`, `I omega' = -omega x I omega` without torque, omega in the axes of
-    the body.
+    the body, at rising times `since` (F,) [s] after the start.
     """
     if inertia is None:  # omega stays
         paths = [r * Rotation.from_rotvec(since[:, None] * w) for r, w in zip(turns, omegas)]
@@ -71,6 +82,7 @@ def free_rotation(
     count, inverse = len(omegas), np.linalg.inv(inertia)
 
     def rates(_: float, state: np.ndarray) -> np.ndarray:
+        """Rates of B states: three rows of R, whose rates are `row x omega`, and omega."""
         each = state.reshape(count, 4, 3)
         rows, w = each[:, :3], each[:, 3:]
         slope = -np.cross(w, w @ inertia) @ inverse  # both are symmetric
@@ -92,7 +104,10 @@ def free_rotation(
 def fit_turning(
     t: np.ndarray, measured: Rotation, sigma: np.ndarray, inertia: np.ndarray | None
 ) -> tuple[Turning, np.ndarray]:
-    """A flight by the orientations of its frames, and the turns (F, 3) [rad] that are left.
+    """Free rotation that fits the orientations of a flight, and the residual turns (F, 3) [rad].
+
+    Equation: least squares of `(R(t)^-1 R_measured) / sigma`, as rotation vectors, by Gauss-Newton
+    in turn and omega; covariance `(J^T J)^-1`.
 
     Args:
         t: (F,), F >= 2.
@@ -105,13 +120,13 @@ def fit_turning(
     flight = Turning(middle, measured[nearest], np.median(steps, axis=0), np.eye(6), inertia)
     flight = flight.moved(np.append((middle - t[nearest]) * flight.omega, np.zeros(3)))
     for _ in range(STEPS):
-        turn, _, slopes, _ = flight.at(t)
-        rest = (turn.inv() * measured).as_rotvec()
-        J = (slopes / sigma[:, None]).reshape(-1, 6)
+        now = flight.at(t)
+        rest = (now.turn.inv() * measured).as_rotvec()
+        J = (now.turn_slopes / sigma[:, None]).reshape(-1, 6)
         step = np.linalg.lstsq(J, (rest / sigma).ravel(), rcond=None)[0]
         flight = flight.moved(step)
         if np.abs(step[:3]).max() < SETTLED:
             break
     covariance = np.linalg.pinv(J.T @ J, hermitian=True)
-    rest = (flight.at(t)[0].inv() * measured).as_rotvec()
+    rest = (flight.at(t).turn.inv() * measured).as_rotvec()
     return Turning(middle, flight.turn, flight.omega, covariance, inertia), rest
