@@ -324,8 +324,10 @@ class SlipFlow(FrictionFlow):
         r = jnp.where(creeps, self.slip(y)[:, 0], 0.0)
         direction, perpendicular = frame
 
-        def acceleration(f: Float[Array, "m B"], side: Float[Array, "t B"]) -> jax.Array:
-            """u' (m, 2, B) of normal forces and those of sliding."""
+        def acceleration(
+            f: Float[Array, "m B"], side: Float[Array, "m 2 B"]
+        ) -> Float[Array, "m 2 B"]:
+            """Accelerations `u' = K_tn F + K_tt lambda` of slip by normal and sliding forces."""
             return pairs(times(const.pull, f) + times(const.tangent, flat(side)))
 
         side = -c[:, None] * direction

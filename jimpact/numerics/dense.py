@@ -438,8 +438,8 @@ def _batch_of_singular_values(
         lambda: jnp.where(null[None], _orthogonal(matrix.swapaxes(0, 1))[1], left),
         lambda: left,
     )
-    parts = SingularValues(left, values, right.swapaxes(0, 1), null)
-    return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), parts), all_batched
+    parts = left, values, right.swapaxes(0, 1), null
+    return SingularValues(*(jnp.moveaxis(x, -1, 0) for x in parts)), all_batched
 
 
 @jax.custom_batching.custom_vmap

@@ -17,7 +17,7 @@ Source: Acary, Cadoux, Lemarechal and Malick, ZAMM 91 (2011) 155-175, for the co
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -61,14 +61,14 @@ class Cones(NamedTuple):
 class _Inside(NamedTuple):
     """A point inside the cones: Y = (a + load, y), K = (kappa, s), a and nu positive.
 
-    Also a change of one, or its affine forms with an axis of coefficients behind.
+    Also a change of one, or its affine forms with an axis of w coefficients behind.
     """
 
-    push: Float[Array, "m"]  # a
-    normal: Float[Array, "m"]  # nu
-    side: Float[Array, "m rows"]  # y
-    bound: Float[Array, "m"]  # kappa
-    slip: Float[Array, "m rows"]  # s
+    push: Float[Array, "m *w"]  # a
+    normal: Float[Array, "m *w"]  # nu
+    side: Float[Array, "m rows *w"]  # y
+    bound: Float[Array, "m *w"]  # kappa
+    slip: Float[Array, "m rows *w"]  # s
 
 
 class Best(NamedTuple):
@@ -174,7 +174,7 @@ def _corrected(cones: Cones, at: _Inside, slides: Float[Array, ""]) -> _Inside:
         part = jnp.minimum(1.0, _WITHIN * room)
         return jax.tree.map(lambda x, dx: x + part * dx, at, way)
 
-    def look(_: int, state: tuple[_Inside, Float[Array, ""]]) -> tuple[_Inside, Float[Array, ""]]:
+    def look(_: Any, state: tuple[_Inside, Float[Array, ""]]) -> tuple[_Inside, Float[Array, ""]]:
         """The point ahead with this aim, and the aim that follows: `mean (mean+ / mean)^2`."""
         point = ahead(state[1])
         share = jnp.maximum(jnp.minimum(_mean(cones, point) / mean, 1.0) ** 2, _LEAST_AIM)

@@ -9,12 +9,12 @@ from jaxtyping import Array, Float, Shaped
 class TangentialBlock(NamedTuple):
     """Blocks of the Delassus matrix of m contacts with t tangents: `u+ = u- + W_nt^T p + W_tt p_t`.
 
-    t = m in the plane, 2 m in space, contact by contact.
+    t = m in the plane, 2 m in space, contact by contact; of N groups with an axis in front.
     """
 
-    normal_tangent: Float[Array, "m t *B"]  # W_nt [1/kg]
-    tangent: Float[Array, "t t *B"]  # W_tt [1/kg]
-    slip: Float[Array, "t *B"]  # u- [m/s]
+    normal_tangent: Float[Array, "*N m t"]  # W_nt [1/kg]
+    tangent: Float[Array, "*N t t"]  # W_tt [1/kg]
+    slip: Float[Array, "*N t"]  # u- [m/s]
 
     def scaled(
         self, root: Float[Array, "m"], speed: Float[Array, ""] | float = 1.0
