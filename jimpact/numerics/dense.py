@@ -149,12 +149,12 @@ def inverse(matrix: Float[Array, "n n *B"]) -> Float[Array, "n n *B"]:
 
     def eliminate(k: Int[Array, ""] | int, rows: Float[Array, "n n *B"]) -> Float[Array, "n n *B"]:
         """The matrix after pivot k; column k is then that of the eliminations so far."""
-        here, there = number == k, number[:, 0][None] == k
+        in_row, in_column = number == k, number[:, 0][None] == k  # masks of row and column k
         column = jax.lax.dynamic_index_in_dim(rows, k, 1)
         row = jax.lax.dynamic_index_in_dim(rows, k, 0)
         scale = 1 / jax.lax.dynamic_index_in_dim(row, k, 1)
-        row = jnp.where(there, scale, row * scale)
-        return jnp.where(here, row, jnp.where(there, 0.0, rows) - column * row)
+        row = jnp.where(in_column, scale, row * scale)
+        return jnp.where(in_row, row, jnp.where(in_column, 0.0, rows) - column * row)
 
     return fori_loop(0, n, eliminate, matrix)
 
@@ -197,14 +197,14 @@ def block_inverse(matrix: Float[Array, "m b m b N"]) -> Float[Array, "m b m b N"
         i: Int[Array, ""] | int, inverse: Float[Array, "m b m b N"]
     ) -> Float[Array, "m b m b N"]:
         """Matrices after Gauss-Jordan elimination in place, with diagonal block i as pivot."""
-        here = (jnp.arange(m) == i)[:, None, None, None]
-        column, row = inverse[:, :, i], inverse[i]
+        pivot = (jnp.arange(m) == i)[:, None, None, None]
+        column, row = inverse[:, :, i], inverse[i]  # (m, b, b, N) and (b, m, b, N) of blocks
         block = _small_inverse(column[i], perturbation)
-        column = jnp.where(here, -eye[None], column)
-        row = jnp.where(here[:, 0][None], eye[:, None], row)
-        row = jnp.sum(block[:, :, None, None] * row[None], axis=1)
-        replaced = here[..., None] | here[None, None, :, 0]
-        spread = jnp.sum(column[:, :, :, None, None] * row[None, None], axis=2)
+        column = jnp.where(pivot, -eye[None], column)
+        row = jnp.where(pivot[:, 0][None], eye[:, None], row)
+        row = jnp.sum(block[:, :, None, None] * row[None], axis=1)  # block times row
+        replaced = pivot[..., None] | pivot[None, None, :, 0]  # row i and column i of blocks
+        spread = jnp.sum(column[:, :, :, None, None] * row[None, None], axis=2)  # column times row
         return jnp.where(replaced, 0.0, inverse) - spread
 
     return fori_loop(0, m, eliminate, matrix)
@@ -238,11 +238,11 @@ def block_solve(
 
 def _small_inverse(block: Float[Array, "b b N"], perturbation: float) -> Float[Array, "b b N"]:
     """Inverses `adj(A) / det(A)` of blocks, b = 2 or 3, perturbed where they are singular."""
-    small = jnp.abs(_small_determinant(block)) < perturbation
+    singular = jnp.abs(_small_determinant(block)) < perturbation
     eye = jnp.eye(len(block), dtype=block.dtype)[..., None]
-    block = block + jnp.where(small, perturbation, 0.0)[None, None] * eye
-    whole = _small_determinant(block)
-    return _cofactors(block) / jnp.where(whole == 0, 1.0, whole)[None, None]
+    block = block + jnp.where(singular, perturbation, 0.0)[None, None] * eye
+    determinant = _small_determinant(block)
+    return _cofactors(block) / jnp.where(determinant == 0, 1.0, determinant)[None, None]
 
 
 def _small_determinant(a: Float[Array, "b b N"]) -> Float[Array, "N"]:
@@ -277,6 +277,7 @@ def solve_by_pivots(
         rows, determinant = state
         column = jax.lax.dynamic_index_in_dim(rows, k, 1)
         largest = jnp.argmax(jnp.where(number >= k, jnp.abs(column), -1.0), axis=0)[0]
+        # the rows k and `largest` change places
         own, chosen = (jax.lax.dynamic_index_in_dim(rows, i, 0) for i in (k, largest))
         pivot = jax.lax.dynamic_index_in_dim(chosen, k, 1)
         rows = jnp.where(number == largest, own, rows)
@@ -337,7 +338,7 @@ def regularized(
 
     The barriers keep XLA from computing what is multiplied once more for each column.
     """
-    kept = jax.lax.optimization_barrier
+    kept = jax.lax.optimization_barrier  # computed once, see above
     matrix, right = kept(matrix), kept(right)  # apart: only the right side is linear in tangents
     on_diagonal = ridge if matrix.ndim == 2 else ridge[:, None]
     inverted = jax.lax.stop_gradient(inverse(matrix + unit(matrix) * on_diagonal))

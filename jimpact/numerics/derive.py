@@ -87,7 +87,7 @@ def in_lanes(
 
 @contextmanager
 def naming_the_adjoint() -> Iterator[None]:
-    """Within, JAX's refusal of a forward mode names the option that forbids it."""
+    """Context in which JAX's refusal of a forward mode names the option that forbids it."""
     try:
         yield
     except TypeError as error:
@@ -103,7 +103,7 @@ def by_jacobian(function: Callable[[Any], Any], argument: Any) -> Any:
     as of any function.
     """
     leaves, tree = jax.tree.flatten(argument)
-    others = [None if eqx.is_array(x) else x for x in leaves]
+    others = [None if eqx.is_array(x) else x for x in leaves]  # leaves that are no arrays
     trees: list[Any] = []
 
     def of_arrays(*arrays: jax.Array) -> Arrays:
@@ -202,14 +202,14 @@ class _WithJacobian:
         push = _WithTangents(self.function, self.marked, many=True)
         moving = [x for x, mark in zip(arrays, self.marked) if mark]
         sizes = [math.prod(x.shape[:-1]) for x in moving]
-        count = -(-sum(sizes) // DIRECTIONS)
-        size = -(-sum(sizes) // count)
+        count = -(-sum(sizes) // DIRECTIONS)  # runs, rounded up
+        size = -(-sum(sizes) // count)  # directions of a run
         unit = jnp.eye(count * size, sum(sizes), dtype=moving[0].dtype)
 
         def along(rows: Float[Array, "d D"]) -> tuple[Arrays, Arrays]:
             """Results, and rates (d, .., B) in d directions, given by entries in all arguments."""
             directions, first = [], 0
-            for x, n in zip(moving, sizes):
+            for x, n in zip(moving, sizes):  # entries first .. first + n are those of x
                 own = rows[:, first : first + n].reshape(-1, *x.shape[:-1], 1)
                 own = jnp.broadcast_to(own, (len(rows), *x.shape))
                 directions.append(varying_like(own, x))
@@ -488,7 +488,7 @@ def _batching_rule(
         values = _count_of_values(outs)
         return outs, tuple(None if i < values else 0 for i in range(len(outs)))
 
-    def wide(x: jax.Array, is_batched: bool) -> jax.Array:
+    def wide(x: Shaped[Array, "..."], is_batched: bool) -> Shaped[Array, "..."]:
         """An array with the batch of `vmap` and its own, one after the other, in its last axis."""
         if is_batched:
             x = jnp.moveaxis(x, 0, -2)

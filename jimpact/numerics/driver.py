@@ -30,9 +30,9 @@ class _Slots(NamedTuple):
 
     impact: Int[Array, "slots"]  # the impact that is in each slot
     following: Int[Array, ""]  # the first impact that still waits
-    flow: Any
-    carry: Any
-    ends: Any  # of all impacts, as far as they have left their slots
+    flow: Any  # parameters of the impacts in the slots
+    carry: Any  # their states
+    ends: Any  # states of all impacts, as far as they have left their slots
 
 
 def until_over(
@@ -95,6 +95,7 @@ def _in_slots(
     def refilled(s: _Slots) -> _Slots:
         """The slots with the next waiting impacts in place of those that are over."""
         free = ~goes_on(s.flow, s.carry)[0]
+        # the first free slot gets the impact `following`, the second the one after it, ..
         next_one = s.following + jnp.cumsum(free, dtype=jnp.int32) - 1
         enters = free & (next_one < count)
         impact = jnp.where(enters, next_one, s.impact)
@@ -119,6 +120,7 @@ def _in_slots(
         return jnp.any(goes_on(s.flow, s.carry)) | (s.following < count)
 
     first = jnp.arange(size, dtype=jnp.int32)
-    own, here = picked((flow, carry), first)
-    slots = _Slots(first, jnp.asarray(size, jnp.int32), own, here, carry)
+    flow_of_slots, carry_of_slots = picked((flow, carry), first)
+    following = jnp.asarray(size, jnp.int32)
+    slots = _Slots(first, following, flow_of_slots, carry_of_slots, carry)
     return stored(while_loop(open_work, next_round, slots))

@@ -149,8 +149,10 @@ def solve(
     """
     m = len(normal)
     rows = len(slip) // m
+    # rows of A (m, b) of each contact: its normal, then its tangents
     order = np.concatenate([np.arange(m)[:, None], m + np.arange(m * rows).reshape(m, rows)], 1)
     of_contacts = matrix[order[:, :, None, None], order[None, None]]
+    # unknowns are scaled to a diagonal of 1, both tangents of a contact alike
     squares = jnp.diagonal(jax.lax.stop_gradient(matrix))[order]
     squares = jnp.stack([squares[:, 0], jnp.mean(squares[:, 1:], axis=1)], axis=1)
     norm = jnp.sqrt(jnp.where(squares > 0, squares, 1.0))
@@ -158,8 +160,8 @@ def solve(
     rate = jnp.concatenate([normal[:, None], slip.reshape(m, rows)], axis=1) * scale
     friction = friction * norm[:, 1] / norm[:, 0]
     of_contacts = of_contacts * scale[:, :, None, None] * scale[None, None]
-    drag = jnp.zeros((m, rows), matrix.dtype)
-    if sliding is not None:
+    drag = jnp.zeros((m, rows), matrix.dtype)  # p_t / p of contacts whose slip is known
+    if sliding is not None:  # their p_t = drag p moves into the column of p; unit rows of p_t
         slides = jnp.any(sliding.reshape(m, rows) != 0, axis=1)
         drag = -friction[:, None] * sliding.reshape(m, rows)
         dragged = jnp.sum(of_contacts[..., 1:] * drag[None, None], axis=3)
@@ -288,6 +290,7 @@ def _equations(
     pressed = friction_direction[:, :, None, None] * own * first
     # term by term: in single precision XLA may crash on sums within batches of so many axes
     apart = (problem.matrix - unit)[..., None]
+    # Q A + (1 - Q) = 1 + Q (A - 1)
     moved = sum(q[:, :, k, None, None] * apart[:, None, k] for k in range(1 + rows))
     right = -jnp.sum(q * problem.rate[:, None, :, None], axis=2)
     if problem.load is not None:
@@ -307,8 +310,8 @@ def _turned(problem: _FrictionProblem, modes: _Modes, x: Float[Array, "m b N"]) 
     length, bound = length_of(pull), _bound(problem, x)
     slides = (length_of(modes.direction) > 0) & (length > 0)
     direction = jnp.where(slides[:, None], over(pull, length), modes.direction)
-    whole = bound + length_of(slip)
-    turning = jnp.where(slides & (whole > 0), bound / jnp.where(whole > 0, whole, 1.0), 0.0)
+    both = bound + length_of(slip)
+    turning = jnp.where(slides & (both > 0), bound / jnp.where(both > 0, both, 1.0), 0.0)
     return modes._replace(direction=direction, turning=turning)
 
 
@@ -347,15 +350,14 @@ def _table(contacts: int, rows: int, loaded: bool) -> tuple[np.ndarray, np.ndarr
     return table[0], table[1] == 1
 
 
-def _enumerate(
-    problem: _FrictionProblem,
-) -> _Decision:
-    """The consistent modes that stick most, and what other consistent modes say: a table of all."""
+def _enumerate(problem: _FrictionProblem) -> _Decision:
+    """The consistent modes that stick most, of all modes, and what other consistent ones give."""
     m, rows = len(problem.friction), problem.rate.shape[1] - 1
     dtype = problem.matrix.dtype
     kinds, taking = _table(m, rows, problem.load is not None)
     angle = 2 * np.pi * (kinds - 2) / (2 if rows == 1 else _DIRECTIONS)
     turned = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    # rotations (rows, rows, m, N) of the first direction, 0 where a contact does not slide
     turn = jnp.asarray(np.where(kinds > 1, turned, 0.0)[:rows, :rows], dtype)
     begin = jnp.ones((m, 1, 1), dtype)
     if rows == 2:  # the slip without impulses, if there is some
@@ -383,7 +385,7 @@ def _enumerate(
     status = jnp.where(differ(_rates(problem, x)), CODE["several_outcomes"], status)
     none = CODE["infeasible" if rows == 1 else "max_steps"]
     chosen = jax.tree.map(lambda leaf: leaf[..., best][..., None], modes)
-    signed = jnp.concatenate([x[:, 0], -x[:, 0]])
+    signed = jnp.concatenate([x[:, 0], -x[:, 0]])  # p and -p (2 m, N)
     extreme = jnp.argmin(jnp.where(good, signed, jnp.inf), axis=1)
     others = x[..., jnp.where(jnp.any(good), extreme, best)]
     return _Decision(chosen, x[..., best], jnp.where(jnp.any(good), status, none), others)
@@ -407,7 +409,7 @@ def _newton(problem: _FrictionProblem, modes: _Modes) -> tuple[_Modes, Float[Arr
 
 def _at_rest(problem: _FrictionProblem, x: Float[Array, "m b"], margin: Float[Array, ""]) -> _Modes:
     """The modes (N = 1) that x has, where contacts stick that slip by less than `margin`."""
-    rate = _rates(problem, x[..., None])
+    rate = _rates(problem, x[..., None])  # (r, s)
     margin = (margin * _size(x[..., None]))[None]
     taking = rate[:, 0] <= margin if problem.complementary else jnp.ones(rate[:, 0].shape, bool)
     if problem.load is not None:

@@ -159,7 +159,7 @@ def conjugate_step(
     product: Callable[[jax.Array], jax.Array],
     dot: Callable[[jax.Array, jax.Array], jax.Array],
     at: Iterate,
-) -> tuple[Iterate, jax.Array]:
+) -> tuple[Iterate, Bool[Array, "..."]]:
     """State after a step of conjugate gradients, and whether A has curvature along its direction.
 
     Equation: `x + a d`, `r - a A d`, `r+ + b d` with `a = r^T r / d^T A d`, `b = r+^T r+ / r^T r`.

@@ -73,9 +73,9 @@ class StepProblem(NamedTuple):
         owner = np.argsort(rows.ravel()) // kinds  # the contact of each row
         tried = impulses - self.descent * self.velocities(impulses)
         one = jnp.eye(n, dtype=tried.dtype)[..., None]
-        moved = one - self.descent[:, None] * self.coupling.dense(n)
+        moved = one - self.descent[:, None] * self.coupling.dense(n)  # d (q - d w) / dq
         matrix = jnp.broadcast_to(one, moved.shape)
-        for kind in range(kinds):
+        for kind in range(kinds):  # the normals, the first tangents, the second ones
             direction = jnp.zeros_like(tried).at[rows[:, kind]].set(1.0)
             _, slope = jax.jvp(self.projected, (tried,), (direction,))
             matrix = matrix - slope[:, None] * moved[rows[owner, kind]]
@@ -132,6 +132,7 @@ def extrapolated(
         """Scalar products `sum_i weight_i a_i b_i` over the rows."""
         return jnp.sum(weight * a * b, axis=0, keepdims=True)
 
+    # normal equations [aa ab; ab bb] c = [a; b]; only c_1 where both changes are parallel
     aa, ab, bb = (dot(*x) for x in ((change.way,) * 2, (change.way, before.way), (before.way,) * 2))
     both = aa * bb - ab**2 > precision(weight.dtype).eps * aa * bb
     aa, bb = jnp.where(aa > 0, aa, 1.0), jnp.where(both, bb, 1.0)
@@ -156,9 +157,7 @@ def solve(
         """State of the iteration."""
 
         ahead: Float[Array, "n B"]  # impulses that the sweep starts from
-        velocities: Float[
-            Array, "n B"
-        ]  # there; kept, they are computed once: XLA fuses them into each use
+        velocities: Float[Array, "n B"]  # there; kept, as XLA would compute them in each use
         last: Move  # of the sweep before
         change: Move  # its difference from the move before it
         impulses: Float[Array, "n B"]  # admissible ones

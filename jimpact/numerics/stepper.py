@@ -204,7 +204,7 @@ def _rows(x: Float[Array, "k B"]) -> list[Float[Array, "1 B"]]:
 
 def put(
     buffer: Shaped[Array, "count *rows"], value: Shaped[Array, "*rows"], index: Integer[Array, ""]
-) -> jax.Array:
+) -> Shaped[Array, "count *rows"]:
     """The buffer with `value` in the row `index`."""
     return jax.lax.dynamic_update_slice_in_dim(
         buffer, value[None], index, 0, allow_negative_indices=False
@@ -214,7 +214,7 @@ def put(
 class Step(NamedTuple):
     """A step without its state: enough to repeat it."""
 
-    modes: Int[Array, "modes B"]  # (m, B)
+    modes: Int[Array, "modes B"]
     target: Bool[Array, "k B"]  # one-hot: the margin it lands on; none: a step in time
     clock: Float[Array, "4 B"]  # xi at the beginning, length, 1 if xi is a root, 1 if it lands
 
@@ -224,8 +224,8 @@ class _StepVariable(NamedTuple):
 
     start: Any  # xi at the beginning
     length: Any  # of the step in xi
-    rooted: Any  # whether xi is a root
-    zero_length: Any  # whether it is a landing on a margin that is 0
+    rooted: Any  # 1 where xi is a root, 0 elsewhere
+    zero_length: Any  # mask of landings on a margin that is 0
 
 
 def _frame(
@@ -290,6 +290,7 @@ def _slopes(
         value, dc = cond(needed, rates_of_margins, lambda: (none, none))
     else:
         value, dc = rates_of_margins()
+    # dt/dxi = N / R: N = 2 xi of a root, else 1; R = dc_k/dt of a landing, else 1
     rate = total(jnp.where(s.target, dc, 0.0)) + (1 - lands)
     rate = jnp.where(frame.zero_length & (rate == 0), jnp.inf, rate)
     dt = (1 + frame.rooted * (2 * xi - 1)) / rate
@@ -426,7 +427,7 @@ class Mark(enum.IntEnum):
 
 
 class Intention(enum.IntEnum):
-    """What the next step does about a margin, the most urgent first, and what its distance means.
+    """Purpose of the next step for a margin, the most urgent first; the meaning of its distance.
 
     The numbers leave a gap for distances from 0 to 1 between them: their sum is the order of
     urgency.
@@ -490,7 +491,7 @@ def advance(flow: Flow, state: StepperState, most: int) -> tuple[StepperState, B
     Returns the state for the next pass, and a mask of the impacts that accept the step.
     """
     duals, start, s = flow, state.y, state.step
-    flow, y = value_of((flow, start))
+    flow, y = value_of((flow, start))  # without tangents
     n = y.shape[0]
     expected, aimed_twice, mark, passes = _rows(state.progress)
     _, h, _, lands = _rows(s.clock)
