@@ -40,7 +40,7 @@ from jimpact.numerics.tridiagonal import tridiagonal_product
 
 
 class Phase(enum.IntEnum):
-    """What a contact does within a step."""
+    """Phase of a contact, which lasts for whole steps."""
 
     OPEN = 0
     COMPRESSION = 1
@@ -368,7 +368,7 @@ class ContactFlow(Flow):
     def normal_constants(self, modes: Int[Array, "modes B"]) -> Frozen:
         """Factors of the normal field in the phases of the contacts."""
         phase, s = modes[: self.contacts], self.scales(modes)
-        # the least one makes e = 0 regular; of several one of them, whole: min() would share its
+        # the least s makes e = 0 regular; of several equal ones, one: min() would share its
         # derivative among them
         least = (
             functools.reduce(
@@ -623,12 +623,12 @@ class ContactFlow(Flow):
         works, gamma, rebound = self.at_work(modes, y, tolerance)
         if not self.closed_form:
             return ~any_of(works)
-        # |G| and min(G, 0), both with a unit diagonal
+        # |G| and min(G, 0), both with a unit diagonal: less the contact itself
         load = works.astype(y.dtype)
-        felt = self.coupling.magnitude().times(load) - load > 0
+        coupled = self.coupling.magnitude().times(load) - load > 0  # to another one at work
         change = rebound - gamma
-        left = gamma + self.coupling.pull().times(change) - change
-        return ~any_of(jnp.where(works, felt, left < -tolerance))
+        least = gamma + self.coupling.pull().times(change) - change  # gamma+ of the others
+        return ~any_of(jnp.where(works, coupled, least < -tolerance))
 
     def finish(
         self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]

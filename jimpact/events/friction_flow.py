@@ -78,9 +78,7 @@ class FrictionForces(NamedTuple):
     normal: Float[Array, "m B"]  # F
     side: Float[Array, "m B"]  # lambda
     rate: Float[Array, "m B"]  # u'
-    room: Float[
-        Array, "m B"
-    ]  # inside the cone of those that stick: 1: no tangential force, 0: on the cone
+    room: Float[Array, "m B"]  # in the cone, of those that stick: 0 on it, 1 without lambda
 
 
 @as_pytree
@@ -247,6 +245,7 @@ class FrictionFlow(ContactFlow):
         constant, state = jax.lax.stop_gradient((self, y))
         f = constant.soon(modes, state)
         most = constant.friction * f
+        # b = u' by normal forces and by the friction of contacts that slide on
         slides = jnp.where(to_check | ~loaded, 0.0, -slip.astype(u.dtype) * most)
         b = times(jnp.swapaxes(constant.normal_tangent, 0, 1), f) + times(constant.tangent, slides)
         stick, towards = distribute(constant.tangent, b, most, to_check)
@@ -345,7 +344,7 @@ class FrictionFlow(ContactFlow):
         """
         works, gamma, _ = self.at_work(modes, y, LEFT * self.tolerance)
         (x, _, p), u, slip = self.rows(y), self.slip(y), modes[2:]
-        across, own, mu = self.normal_tangent[0], self.tangent[0], self.friction
+        across, own, mu = self.normal_tangent[0], self.tangent[0], self.friction  # K_nt, K_tt, mu
         drag = -slip.astype(u.dtype) * mu
         movable = own > 0
         hold = jnp.where(movable, -across / jnp.where(movable, own, 1.0), 0.0)

@@ -238,10 +238,11 @@ class ImplicitSteps:
         load = h * self.force_of(half, gamma)
         unloading = jnp.where(stiff, self.unloading(half, h), 0.0)
         impulses = self.frictional_impulses if len(s.velocity) > m else self.normal_impulses
-        impulse, rate, load, left = impulses(s, h, Middle(half, load, unloading))
+        impulse, rate, load, error = impulses(s, h, Middle(half, load, unloading))
         velocity = s.velocity + self.coupling.times(impulse)
         normal, after = impulse[:m], velocity[:m]
 
+        # where unloading has reduced the impulse, x in the middle is that of the reduced force
         cut = stiff & (normal < load)
         middle = cond(
             jnp.any(cut),
@@ -253,7 +254,7 @@ class ImplicitSteps:
         opened = cut & (normal <= 0) & (after > 0)
         x = jnp.where(opened, -h / 2 * self.omega * after if self.gapped else 0.0, x)
         loss = self.lost(s.indentation, jnp.where(stiff, s.indentation, half), x, after)
-        loss = loss + left + self.dropped(load, opened, gamma, after)
+        loss = loss + error + self.dropped(load, opened, gamma, after)
         loss = loss + self.slackened(s.indentation, x, gamma, after, h)
         # no tangents: where nothing is stored, the slope of a root would be infinite
         loss = jax.lax.stop_gradient(loss)
@@ -272,7 +273,7 @@ class ImplicitSteps:
         # first stage of friction; the normal rows are those at the end of the step
         ahead = jnp.concatenate([gamma, s.velocity[m:] / PART])
         stage = self.problem(ahead, load, unloading, self.friction)
-        first, left = solve(stage, self.guess(s.rate, load), inner)
+        first, error = solve(stage, self.guess(s.rate, load), inner)
         if self.viscous is not None:  # the force at the velocity in the middle of the step
             load = h * self.force_of(half, gamma + self.coupling.times(first)[:m] / 2)
         side = (1 - PART) * first[m:]
@@ -281,11 +282,11 @@ class ImplicitSteps:
         # second stage, in units in which both rows have the weight PART
         stage = self.problem(base / PART, load / PART, unloading, self.friction * PART)
         guess = jnp.concatenate([first[:m] / PART, first[m:]])
-        second, left_then = solve(stage, guess, inner)
+        second, second_error = solve(stage, guess, inner)
         normal = PART * second[:m]
         impulse = jnp.concatenate([normal, side + PART * second[m:]])
-        left = (1 - PART) * left + PART * left_then
-        return StageImpulses(impulse, jnp.concatenate([normal, second[m:]]) / h, load, left)
+        error = (1 - PART) * error + PART * second_error
+        return StageImpulses(impulse, jnp.concatenate([normal, second[m:]]) / h, load, error)
 
     def guess(self, rate: Float[Array, "n B"], load: Float[Array, "m B"]) -> Float[Array, "n B"]:
         """Impulses (f, y): this load, and the parts of it that friction had in the last step."""
@@ -312,8 +313,8 @@ class ImplicitSteps:
             return solve(problem, h * s.rate, INNER * self.tolerance)
 
         some = jnp.any(unloading > 0)
-        normal, left = cond(some, cut, lambda: (load, none))
-        return StageImpulses(normal, normal / h, load, left)
+        normal, error = cond(some, cut, lambda: (load, none))
+        return StageImpulses(normal, normal / h, load, error)
 
     def turned(
         self,

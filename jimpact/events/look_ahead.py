@@ -70,7 +70,8 @@ def comes_to_rest(
     """
     m = flow.contacts
     x, g, _ = flow.rows(y)
-    visible = flow.tolerance * jnp.maximum(flow.taking_part, 2) / 2  # see `dimensionless`
+    # error that the law's tolerance allows in the outcome, see `dimensionless`
+    visible = flow.tolerance * jnp.maximum(flow.taking_part, 2) / 2
     steps = ImplicitSteps(
         coupling=flow.coupling,
         omega=flow.omega,

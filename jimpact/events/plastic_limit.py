@@ -101,12 +101,12 @@ def contacts_at_rest(
     the gamma+ that their impulses give: errors of many closings add up.
     """
     m, modes, state = flow.contacts, carry.step.modes, carry.y
-    count = modes[m : 2 * m]
+    count = modes[m : 2 * m]  # closings so far
     since = count - last.closings
     most, before = (jnp.max(x, axis=0, keepdims=True) for x in (count, last.closings))
     paused = (carry.mark == Mark.PAUSED) & (most > before) & (most >= OFTEN)
     often = paused & (2 * since >= jnp.max(since, axis=0, keepdims=True)) & (count > 0)
-    rest = resting | often
+    rest = resting | often  # contacts asked about
     now = gamma + flow.change(state)
 
     start = often | (rest & (now < 0))
@@ -118,14 +118,14 @@ def contacts_at_rest(
     size, old = (jnp.max(jnp.abs(x), axis=1, keepdims=True) for x in (rows, last.rows))
     ratio = size[:1] / jnp.where(old[:1] > 0, old[:1], size[:1])
     returns = jnp.abs(rows - ratio * last.rows) <= SHAPE * (1 - ratio) * size
-    after = now + flow.coupling.times(dp)
+    after = now + flow.coupling.times(dp)  # gamma+
     settled = ~flow.at_work(modes, state, flow.tolerance)[0] & (after >= -flow.tolerance)
     meets = jnp.where(often, carries, settled) & jnp.all(returns, axis=0)
     ends = paused & ~any_of(~meets) & any_of(often & (flow.restitution < 1))
     rest = resting | (often & ends)
     new = Rest(rest, rest & carries, rows.at[2].set(dp), count, ends)
-    fresh = paused | any_of(resting)
-    return jax.tree.map(lambda a, b: jnp.where(fresh, a, b), new, last)
+    inspected = paused | any_of(resting)
+    return jax.tree.map(lambda a, b: jnp.where(inspected, a, b), new, last)
 
 
 def block_at_rest(
@@ -139,9 +139,9 @@ def block_at_rest(
     now = gamma + flow.change(carry.y)
     everywhere = jnp.ones_like(now, bool)
     block, dp = plastic_impulses(flow, everywhere, everywhere, now)
-    after = now + flow.coupling.times(dp)
-    right = ~any_of((jnp.where(block, dp, 0.0) < 0) | (after < -flow.tolerance))
-    ended = comes_to_rest(flow, carry.step.modes, carry.y, block, dp, due & right)
+    after = now + flow.coupling.times(dp)  # gamma+
+    admissible = ~any_of((jnp.where(block, dp, 0.0) < 0) | (after < -flow.tolerance))
+    ended = comes_to_rest(flow, carry.step.modes, carry.y, block, dp, due & admissible)
     new = Rest(block, block, rest.rows.at[2].set(dp), rest.closings, ended)
     return jax.tree.map(lambda a, b: jnp.where(ended, a, b), new, rest)
 

@@ -254,15 +254,15 @@ class SlipFlow(FrictionFlow):
         stick, slips, creeps = self.sliding(modes)
         slides, q = slips | creeps, self.slip(y)
         f = self.force(frozen, x, g)
-        c = jnp.where(slides, self.friction * f, 0.0)
+        c = jnp.where(slides, self.friction * f, 0.0)  # mu F
         angle, r = jnp.where(slides, q[:, 1], 0.0), self.speed(modes, q)
         over_r = jnp.where(slips, frozen.unit / jnp.where(slips, r, 1.0), 0.0)
         frame = polar(angle)
         drift, correction = self._creep(const, modes, y, f, c, frame, over_r)
         direction, perpendicular = turned(frame, correction)
         side = flat(-c[:, None] * direction)
-        a = pairs(times(const.pull, f) + times(const.tangent, side))
-        grows, turns = dot(direction, a), dot(perpendicular, a)
+        a = pairs(times(const.pull, f) + times(const.tangent, side))  # u'
+        grows, turns = dot(direction, a), dot(perpendicular, a)  # r' = d . a and r angle' = n . a
         rate = jnp.stack(
             [
                 jnp.where(slips, over_r * grows, jnp.where(creeps, frozen.unit * grows, 0.0)),
@@ -270,6 +270,7 @@ class SlipFlow(FrictionFlow):
             ],
             1,
         )
+        # rows of contacts without load are u itself
         rate = jnp.where(
             self.loaded(modes)[:, None], rate, (frozen.unit * jnp.ones_like(x))[:, None] * a
         )
@@ -314,6 +315,7 @@ class SlipFlow(FrictionFlow):
     ) -> tuple[Float[Array, "m B"], Float[Array, "m B"]]:
         """Rates at which the directions of creep drift, and their deviation from those of `frame`.
 
+        `c` is mu F, `frame` the directions d and n, `over_r` 1 / r of the contacts that slip.
         With G = n . a of all contacts that creep, G' at fixed angles and J = -dG/d angle, the
         quasi-static solution G = 0 drifts by J^-1 G'. The directions lag behind it by
         (J + diag(r'))^-1 r drift, as r angle' = G and r grows at the rate r'.
@@ -332,14 +334,15 @@ class SlipFlow(FrictionFlow):
 
         side = -c[:, None] * direction
         a = acceleration(f, side)
-        grows, turns = dot(direction, a), dot(perpendicular, a)
+        grows, turns = dot(direction, a), dot(perpendicular, a)  # r' and G
+        # G' from the rates of F, of the radii c, and of the directions that slip
         pull = times(const.coupling, f) + times(const.normal_tangent, flat(side))
         rates = (frozen.closing * g, frozen.ratio * pull)
         _, df = jax.jvp(lambda x, g: self.force(frozen, x, g), (x, g), rates)
         dc = jnp.where(c > 0, self.friction * df, 0.0)
-        swung = (c * over_r * turns)[:, None] * perpendicular  # of those that slip
+        swung = (c * over_r * turns)[:, None] * perpendicular
         changes = dot(perpendicular, acceleration(df, -dc[:, None] * direction - swung))
-        # all in units of the largest entry: forces begin at 0
+        # J = n K_tt n c + diag(r'), all in units of the largest entry: forces begin at 0
         blocks = self._blocks(const)
         j = sum(
             perpendicular[:, i][:, None] * blocks[:, i, :, k] * perpendicular[:, k][None]
@@ -353,8 +356,8 @@ class SlipFlow(FrictionFlow):
         j, eye = j / size[None], unit(j)
         turns, changes = (jnp.where(creeps, z / size, 0.0) for z in (turns, changes))
         away = jnp.where(creeps, LEAST_STIFFNESS, 1.0)
-        whole = j + eye * (growth + away)[:, None]
-        drift, newton = (solve(whole, z[:, None])[:, 0] for z in (changes, turns))
+        jacobian = j + eye * (growth + away)[:, None]
+        drift, newton = (solve(jacobian, z[:, None])[:, 0] for z in (changes, turns))
         lagging = jnp.where(creeps, frozen.unit, 1.0)[:, None] * (
             j + eye * (2 * growth + away)[:, None]
         )
@@ -385,6 +388,7 @@ class SlipFlow(FrictionFlow):
         """Rates of x, g, p, slip, its impulses and time, all in the shortened time."""
         _, g, _ = self.rows(y)
         frozen, motion = const.frozen, self.motion(const, modes, y)
+        # gamma' = G F + K_nt lambda
         pull = times(const.coupling, motion.force) + times(const.normal_tangent, motion.sliding)
         dy = jnp.concatenate(
             [
@@ -473,7 +477,11 @@ class SlipFlow(FrictionFlow):
     def switch(
         self, modes: Int[Array, "modes B"], y: Float[Array, "n B"], which: Bool[Array, "k B"]
     ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
-        """Modes and state after events; slip changes its variables with the mode."""
+        """Modes and state after events; slip changes its variables with the mode.
+
+        A contact that opens keeps u = r d, one that breaks loose creeps from r = 0, and creep that
+        ends goes on with ln r.
+        """
         m = self.contacts
         stopped, ended = which[2 * m : 3 * m], which[3 * m :]
         stick, slips, creeps = self.sliding(modes)
