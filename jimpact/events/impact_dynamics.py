@@ -115,7 +115,7 @@ def dimensionless(
     stiffness: Float[Array, ""] | Float[Array, "m"],
     exponent: Exponent,
     stored: Float[Array, "m"],
-    rtol: float,
+    rtol: Float[Array, ""] | float,
     gaps: Float[Array, "m"] | None = None,
     closed: Bool[Array, "m"] | None = None,
 ) -> tuple[Problem, ImpactUnits]:

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jimpact.tools.compiling import full_precision
 from jimpact.tools.loops import while_loop
@@ -72,8 +72,9 @@ class Sparse(eqx.Module):
     entries: Float[Array, "m K"]
     neighbours: Neighbours = eqx.field(static=True)
 
-    def __matmul__(self, vector: Float[Array, "m"]) -> Float[Array, "m"]:
+    def __matmul__(self, vector: Float[ArrayLike, "m"]) -> Float[Array, "m"]:
         """Product `A x`."""
+        vector = jnp.asarray(vector)
         return self.diagonal * vector + neighbour_sum(self.entries, vector, self.neighbours)
 
     def __abs__(self) -> "Sparse":

@@ -5,7 +5,7 @@ from typing import Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from jimpact.numerics.sparse import Neighbours, Sparse
 
@@ -34,8 +34,9 @@ class Tridiagonal(eqx.Module):
     off_diagonal: Float[Array, "m-1 *B"]
     regular: bool = eqx.field(static=True, default=False)
 
-    def __matmul__(self, vector: Float[Array, "m *B"]) -> Float[Array, "m *B"]:
+    def __matmul__(self, vector: Float[ArrayLike, "m *B"]) -> Float[Array, "m *B"]:
         """Product `A x` in O(m); batches in further axes of all three."""
+        vector = jnp.asarray(vector)
         return tridiagonal_product(self.diagonal * vector, self.off_diagonal, vector)
 
     def solve(self, vector: Float[Array, "m"]) -> Float[Array, "m"]:
