@@ -134,7 +134,7 @@ def _solve_two(
     matrix: Float[Array, "2 2 *#B"], right: Float[Array, "2 c *#B"]
 ) -> Float[Array, "2 c *#B"]:
     """`A^-1 right` for two rows, by the operations of `_eliminated`, written out."""
-    scale, factor = 1 / matrix[0, :1], matrix[1, :1]
+    scale, factor = 1 / matrix[0, :1], matrix[1, :1]  # of row 0, 1 / a_00 and a_10
     above, x = matrix[0, 1:] * scale, right[0] * scale
     last = (right[1] - factor * x) * (1 / (matrix[1, 1:] - factor * above))
     return jnp.stack([x - above * last, last])
@@ -455,7 +455,7 @@ def eigenvectors(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n"], Float[
 def _batch_of_eigenvectors(
     size: int, batched: Any, matrices: Float[Array, "N n n"]
 ) -> tuple[tuple[Float[Array, "N n"], Float[Array, "N n n"]], tuple[bool, bool]]:
-    """Rule of `vmap`: the columns of A V after Jacobi's rotations are as long as eigenvalues."""
+    """Rule of `vmap`: V by Jacobi's rotations, eigenvalues as the lengths of columns of A V."""
     if matrices.shape[-1] > _BY_LOOP:
         values, vectors = jnp.linalg.eigh(matrices)
         return (values, vectors), (True, True)

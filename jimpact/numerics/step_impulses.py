@@ -90,6 +90,8 @@ def descent_lengths(
     Rows are scaled to a diagonal of at most 1, both tangents of a contact alike; the largest
     eigenvalue is then at most the largest sum of a row, and the fourth root of the Frobenius norm
     of the fourth power. `friction_only`: normal impulses are known, so their rows do not count.
+
+    Equation: `1 / d_i = size_i min(max_j sum_k |S_jk|, |S^4|^(1/4))` with the scaled matrix S.
     """
     n = len(coupling)
     size = coupling[jnp.arange(n), jnp.arange(n)]
@@ -107,8 +109,8 @@ def descent_lengths(
     square = jnp.einsum("ij...,jk...->ik...", scaled, scaled)
     fourth = jnp.einsum("ij...,jk...->ik...", square, square)
     norm = jnp.sum(fourth**2, axis=(0, 1))[None] ** (1 / 8)
-    longest = size * jnp.minimum(row_sum, norm)
-    return 1 / jnp.where(longest > 0, longest, 1.0)
+    bound = size * jnp.minimum(row_sum, norm)  # of the eigenvalues
+    return 1 / jnp.where(bound > 0, bound, 1.0)
 
 
 class Move(NamedTuple):

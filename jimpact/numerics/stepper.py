@@ -472,12 +472,13 @@ def begin(flow: Any, modes: Int[Array, "modes B"], start: Any) -> StepperState:
     start = dual_like((flow, start), start)
     flow, y = value_of((flow, start))
     one = jnp.ones_like(y[:1])
+    # xi = 0, a length in the root of time, no landing
     clock = jnp.concatenate([0 * one, FIRST**0.5 * one, one, 0 * one])
     targets = jax.eval_shape(lambda: flow.margins(flow.constants(modes), modes, y)).shape
     step = Step(modes, jnp.zeros(targets, bool), clock)
     over = flow.over(modes, y, 0 * one)
-    state = jnp.where(over, Mark.OVER, Mark.GOES_ON).astype(y.dtype)
-    return StepperState(start, step, jnp.concatenate([FIRST * one, 0 * one, state, 0 * one]))
+    mark = jnp.where(over, Mark.OVER, Mark.GOES_ON).astype(y.dtype)
+    return StepperState(start, step, jnp.concatenate([FIRST * one, 0 * one, mark, 0 * one]))
 
 
 def goes_on(carry: StepperState, most: int) -> Bool[Array, "1 B"]:
@@ -622,6 +623,7 @@ class _Urgent(NamedTuple):
 
 def _most_urgent(intention: Int[Array, "k B"], distance: Float[Array, "k B"]) -> _Urgent:
     """The margin of least intention and, of equal ones, of least distance; ties go by the row."""
+    # below 0: SHORTEN; from 0 to 1: LAND at this part of the step; above: AHEAD
     order = intention + distance + TIE * jnp.arange(len(distance), dtype=distance.dtype)[:, None]
     first = jnp.min(order, axis=0, keepdims=True)
     not_before = jnp.where(first <= Intention.AHEAD, Intention.LAND, Intention.AHEAD)
@@ -644,8 +646,10 @@ def _next_step(
     """
     start, length, in_root, lands = _rows(s.clock)
     ok, event, lands = error2 <= 1, urgent.intention < Intention.AHEAD, lands > 0
+    # xi goes on from the end of an accepted step
     in_root = (in_root > 0) & ~lands
     start = jnp.where(in_root, start + jnp.where(accept, length, 0.0), 0.0)
+    # the length: shorter before an event or after a failed landing, else by the error
     shorter = _shorter_length(flow, s, in_root, urgent, ok, duration)
     at_event = jnp.where(urgent.intention == Intention.SHORTEN, shorter, length)
     after_landing = jnp.where(ok, length, shorter)
@@ -657,6 +661,7 @@ def _next_step(
     proposed = jnp.where(in_root, proposed, jnp.minimum(proposed, flow.longest))
     # xi is the root of time: from `start` on a step takes this long
     expected = jnp.where(in_root, (start + proposed) ** 2 - start**2, proposed)
+    # the next step is a landing, in time, if one is due now or ahead
     reached = _reaches_event(flow, s.modes, urgent.distance, duration, expected)
     aim = ok & jnp.where(event, urgent.intention == Intention.LAND, ~lands & reached)
     proposed = jnp.where(aim & in_root, expected, proposed)

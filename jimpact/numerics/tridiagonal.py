@@ -9,6 +9,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jimpact.numerics.sparse import Neighbours, Sparse
 
+# of one row: diagonal entry, right side, off-diagonal entry to the next row
 Triple = tuple[jax.Array, jax.Array, jax.Array]
 
 
@@ -59,7 +60,7 @@ class Tridiagonal(eqx.Module):
         _, (pivot, right, after) = jax.lax.scan(eliminate, first, (self.diagonal, vector, after))
 
         def substitute(
-            x: Float[Array, "1"], row: tuple[jax.Array, ...]
+            x: Float[Array, "1"], row: Triple
         ) -> tuple[Float[Array, "1"], Float[Array, "1"]]:
             """Unknown `x_j = (r_j - o_j x_j+1) / d_j` of the bidiagonal system, twice."""
             pivot, right, after = row
