@@ -473,7 +473,11 @@ class ContactFlow(Flow):
     def normal_switch(
         self, modes: Int[Array, "modes B"], y: Float[Array, "n B"], which: Bool[Array, "k B"]
     ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
-        """Phases, closings, x and g after events: m by indentation, then m by velocity."""
+        """Phases, closings, x and g after events: m by indentation, then m by velocity.
+
+        An event ends the phase whose margin it is: OPEN closes to COMPRESSION, which turns to
+        EXPANSION (or YIELD), which opens or is compressed again. See `normal_margins`.
+        """
         m = self.contacts
         phase, count = modes[:m], modes[m : 2 * m]
         x, g, _ = self.rows(y)

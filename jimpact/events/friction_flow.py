@@ -388,12 +388,14 @@ def _next_piece(
     """
     gamma, energy, slides = s.gap_velocity, s.energy, s.left > 0
     slope, most = jnp.where(slides, *slopes), jnp.where(slides, s.left, jnp.inf)
-    closes = (gamma < 0) | ((gamma == 0) & (slope < 0))
+    closes = (gamma < 0) | ((gamma == 0) & (slope < 0))  # is compressed
     expands = ~closes & (energy > 0) & ((gamma > 0) | (slope > 0))
+    # gamma reaches 0, and: the expansion starts from gamma = 0
     turns, rising = closes & (slope > 0), expands & (gamma == 0)
     some, up = jnp.where(expands, energy, 1.0), jnp.where(turns | rising, slope, 1.0)
     square = jnp.where(expands & ~rising, gamma**2 + e**2 * slope * energy, 1.0)
     back = square <= 0  # gamma falls to 0 before the energy does
+    # unloaded at gamma = end = sqrt(square), after the impulse e^2 energy / (gamma + end);
     # from gamma = 0 the end is a multiple of e: regular at e = 0
     end = jnp.where(rising, e * jnp.sqrt(up * some), jnp.sqrt(jnp.where(back, 1.0, square)))
     whole = e**2 * some / jnp.where(expands & ~rising & ~back, gamma + end, 1.0)

@@ -291,7 +291,7 @@ class ImplicitSteps:
     def guess(self, rate: Float[Array, "n B"], load: Float[Array, "m B"]) -> Float[Array, "n B"]:
         """Impulses (f, y): this load, and the parts of it that friction had in the last step."""
         m = self.contacts
-        rows = len(rate) // m - 1
+        rows = len(rate) // m - 1  # tangents of a contact
         pressed = rate[:m] > 0
         carried = jnp.repeat(jnp.where(pressed, rate[:m], 1.0), rows, axis=0)
         loads = jnp.repeat(jnp.where(pressed, load, 0.0), rows, axis=0)

@@ -56,9 +56,9 @@ def inspect(
     which: Bool[Array, "1 B"],
     at_end: bool,
 ) -> Rest:
-    """`rest` anew for impacts `which` pause, or are over: see `run`.
+    """Contacts at rest in impacts `which` pause or, `at_end`, are over; else those of `rest`.
 
-    Of those that are over, where contacts that closed often hardly move.
+    Of impacts that are over, where contacts that closed often hardly move.
     """
     flow, values = _values(flow, carry)
     gamma, rest = jax.lax.stop_gradient((gamma, rest))
@@ -112,7 +112,7 @@ def contacts_at_rest(
     start = often | (rest & (now < 0))
     carries, dp = plastic_impulses(flow, rest, start, now)
 
-    # is it a multiple of the state at the last check?
+    # is (gamma, root of the energy, dp) a multiple of that at the last inspection?
     root = jnp.sqrt(flow.energy(state[:m], jnp.zeros_like(now)))
     rows = jnp.where(often, jnp.stack([now, root, dp]), 0.0)
     size, old = (jnp.max(jnp.abs(x), axis=1, keepdims=True) for x in (rows, last.rows))

@@ -385,10 +385,12 @@ class SlipFlow(FrictionFlow):
     def field(
         self, const: Reduced, modes: Int[Array, "modes B"], y: Float[Array, "driving B"]
     ) -> Float[Array, "n B"]:
-        """Rates of x, g, p, slip, its impulses and time, all in the shortened time."""
+        """Rates of x, g, p, slip, its impulses and time, all over `haste`: in shortened time.
+
+        Equation: `g' = ratio (G F + K_nt lambda)`, without the forces of sticking in K.
+        """
         _, g, _ = self.rows(y)
         frozen, motion = const.frozen, self.motion(const, modes, y)
-        # gamma' = G F + K_nt lambda
         pull = times(const.coupling, motion.force) + times(const.normal_tangent, motion.sliding)
         dy = jnp.concatenate(
             [
