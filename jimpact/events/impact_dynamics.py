@@ -166,7 +166,7 @@ def tangential_of(
 
 
 def normal_coupling(problem: Problem, structure: Structure) -> Float[Array, "m m B"]:
-    """G from the entries that a problem holds: the upper triangle, or the one of a chain."""
+    """G with unit diagonal, from the entries above it: all, or G_j,j+1 of a chain."""
     m, (_, *batch) = problem.omega.shape[0], problem.omega.shape
     chain = structure == "chain"
     i, j = (jnp.arange(m - 1), jnp.arange(1, m)) if chain else jnp.triu_indices(m, 1)

@@ -105,6 +105,7 @@ def contacts_at_rest(
     since = count - last.closings
     most, before = (jnp.max(x, axis=0, keepdims=True) for x in (count, last.closings))
     paused = (carry.mark == Mark.PAUSED) & (most > before) & (most >= OFTEN)
+    # closed since the last inspection at least half as often as any other contact
     often = paused & (2 * since >= jnp.max(since, axis=0, keepdims=True)) & (count > 0)
     rest = resting | often  # contacts asked about
     now = gamma + flow.change(state)
@@ -119,6 +120,7 @@ def contacts_at_rest(
     ratio = size[:1] / jnp.where(old[:1] > 0, old[:1], size[:1])
     returns = jnp.abs(rows - ratio * last.rows) <= SHAPE * (1 - ratio) * size
     after = now + flow.coupling.times(dp)  # gamma+
+    # the impact ends if its state returns, and all but those contacts have settled
     settled = ~flow.at_work(modes, state, flow.tolerance)[0] & (after >= -flow.tolerance)
     meets = jnp.where(often, carries, settled) & jnp.all(returns, axis=0)
     ends = paused & ~any_of(~meets) & any_of(often & (flow.restitution < 1))

@@ -334,10 +334,10 @@ def _solved(problem: _FrictionProblem, modes: _Modes) -> Float[Array, "m b N"]:
 
 
 def _table(contacts: int, rows: int, loaded: bool) -> tuple[np.ndarray, np.ndarray]:
-    """All modes of contacts, an array (m, N): 0 sticks, 1 is free, 2... slide; most sticking first.
+    """All combinations of modes (m, N), most sticking first: 0 sticks, 1 is free, 2, 3, .. slide.
 
-    And the mask (m, N) of those with r = 0: all that are not free, but with a load any other may
-    have p = 0 as well.
+    And the mask (m, N) of contacts with r = 0: all that are not free; with a load those may have
+    p = 0 instead, and none is free.
     """
     slides = 2 if rows == 1 else _DIRECTIONS
     if not loaded:
