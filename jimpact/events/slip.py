@@ -523,6 +523,7 @@ class SlipFlow(FrictionFlow):
         stick = loaded & (slip == Slip.STICKS) & ~closed
         r = jnp.where(closed, length(q), self.speed(modes, q))
         resting = loaded & (r <= REST * self.tolerance) & ~stick
+        # contacts that close with slip: its Cartesian rows become ln r and angle
         slips = closed & ~resting
         moving = jnp.where(slips[:, None], q, 1.0)
         q = jnp.where(slips[:, None], jnp.stack([jnp.log(length(moving)), angle_of(moving)], 1), q)
@@ -532,6 +533,7 @@ class SlipFlow(FrictionFlow):
         constant, state = jax.lax.stop_gradient((self, y))
         f = constant.soon(modes, state)
         most = constant.friction * f
+        # b = u' by normal forces and by the friction of contacts that slide on
         slides = jnp.where(
             (to_check | ~loaded)[:, None], 0.0, polar(jax.lax.stop_gradient(q[:, 1]))[0]
         )
@@ -539,6 +541,7 @@ class SlipFlow(FrictionFlow):
         b = b - times(constant.tangent, flat(most[:, None] * slides))
         inside, towards = distribute(constant.tangent, b, most, to_check)
         towards = angle_of(pairs(towards))
+        # stick is (0, 0), creep begins at r = 0
         begins = jnp.stack([jnp.zeros_like(towards), jnp.where(inside, 0.0, towards)], 1)
         lost = jnp.where((closed & resting & inside)[:, None], q, 0.0)
         q = jnp.where(to_check[:, None], begins, q)

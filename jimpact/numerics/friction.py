@@ -680,9 +680,9 @@ def _relaxed(
 
     def relax(j: Int[Array, ""] | int, force: Float[Array, "t B"]) -> Float[Array, "t B"]:
         """Forces after `lambda_j <- P(lambda_j - u_j' / stiffness_j)`, P projects on disc j."""
-        here = jax.lax.dynamic_slice_in_dim(force, rows * j, rows)
+        at_contact = jax.lax.dynamic_slice_in_dim(force, rows * j, rows)
         change = jax.lax.dynamic_slice_in_dim(rate, rows * j, rows) + times(of_contacts[j], force)
-        tried, most = here - change / stiffness[j], limit[j][None]
+        tried, most = at_contact - change / stiffness[j], limit[j][None]
         length = _lengths(tried, rows)
         shrink = jnp.where(length > most, most / jnp.where(length > 0, length, 1.0), 1.0)
         return jax.lax.dynamic_update_slice_in_dim(force, tried * shrink, rows * j, 0)

@@ -123,10 +123,10 @@ def _solve_sparse(matrix: Sparse, q: Float[Array, "m"]) -> LCP:
     a = matrix.scaled(scale).within(support)
     solved = scale * conjugate_gradients(lambda x: a @ x, jnp.where(support, -q * scale, 0.0))
     z = z + (solved - jax.lax.stop_gradient(solved))
-    # a vector that A makes nothing of, if there is one, has a part in nearly all others
+    # A is singular if a right side is not in its range: nearly all have a part in its null space
     other = jnp.where(support, jnp.cos(jnp.arange(1.0, len(q) + 1, dtype=q.dtype) ** 2), 0.0)
-    still_a = jax.lax.stop_gradient(a)
-    singular = jnp.any(jnp.isnan(conjugate_gradients(lambda x: still_a @ x, other)))
+    fixed = jax.lax.stop_gradient(a)
+    singular = jnp.any(jnp.isnan(conjugate_gradients(lambda x: fixed @ x, other)))
     code = jnp.where(singular, CODE["impulse_not_unique"], CODE["ok"])
     code = jnp.where(found.misfit > tolerance, CODE["max_steps"], code)
     return LCP(z, jnp.where(support, 0.0, matrix @ z + q), code)
