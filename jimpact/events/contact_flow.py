@@ -31,6 +31,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
 
 from jimpact.numerics.dense import COLUMNS_WRITTEN_OUT, times, unit
 from jimpact.numerics.sparse import Neighbours, neighbour_sum
@@ -39,7 +40,7 @@ from jimpact.numerics.tridiagonal import tridiagonal_product
 
 
 class Phase(enum.IntEnum):
-    """What a contact does within a step."""
+    """Phase of a contact, which lasts for whole steps."""
 
     OPEN = 0
     COMPRESSION = 1
@@ -79,8 +80,8 @@ T = TypeVar("T")
 Exponent = float | tuple[float, ...] | jax.Array
 
 
-def power(x: jax.Array, exponent: Exponent) -> jax.Array:
-    """`max(x, 0)^exponent` of rows x, with finite derivatives at 0; fast for static halves."""
+def power(x: Float[Array, "m *B"], exponent: Exponent) -> Float[Array, "m *B"]:
+    """`max(x, 0)^exponent`, with finite derivatives at 0; fast for static halves."""
     if isinstance(exponent, tuple) and len(set(exponent)) == 1:
         exponent = exponent[0]
     if isinstance(exponent, float) and exponent == 1.0:
@@ -96,8 +97,8 @@ def power(x: jax.Array, exponent: Exponent) -> jax.Array:
     return jnp.where(positive, jnp.exp(eta * jnp.log(safe)), 0.0)
 
 
-def per_row(values: Exponent, like: jax.Array) -> jax.Array:
-    """Values of contacts, (m,) or one, shaped to broadcast against rows (m, B)."""
+def per_row(values: Exponent, like: Float[Array, "m *B"]) -> Float[Array, "#m *#B"]:
+    """Values of contacts, (m,) or one, with axes of length 1 to broadcast against `like`."""
     values = jnp.asarray(values, like.dtype)
     return values if values.ndim == like.ndim else values.reshape(-1, *[1] * (like.ndim - 1))
 
@@ -108,36 +109,67 @@ def plus_one(exponent: Exponent) -> Exponent:
 
 
 class Viscous(NamedTuple):
-    """A force `model` (see `laws/forces.py`) and the units (m, B) that make it dimensionless."""
+    """A force `model` (see `laws/forces.py`), and the units that make it dimensionless."""
 
     model: Any
-    indentation: jax.Array  # [m]
-    speed: jax.Array  # [m/s]
-    force: jax.Array  # [N]
-    onset_unit: jax.Array  # of `onset`, whose dimension is the model's own
+    indentation: Float[Array, "m *B"]  # X [m]
+    speed: Float[Array, "m *B"]  # V [m/s]
+    force: Float[Array, "m *B"]  # F_0 [N]
+    onset_unit: Float[Array, "m *B"]  # of `onset`, whose dimension is the model's own
 
-    def push(self, x: jax.Array, gamma: jax.Array) -> jax.Array:
-        """Dimensionless force, not tensile."""
+    def push(self, x: Float[Array, "m B"], gamma: Float[Array, "m B"]) -> Float[Array, "m B"]:
+        """Dimensionless force `max(F(X x, -V gamma), 0) / F_0`: it never pulls."""
         x = jnp.where(x >= 0, x, 0.0) * self.indentation
         return jnp.maximum(self._value("force", x, gamma) / self.force, 0.0)
 
-    def onset(self, x: jax.Array, gamma: jax.Array) -> jax.Array:
-        """Smooth function with the sign of the force, of order 1."""
+    def onset(self, x: Float[Array, "m B"], gamma: Float[Array, "m B"]) -> Float[Array, "m B"]:
+        """Smooth function of order 1 with the sign of the force, which says where it sets in."""
         x = jnp.where(x >= 0, x, 0.0) * self.indentation
         return self._value("onset", x, gamma) / self.onset_unit
 
-    def _value(self, name: str, x: jax.Array, gamma: jax.Array) -> jax.Array:
-        """A force knows contacts (m,), not batches."""
+    def _value(
+        self, name: str, x: Float[Array, "m B"], gamma: Float[Array, "m B"]
+    ) -> Float[Array, "m B"]:
+        """Method `name` of the model at x [m] and -V gamma [m/s]; it knows one impact, no batch."""
 
-        def of_one(model: Any, x: jax.Array, rate: jax.Array) -> jax.Array:
-            """Of one impact, arrays (m,)."""
+        def of_one(model: Any, x: Float[Array, "m"], rate: Float[Array, "m"]) -> Float[Array, "m"]:
+            """The method's values in the contacts of one impact."""
             return getattr(model, name)(x, rate)
 
         return jax.vmap(of_one, in_axes=-1, out_axes=-1)(self.model, x, -gamma * self.speed)
 
 
-def written_out(coupling: Any, n: int) -> jax.Array:
-    """The matrix (n, n, B) of a coupling that multiplies."""
+# fields of flows and couplings that are no arrays: they belong to the program
+COMPILED_IN = ("exponent_static", "gapped", "closed_form", "watches", "neighbours")
+
+
+def as_pytree(kind: type[T]) -> type[T]:
+    """A dataclass of arrays as a pytree; the fields COMPILED_IN belong to its structure.
+
+    JAX rebuilds it without its constructor, whose annotations hold for arrays only: in between the
+    leaves are `Dual`s, axes or placeholders.
+    """
+    names = [field.name for field in dataclasses.fields(kind)]  # type: ignore[arg-type]
+    arrays = [name for name in names if name not in COMPILED_IN]
+    fixed = [name for name in names if name in COMPILED_IN]
+
+    def flatten(tree: T) -> tuple[list[Any], tuple[Any, ...]]:
+        """Values of the fields that are arrays, and of the others."""
+        return [getattr(tree, name) for name in arrays], tuple(getattr(tree, n) for n in fixed)
+
+    def unflatten(structure: tuple[Any, ...], leaves: Any) -> T:
+        """The inverse of `flatten`."""
+        tree = object.__new__(kind)
+        for name, value in zip((*arrays, *fixed), (*leaves, *structure)):
+            object.__setattr__(tree, name, value)
+        return tree
+
+    jax.tree_util.register_pytree_node(kind, flatten, unflatten)
+    return kind
+
+
+def written_out(coupling: Any, n: int) -> Float[Array, "n n B"]:
+    """The matrix of n rows of a coupling that multiplies: its products with unit vectors."""
     entries = jax.tree.leaves(coupling)[0]
     one = jnp.eye(n, dtype=entries.dtype)[..., None]
     columns = jnp.broadcast_to(one, (n, n, entries.shape[-1]))
@@ -145,16 +177,16 @@ def written_out(coupling: Any, n: int) -> jax.Array:
 
 
 class Chain(NamedTuple):
-    """The coupling of a chain: G without its unit diagonal, (m - 1, B)."""
+    """The coupling of a chain: a tridiagonal G with unit diagonal."""
 
-    off_diagonal: jax.Array
+    off_diagonal: Float[Array, "_ B"]  # m - 1 entries G_j,j+1
 
-    def dense(self, n: int) -> jax.Array:
-        """The matrix (n, n, B)."""
+    def dense(self, n: int) -> Float[Array, "n n B"]:
+        """The matrix G of n rows."""
         return written_out(self, n)
 
-    def times(self, f: jax.Array) -> jax.Array:
-        """`G f` (m, B)."""
+    def times(self, f: Float[Array, "m B"]) -> Float[Array, "m B"]:
+        """Products `G f`."""
         return tridiagonal_product(f, self.off_diagonal, f)
 
     def magnitude(self) -> "Chain":
@@ -167,19 +199,19 @@ class Chain(NamedTuple):
 
 
 class Dense(NamedTuple):
-    """A coupling matrix (m, m, B)."""
+    """A coupling matrix that is stored whole."""
 
-    matrix: jax.Array
+    matrix: Float[Array, "m m B"]
 
-    def dense(self, _: int) -> jax.Array:
+    def dense(self, _: int) -> Float[Array, "m m B"]:
         """The matrix."""
         return self.matrix
 
-    def times(self, f: jax.Array) -> jax.Array:
-        """`G f` (m, B)."""
+    def times(self, f: Float[Array, "m B"]) -> Float[Array, "m B"]:
+        """Products `G f`."""
         return times(self.matrix, f)
 
-    def _off_diagonal(self) -> jax.Array:
+    def _off_diagonal(self) -> Float[Array, "m m B"]:
         """G without its diagonal."""
         return self.matrix * (1 - unit(self.matrix))
 
@@ -192,20 +224,20 @@ class Dense(NamedTuple):
         return Dense(jnp.minimum(self._off_diagonal(), 0.0) + unit(self.matrix))
 
 
-@jax.tree_util.register_dataclass
+@as_pytree
 @dataclasses.dataclass(frozen=True)
 class Packing:
-    """The coupling of a packing: entries of G off its unit diagonal, (m, K, B), at neighbours."""
+    """The coupling of a packing: entries of G off its unit diagonal, at neighbours of each row."""
 
-    entries: jax.Array
-    neighbours: Neighbours = dataclasses.field(metadata={"static": True})
+    entries: Float[Array, "m K B"]
+    neighbours: Neighbours
 
-    def dense(self, n: int) -> jax.Array:
-        """The matrix (n, n, B)."""
+    def dense(self, n: int) -> Float[Array, "n n B"]:
+        """The matrix G of n rows."""
         return written_out(self, n)
 
-    def times(self, f: jax.Array) -> jax.Array:
-        """`G f` (m, B)."""
+    def times(self, f: Float[Array, "m B"]) -> Float[Array, "m B"]:
+        """Products `G f`."""
         return f + neighbour_sum(self.entries, f, self.neighbours)
 
     def magnitude(self) -> "Packing":
@@ -221,52 +253,41 @@ Coupling = Chain | Dense | Packing
 
 
 class Frozen(NamedTuple):
-    """What of the field does not change while the modes last."""
+    """Factors of the normal field that do not change while the modes last."""
 
-    unit: jax.Array  # (1, B) time unit s*: the smallest s_j
-    ratio: jax.Array  # (m, B) s* / s_j
-    closing: jax.Array  # (m, B) x' / g
-    stiffness: jax.Array  # (m, B) force / x^eta
-    scale: jax.Array  # (m, B) s_j = gamma / g
+    unit: Float[Array, "1 B"]  # time unit s*: the smallest s_j
+    ratio: Float[Array, "m B"]  # s* / s_j
+    closing: Float[Array, "m B"]  # x' / g
+    stiffness: Float[Array, "m B"]  # force / x^eta
+    scale: Float[Array, "m B"]  # s_j = gamma / g
 
 
 class ContactStates(NamedTuple):
-    """Of a state F, x, p, gamma (m, B), lambda, its impulse, slip (t, B), rate of time (1, B)."""
+    """Forces and motion of the contacts in a state, dimensionless."""
 
-    force: jax.Array
-    indentation: jax.Array
-    impulse: jax.Array
-    gap_velocity: jax.Array
-    tangential_force: jax.Array
-    tangential_impulse: jax.Array
-    slip: jax.Array
-    rate: jax.Array
-
-
-COMPILED_IN = ("exponent_static", "gapped", "closed_form", "watches")  # fields that are no arrays
-
-
-def as_pytree(flow: type[T]) -> type[T]:
-    """A dataclass of arrays as a pytree; the fields COMPILED_IN belong to its structure."""
-    names = [field.name for field in dataclasses.fields(flow)]  # type: ignore[arg-type]
-    arrays = [name for name in names if name not in COMPILED_IN]
-    fixed = [name for name in names if name in COMPILED_IN]
-    return jax.tree_util.register_dataclass(flow, arrays, fixed)
+    force: Float[Array, "m B"]  # F
+    indentation: Float[Array, "m B"]  # x
+    impulse: Float[Array, "m B"]  # p
+    gap_velocity: Float[Array, "m B"]  # gamma
+    tangential_force: Float[Array, "t B"]  # lambda
+    tangential_impulse: Float[Array, "t B"]  # its integral
+    slip: Float[Array, "t B"]  # u
+    rate: Float[Array, "1 B"]  # of time, in the flow's own time
 
 
 @as_pytree
 @dataclasses.dataclass
 class ContactFlow(Flow):
-    """Contacts without friction."""
+    """The motion of m contacts without friction; see above for its state and its modes."""
 
     coupling: Coupling
-    omega: jax.Array  # (m, B)
-    restitution: jax.Array  # (m, B)
-    exponent_array: jax.Array | None  # (m, B)
-    tolerance: jax.Array  # (1, B)
-    taking_part: jax.Array  # (1, B) contacts that are not open for good
+    omega: Float[Array, "m B"]  # (m, B)
+    restitution: Float[Array, "m B"]  # (m, B)
+    exponent_array: Float[Array, "m B"] | None  # (m, B)
+    tolerance: Float[Array, "1 B"]  # (1, B)
+    taking_part: Float[Array, "1 B"]  # contacts that are not open for good
     viscous: Viscous | None = None
-    limit: jax.Array | None = None  # (m, B) indentation at which the force stays
+    limit: Float[Array, "m B"] | None = None  # indentation at which the force stays
     exponent_static: float | tuple[float, ...] | None = None
     gapped: bool = False
     closed_form: bool = True  # an impact may end by the energy of contacts that work alone
@@ -278,7 +299,7 @@ class ContactFlow(Flow):
 
     @property
     def exponent(self) -> Exponent:
-        """Exponents of the contacts: compiled in, or an array (m, B)."""
+        """Exponents of the contacts: compiled in, or an array."""
         static = self.exponent_static
         return static if static is not None else self.exponent_array  # type: ignore[return-value]
 
@@ -288,33 +309,37 @@ class ContactFlow(Flow):
         return self.omega.shape[0]
 
     @property
-    def zero_margin(self) -> jax.Array:
-        """Margins (1, B) below this are 0."""
+    def zero_margin(self) -> Float[Array, "1 B"]:
+        """Margins below this are 0."""
         return SNAP * self.tolerance
 
     @property
     def slackens(self) -> bool:
-        """Whether a contact may lose its force before its indentation."""
+        """True if a contact may lose its force before its indentation."""
         return self.viscous is not None and self.viscous.model.slackens
 
     # ---- the state
 
     @property
     def driving(self) -> tuple[int, ...]:
-        """Blocks of rows that the field depends on."""
+        """Sizes of the blocks of rows that the field depends on: x and g."""
         return self.contacts, self.contacts
 
     @property
     def adding(self) -> tuple[int, ...]:
-        """Blocks of rows, behind those, that only add up."""
+        """Sizes of the blocks of rows that only add up: p, the watching row, time."""
         return (self.contacts, 1, 1) if self.watches else (self.contacts, 1)
 
-    def rows(self, y: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """x, g and p."""
+    def rows(
+        self, y: Float[Array, "driving B"]
+    ) -> tuple[Float[Array, "m B"], Float[Array, "m B"], Float[Array, "_ B"]]:
+        """Rows of a state: indentations x, g = gamma / s, impulses p (none within a step)."""
         m = self.contacts
         return y[:m], y[m : 2 * m], y[2 * m : 3 * m]
 
-    def start(self, gamma: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def start(
+        self, gamma: Float[Array, "m B"], x: Float[Array, "m B"]
+    ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
         """Modes and state before the impact; a touching contact at rest starts in compression."""
         phase = jnp.where((gamma <= 0) | (x > 0), Phase.COMPRESSION, Phase.OPEN)
         phase = jnp.where(x < 0, Phase.OPEN, phase)
@@ -330,20 +355,20 @@ class ContactFlow(Flow):
         watched = [last] if self.watches else []
         return modes, jnp.concatenate([x, g, jnp.zeros_like(g), *watched, last])
 
-    def scales(self, modes: jax.Array) -> jax.Array:
-        """s_j = gamma_j / g_j (m, B)."""
+    def scales(self, modes: Int[Array, "modes B"]) -> Float[Array, "m B"]:
+        """`s_j = gamma_j / g_j`: e_j in expansion, otherwise 1."""
         return jnp.where(modes[: self.contacts] == Phase.EXPANSION, self.restitution, 1.0)
 
     # ---- the protocol
 
-    def constants(self, modes: jax.Array) -> Any:
-        """What the field needs of the modes; without friction the normal factors alone."""
+    def constants(self, modes: Int[Array, "modes B"]) -> Any:
+        """Constants of the field in these modes; without friction its normal factors alone."""
         return self.normal_constants(modes)
 
-    def normal_constants(self, modes: jax.Array) -> Frozen:
+    def normal_constants(self, modes: Int[Array, "modes B"]) -> Frozen:
         """Factors of the normal field in the phases of the contacts."""
         phase, s = modes[: self.contacts], self.scales(modes)
-        # the least one makes e = 0 regular; of several one of them, whole: min() would share its
+        # the least s makes e = 0 regular; of several equal ones, one: min() would share its
         # derivative among them
         least = (
             functools.reduce(
@@ -361,14 +386,21 @@ class ContactFlow(Flow):
         stiffness = (per_row(self.exponent, self.omega) + 1) / 2 * self.omega
         return Frozen(least, ratio, closing, jnp.where(loaded, stiffness, 0.0), s)
 
-    def force(self, const: Frozen, x: jax.Array, g: jax.Array) -> jax.Array:
-        """Normal force: p' = unit * force with respect to time in units of `s*`."""
+    def force(
+        self, const: Frozen, x: Float[Array, "m B"], g: Float[Array, "m B"]
+    ) -> Float[Array, "m B"]:
+        """Normal forces `F = stiffness x^eta`; p' = unit F by the time in units of `s*`."""
         if self.viscous is None:
             return const.stiffness * power(x, self.exponent)
         return jnp.where(const.stiffness > 0, self.viscous.push(x, g), 0.0)
 
-    def field(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
-        """Rates of x, g, p and time."""
+    def field(
+        self, const: Any, modes: Int[Array, "modes B"], y: Float[Array, "driving B"]
+    ) -> Float[Array, "n B"]:
+        """Rates `x' = closing g`, `g' = ratio G F`, `p' = unit F` and of time, `unit`.
+
+        The watching row before the time has the rate `unit sum_j F_j log x_j`.
+        """
         x, g, _ = self.rows(y)
         f = self.force(const, x, g)
         dg = const.ratio * self.coupling.times(f)
@@ -378,18 +410,33 @@ class ContactFlow(Flow):
             watched = [jax.lax.stop_gradient(const.unit * total(slope))]
         return jnp.concatenate([const.closing * g, dg, const.unit * f, *watched, const.unit])
 
-    def allowance(self, modes: jax.Array, y: jax.Array) -> jax.Array | float:
-        """More in the row that only watches."""
+    def allowance(
+        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]
+    ) -> Float[Array, "n #B"] | float:
+        """Allowed error of each row, in tolerances: more in the row that only watches."""
         if not self.watches:
             return 1.0
         return jnp.ones_like(y[:, :1]).at[-2].set(WATCHED)
 
-    def margins(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
-        """What stays positive until a contact changes its mode; without friction its phase."""
+    def margins(
+        self, const: Any, modes: Int[Array, "modes B"], y: Float[Array, "driving B"]
+    ) -> Float[Array, "k B"]:
+        """Margins that are >= 0 until a contact changes its mode; without friction its phase."""
         return self.normal_margins(const, modes, y)
 
-    def normal_margins(self, const: Frozen, modes: jax.Array, y: jax.Array) -> jax.Array:
-        """By indentation (an opening, a gap that closes, the onset of a force), by velocity."""
+    def normal_margins(
+        self, const: Frozen, modes: Int[Array, "modes B"], y: Float[Array, "driving B"]
+    ) -> Float[Array, "k B"]:
+        """Margins that are >= 0 while a contact keeps its phase: m by indentation, m by velocity.
+
+            phase         by indentation               by velocity
+            OPEN          1; with gaps -x              g + NEGLIGIBLE tolerance; with gaps 1
+            COMPRESSION   1; with a limit limit - x    -g
+            EXPANSION     x                            g
+            YIELD         1                            -g
+
+        Where forces slacken: the onset in COMPRESSION, minus the onset in SLACK; x in both.
+        """
         x, g, _ = self.rows(y)
         phase = modes[: self.contacts]
         by_x = jnp.where(phase == Phase.EXPANSION, x, 1.0)
@@ -410,23 +457,27 @@ class ContactFlow(Flow):
             by_g = jnp.where(compressed | slack, x, by_g)
         return jnp.concatenate([by_x, by_g])
 
-    def rooted(self, modes: jax.Array) -> jax.Array:
-        """Openings: x falls to 0 like the square of the time left."""
+    def rooted(self, modes: Int[Array, "modes B"]) -> Bool[Array, "k B"]:
+        """Mask of the margins that are openings: x falls to 0 like the square of the time left."""
         phase = modes[: self.contacts]
         opens = phase == Phase.EXPANSION
         by_g = (phase == Phase.COMPRESSION) & self.slackens
         return jnp.concatenate([opens, by_g])
 
     def switch(
-        self, modes: jax.Array, y: jax.Array, which: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """Modes and state after an event; without friction those of the normal motion."""
+        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"], which: Bool[Array, "k B"]
+    ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
+        """Modes and state after the events `which`; without friction those of the normal motion."""
         return self.normal_switch(modes, y, which)
 
     def normal_switch(
-        self, modes: jax.Array, y: jax.Array, which: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """Phases and closings after events by indentation and by velocity."""
+        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"], which: Bool[Array, "k B"]
+    ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
+        """Phases, closings, x and g after events: m by indentation, then m by velocity.
+
+        An event ends the phase whose margin it is: OPEN closes to COMPRESSION, which turns to
+        EXPANSION (or YIELD), which opens or is compressed again. See `normal_margins`.
+        """
         m = self.contacts
         phase, count = modes[:m], modes[m : 2 * m]
         x, g, _ = self.rows(y)
@@ -456,22 +507,29 @@ class ContactFlow(Flow):
         modes = jnp.concatenate([after, count, modes[2 * m :]]).astype(modes.dtype)
         return modes, jnp.concatenate([x, g, y[2 * m :]])
 
-    def _slackening(self, phase: jax.Array, by_x: jax.Array, by_g: jax.Array) -> jax.Array:
-        """Phases (m, B) after events where forces may vanish before the indentation."""
+    def _slackening(
+        self, phase: Int[Array, "m B"], by_x: Bool[Array, "m B"], by_g: Bool[Array, "m B"]
+    ) -> Int[Array, "m B"]:
+        """Phases after events where forces may vanish before the indentation."""
         after = jnp.where(by_x & (phase == Phase.COMPRESSION), Phase.SLACK, phase)
         free = (phase == Phase.SLACK) | (phase == Phase.OPEN)
         after = jnp.where(by_x & free, Phase.COMPRESSION, after)
         return jnp.where(by_g & ~(phase == Phase.OPEN), Phase.OPEN, after)
 
-    def begins(self, before: jax.Array, after: jax.Array) -> jax.Array:
-        """Behind a gap x sets in like t; without gaps like t^2, and forces are smooth enough."""
+    def begins(
+        self, before: Int[Array, "modes B"], after: Int[Array, "modes B"]
+    ) -> Bool[Array, "1 B"]:
+        """Mask: a contact has closed behind a gap, from where on x grows like t.
+
+        Without gaps x sets in like t^2, and forces are smooth enough.
+        """
         m = self.contacts
         if not self.gapped:
             return jnp.zeros((1, *before.shape[1:]), bool)
         return any_of(after[m : 2 * m] > before[m : 2 * m])
 
-    def coasts(self, modes: jax.Array) -> jax.Array | None:
-        """With gaps, while no contact is loaded."""
+    def coasts(self, modes: Int[Array, "modes B"]) -> Bool[Array, "1 B"] | None:
+        """Mask: there are gaps, and no contact is loaded."""
         if not self.gapped:
             return None
         phase = modes[: self.contacts]
@@ -479,44 +537,49 @@ class ContactFlow(Flow):
 
     # ---- results
 
-    def contact_states(self, modes: jax.Array, y: jax.Array) -> ContactStates:
+    def contact_states(self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]) -> ContactStates:
         """Forces, velocities and the rate of time in a state."""
         const, none = self.normal_constants(modes), y[:0]
         x, g, p = self.rows(y)
         force = self.force(const, x, g)
         return ContactStates(force, x, p, const.scale * g, none, none, none, const.unit)
 
-    def change(self, y: jax.Array) -> jax.Array:
-        """What the impulses of a state change of the gap velocities (m, B)."""
+    def change(self, y: Float[Array, "n B"]) -> Float[Array, "m B"]:
+        """Change `G p` of the gap velocities by the impulses of a state."""
         return self.coupling.times(self.rows(y)[2])
 
     # ---- the end
 
     @property
     def at_once(self) -> bool:
-        """Whether `finish` alone is the impact: one contact, with a closed form."""
+        """True if `finish` alone is the impact: one contact, with a closed form."""
         return self.closed_form and self.contacts == 1
 
     @property
     def self_similar(self) -> bool:
-        """Whether a state multiplied by s takes the same course: see `plastic_limit.py`."""
+        """True if a state multiplied by s takes the same course: see `plastic_limit.py`."""
         return not self.gapped and self.viscous is None
 
     @property
     def looks_ahead(self) -> bool:
-        """Whether the chain is so long that a look ahead decides whether it comes to rest."""
+        """True if the chain is so long that a look ahead decides whether it comes to rest."""
         return isinstance(self.coupling, Chain) and self.contacts > MANY and self.self_similar
 
-    def look_due(self, passes: jax.Array) -> jax.Array:
-        """Whether (1, B) passes per contact are LOOKS times 1, 2, 4, ..., and energy is lost."""
+    def look_due(self, passes: Float[Array, "1 B"]) -> Bool[Array, "1 B"]:
+        """Mask: passes per contact are LOOKS times 1, 2, 4, ..., and energy is lost."""
         each = LOOKS * self.contacts
         whole = passes.astype(jnp.int32)
         number = jax.lax.div(whole, jnp.full_like(whole, each))
         due = (whole == number * each) & (number > 0) & (number & (number - 1) == 0)
         return due & any_of(self.restitution < 1)
 
-    def pauses(self, before: jax.Array, after: jax.Array, passes: jax.Array) -> jax.Array | None:
-        """Where the most closings of a contact become 8, 16, 32, ...: see `plastic_limit.py`."""
+    def pauses(
+        self,
+        before: Int[Array, "modes B"],
+        after: Int[Array, "modes B"],
+        passes: Float[Array, "1 B"],
+    ) -> Bool[Array, "1 B"] | None:
+        """Mask: the most closings of a contact become 8, 16, 32, ...: see `plastic_limit.py`."""
         if not self.self_similar:
             return None
         m = self.contacts
@@ -525,18 +588,22 @@ class ContactFlow(Flow):
         doubled = doubled & (passes > DRAGGING * m)
         return doubled | self.look_due(passes) if self.looks_ahead else doubled
 
-    def patience(self, passes: jax.Array) -> jax.Array:
-        """The tolerance (1, B), WIDENED once an impact drags on."""
+    def patience(self, passes: Float[Array, "1 B"]) -> Float[Array, "1 B"]:
+        """The tolerance, WIDENED once an impact drags on."""
         return jnp.where(passes > PATIENCE * self.taking_part, WIDENED, 1.0) * self.tolerance
 
-    def energy(self, x: jax.Array, g: jax.Array) -> jax.Array:
-        """Twice the energy of each contact by itself."""
+    def energy(self, x: Float[Array, "m B"], g: Float[Array, "m B"]) -> Float[Array, "m B"]:
+        """Twice the energy of each contact by itself, `x^(eta + 1) + g^2`."""
         return power(x, plus_one(self.exponent)) + g * g
 
     def at_work(
-        self, modes: jax.Array, y: jax.Array, tolerance: jax.Array
-    ) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Contacts loaded or approaching by more than the tolerance, gamma, gamma once alone."""
+        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"], tolerance: Float[Array, "1 B"]
+    ) -> tuple[Bool[Array, "m B"], Float[Array, "m B"], Float[Array, "m B"]]:
+        """Mask of contacts at work, gamma, and the gamma that each would have at its end, alone.
+
+        At work: loaded or approaching, with `x^(eta + 1) + g^2 > tolerance^2`; alone it ends with
+        e times the root of that.
+        """
         x, g, _ = self.rows(y)
         phase = modes[: self.contacts]
         gamma = self.scales(modes) * g
@@ -549,20 +616,27 @@ class ContactFlow(Flow):
         rebound = self.restitution * jnp.sqrt(jnp.where(works, energy, 1.0))
         return works, gamma, jnp.where(works, rebound, gamma)
 
-    def over(self, modes: jax.Array, y: jax.Array, passes: jax.Array) -> jax.Array:
-        """Whether loaded contacts act on no others: the rest then follows from the energy."""
+    def over(
+        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"], passes: Float[Array, "1 B"]
+    ) -> Bool[Array, "1 B"]:
+        """Mask: loaded contacts act on no others, so that the rest follows from their energies.
+
+        With changes d of gamma in contacts that end alone, others keep `gamma + min(G, 0) d >= 0`.
+        """
         tolerance = self.patience(passes)
         works, gamma, rebound = self.at_work(modes, y, tolerance)
         if not self.closed_form:
             return ~any_of(works)
-        # |G| and min(G, 0), both with a unit diagonal
+        # |G| and min(G, 0), both with a unit diagonal: less the contact itself
         load = works.astype(y.dtype)
-        felt = self.coupling.magnitude().times(load) - load > 0
+        coupled = self.coupling.magnitude().times(load) - load > 0  # to another one at work
         change = rebound - gamma
-        left = gamma + self.coupling.pull().times(change) - change
-        return ~any_of(jnp.where(works, felt, left < -tolerance))
+        least = gamma + self.coupling.pull().times(change) - change  # gamma+ of the others
+        return ~any_of(jnp.where(works, coupled, least < -tolerance))
 
-    def finish(self, modes: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def finish(
+        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]
+    ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
         """All contacts open; where a closed form ends the impact, its impulses are added."""
         m = self.contacts
         x, _, p = self.rows(y)

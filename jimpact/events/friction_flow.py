@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from jimpact.events.contact_flow import (
     SNAP,
@@ -61,56 +62,56 @@ def ridge(dtype: Any) -> float:
 
 
 class FrictionConstants(NamedTuple):
-    """What of the field does not change while the modes last."""
+    """Factors of the field that do not change while the modes last."""
 
     frozen: Frozen
-    stick: jax.Array  # (m, B)
-    drag: jax.Array  # lambda / F of those that slide (m, B)
-    pull: jax.Array  # u' = pull F without sticking forces (m, m, B)
-    tangent: jax.Array  # K_tt of those that stick (m, m, B)
-    ridge: jax.Array  # added to the diagonal of K_tt (m, B)
+    stick: Bool[Array, "m B"]  # (m, B)
+    drag: Float[Array, "m B"]  # lambda / F of those that slide
+    pull: Float[Array, "m m B"]  # u' = pull F without sticking forces
+    tangent: Float[Array, "m m B"]  # K_tt of those that stick
+    ridge: Float[Array, "m B"]  # added to the diagonal of K_tt
 
 
 class FrictionForces(NamedTuple):
-    """Forces, rates of slip and margins of sticking, (m, B) each."""
+    """Forces, rates of slip and margins of sticking."""
 
-    normal: jax.Array  # F
-    side: jax.Array  # lambda
-    rate: jax.Array  # u'
-    room: jax.Array  # inside the cone of those that stick: 1: no tangential force, 0: on the cone
+    normal: Float[Array, "m B"]  # F
+    side: Float[Array, "m B"]  # lambda
+    rate: Float[Array, "m B"]  # u'
+    room: Float[Array, "m B"]  # in the cone, of those that stick: 0 on it, 1 without lambda
 
 
 @as_pytree
 @dataclasses.dataclass(kw_only=True)
 class FrictionFlow(ContactFlow):
-    """Contacts with planar friction."""
+    """The motion of m contacts with planar friction, t = m."""
 
-    normal_tangent: jax.Array  # K_nt (m, m, B)
-    tangent: jax.Array  # K_tt (m, m, B)
-    friction: jax.Array  # mu (m, B)
+    normal_tangent: Float[Array, "m t B"]  # K_nt
+    tangent: Float[Array, "t t B"]  # K_tt
+    friction: Float[Array, "m B"]  # mu
 
     # ---- the state: x, g, p, slip u, its impulse, time
 
     @property
     def driving(self) -> tuple[int, ...]:
-        """x, g, p and slip."""
+        """Sizes of the blocks x, g, p and slip."""
         m = self.contacts
         return m, m, m, self.normal_tangent.shape[1]
 
     @property
     def adding(self) -> tuple[int, ...]:
-        """The tangential impulse and time."""
+        """Sizes of the blocks of the tangential impulse and of time."""
         return self.normal_tangent.shape[1], 1
 
-    def slip(self, y: jax.Array) -> jax.Array:
-        """Slip u (m, B) of a state."""
+    def slip(self, y: Float[Array, "driving B"]) -> Float[Array, "m B"]:
+        """Slip u of a state."""
         m = self.contacts
         return y[3 * m : 4 * m]
 
     def start_with(
-        self, gamma: jax.Array, x: jax.Array, u: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """Modes and state before the impact."""
+        self, gamma: Float[Array, "m B"], x: Float[Array, "m B"], u: Float[Array, "t B"]
+    ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
+        """Modes and state before the impact, from gamma, indentations x and slip u."""
         m = self.contacts
         modes, y = self.start(gamma, x)
         modes = jnp.concatenate([modes, jnp.sign(u).astype(jnp.int32)])
@@ -120,22 +121,25 @@ class FrictionFlow(ContactFlow):
 
     # ---- the protocol
 
-    def allowance(self, modes: jax.Array, y: jax.Array) -> jax.Array | float:
-        """How contacts share tangential forces is accurate to rounding / weight (`ridge`).
+    def allowance(
+        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]
+    ) -> Float[Array, "n #B"] | float:
+        """Allowed error of each row, in tolerances: more of p_t, rounding / weight (`ridge`).
 
-        The sharing changes no velocity, and all else of lambda is linear in F while the modes last.
+        The sharing of tangential forces is no more accurate. It changes no velocity, and all else
+        of lambda is linear in F while the modes last.
         """
         m = self.contacts
         shares = (np.arange(len(y)) // m == 4)[:, None]
         return jnp.where(shares, jnp.maximum(ridge(y.dtype) / self.tolerance, 1.0), 1.0)
 
-    def loaded(self, modes: jax.Array) -> jax.Array:
-        """Contacts (m, B) in compression or expansion."""
+    def loaded(self, modes: Int[Array, "modes B"]) -> Bool[Array, "m B"]:
+        """Mask of the contacts in compression or expansion."""
         phase = modes[: self.contacts]
         return (phase == Phase.COMPRESSION) | (phase == Phase.EXPANSION)
 
-    def constants(self, modes: jax.Array) -> Any:
-        """Those of the normal flow, and which contacts stick or slide."""
+    def constants(self, modes: Int[Array, "modes B"]) -> Any:
+        """Factors of the normal field and of friction: who sticks, lambda / F of the others."""
         m = self.contacts
         slip = modes[2 * m :]
         stick = (slip == 0) & self.loaded(modes)
@@ -150,8 +154,12 @@ class FrictionFlow(ContactFlow):
             ridge=jnp.where(stick, ridge(k.dtype), 1.0),
         )
 
-    def forces(self, const: FrictionConstants, y: jax.Array) -> FrictionForces:
-        """The forces in a state."""
+    def forces(self, const: FrictionConstants, y: Float[Array, "driving B"]) -> FrictionForces:
+        """Forces F and lambda in a state, rates u' of slip, and margins of sticking.
+
+        Sliding: `lambda = drag F`; sticking: `K_tt lambda = -pull F` for them, shared in proportion
+        to mu F where K_tt is singular.
+        """
         x, g, _ = self.rows(y)
         f = self.force(const.frozen, x, g)
         most, pull = self.friction * f, times(const.pull, f)
@@ -166,8 +174,10 @@ class FrictionFlow(ContactFlow):
         rate = jnp.where(const.stick, 0.0, pull + times(self.tangent, hold))
         return FrictionForces(f, const.drag * f + hold, rate, room)
 
-    def field(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
-        """Rates of x, g, p, slip, its impulse and time."""
+    def field(
+        self, const: Any, modes: Int[Array, "modes B"], y: Float[Array, "driving B"]
+    ) -> Float[Array, "n B"]:
+        """Rates of x, g, p, slip, its impulse and time: `g' = ratio (G F + K_nt lambda)`."""
         frozen, forces = const.frozen, self.forces(const, y)
         pull = self.coupling.times(forces.normal) + times(self.normal_tangent, forces.side)
         return jnp.concatenate(
@@ -181,8 +191,10 @@ class FrictionFlow(ContactFlow):
             ]
         )
 
-    def margins(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
-        """Those of the normal flow, speeds of slip, distances to the friction cones."""
+    def margins(
+        self, const: Any, modes: Int[Array, "modes B"], y: Float[Array, "driving B"]
+    ) -> Float[Array, "k B"]:
+        """Margins of the normal flow, speeds of slip, distances to the friction cones (m each)."""
         m = self.contacts
         slides = (modes[2 * m :] != 0) & self.loaded(modes)
         return jnp.concatenate(
@@ -193,15 +205,15 @@ class FrictionFlow(ContactFlow):
             ]
         )
 
-    def rooted(self, modes: jax.Array) -> jax.Array:
-        """As in the normal flow; margins of friction have no root."""
+    def rooted(self, modes: Int[Array, "modes B"]) -> Bool[Array, "k B"]:
+        """Mask of the openings, as in the normal flow; margins of friction have no root."""
         rooted = super().rooted(modes)
         return jnp.concatenate([rooted, jnp.zeros_like(rooted)])
 
     def switch(
-        self, modes: jax.Array, y: jax.Array, which: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """Modes after events: slip that stops and stick that breaks included."""
+        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"], which: Bool[Array, "k B"]
+    ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
+        """Modes and state after events: slip that stops and stick that breaks included."""
         m = self.contacts
         stopped, broke = which[2 * m : 3 * m], which[3 * m :]
         side = self.forces(self.constants(modes), y).side
@@ -212,9 +224,17 @@ class FrictionFlow(ContactFlow):
         return self.decided(after, y, stopped, closed)
 
     def decided(
-        self, modes: jax.Array, y: jax.Array, stopped: jax.Array, closed: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """Which contacts stick, and where the others slide to, after slip has stopped or begun."""
+        self,
+        modes: Int[Array, "modes B"],
+        y: Float[Array, "n B"],
+        stopped: Bool[Array, "m B"],
+        closed: Bool[Array, "m B"],
+    ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
+        """Modes and state once it is decided which contacts stick, and where others slide to.
+
+        This is asked anew where slip has `stopped`, or a contact has `closed` without slip: from
+        the forces of a moment later, by `distribute`.
+        """
         m = self.contacts
         u, slip, loaded = self.slip(y), modes[2 * m :], self.loaded(modes)
         rests = jnp.abs(u) <= SNAP * self.tolerance
@@ -225,6 +245,7 @@ class FrictionFlow(ContactFlow):
         constant, state = jax.lax.stop_gradient((self, y))
         f = constant.soon(modes, state)
         most = constant.friction * f
+        # b = u' by normal forces and by the friction of contacts that slide on
         slides = jnp.where(to_check | ~loaded, 0.0, -slip.astype(u.dtype) * most)
         b = times(jnp.swapaxes(constant.normal_tangent, 0, 1), f) + times(constant.tangent, slides)
         stick, towards = distribute(constant.tangent, b, most, to_check)
@@ -234,9 +255,13 @@ class FrictionFlow(ContactFlow):
         return jnp.concatenate([modes[: 2 * m], slip]), y
 
     def _at_rest(
-        self, modes: jax.Array, y: jax.Array, rests: jax.Array, most: jax.Array
-    ) -> jax.Array:
-        """The state with slips of 0 at contacts (m, B) that rest, those that stick by friction.
+        self,
+        modes: Int[Array, "modes B"],
+        y: Float[Array, "n B"],
+        rests: Bool[Array, "m B"],
+        most: Float[Array, "m B"],
+    ) -> Float[Array, "n B"]:
+        """The state with slips of 0 at contacts that rest; those with `most` = mu F > 0 stick.
 
         Slips are nothing there, but their tangents are not: those of a contact that sticks are
         taken by a tangential impulse, of one that begins to slide they remain.
@@ -251,20 +276,22 @@ class FrictionFlow(ContactFlow):
         u = jnp.where(rests, u - jax.lax.stop_gradient(u), u)
         return jnp.concatenate([x, g, p, u, y[4 * m : 5 * m] + side, y[5 * m :]])
 
-    def as_rows(self, modes: jax.Array, gamma: jax.Array) -> jax.Array:
-        """Changes of gap velocities (m, B) as those of the rows g; 0 where e = 0 scales them."""
+    def as_rows(
+        self, modes: Int[Array, "modes B"], gamma: Float[Array, "m B"]
+    ) -> Float[Array, "m B"]:
+        """Changes of the rows g = gamma / s from those of gamma; 0 where s = e = 0."""
         scale = self.scales(modes)
         return jnp.where(scale > 0, gamma / jnp.where(scale > 0, scale, 1.0), 0.0)
 
-    def soon(self, modes: jax.Array, y: jax.Array) -> jax.Array:
-        """Forces (m, B) a moment later, in parts of the largest."""
+    def soon(self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]) -> Float[Array, "m B"]:
+        """Normal forces a MOMENT later, in parts of the largest."""
         const = self.normal_constants(modes)
         x, g, _ = self.rows(y)
         f = self.force(const, jnp.maximum(x + MOMENT * const.closing * g, 0.0), g)
         top = jnp.max(f, axis=0, keepdims=True)
         return f / jnp.where(top > 0, top, 1.0)
 
-    def contact_states(self, modes: jax.Array, y: jax.Array) -> ContactStates:
+    def contact_states(self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]) -> ContactStates:
         """Forces, velocities and slip in a state."""
         m, side = self.contacts, self.forces(self.constants(modes), y).side
         return (
@@ -273,8 +300,8 @@ class FrictionFlow(ContactFlow):
             ._replace(tangential_force=side, tangential_impulse=y[4 * m : 5 * m], slip=self.slip(y))
         )
 
-    def change(self, y: jax.Array) -> jax.Array:
-        """What the impulses of a state change of the gap velocities, tangential ones, too."""
+    def change(self, y: Float[Array, "n B"]) -> Float[Array, "m B"]:
+        """Change `G p + K_nt p_t` of the gap velocities by the impulses of a state."""
         side = y[-1 - self.normal_tangent.shape[1] : -1]
         return super().change(y) + times(self.normal_tangent, side)
 
@@ -282,32 +309,42 @@ class FrictionFlow(ContactFlow):
 
     @property
     def self_similar(self) -> bool:
-        """Never, with friction."""
+        """False: with friction a multiple of a state takes another course."""
         return False
 
     @property
     def at_once(self) -> bool:
-        """Whether there is one contact, and it is planar."""
+        """True if there is one contact, and it is planar."""
         return super().at_once and self.normal_tangent.shape[1] == 1
 
-    def over(self, modes: jax.Array, y: jax.Array, passes: jax.Array) -> jax.Array:
-        """Whether no contact is loaded or approaches."""
+    def over(
+        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"], passes: Float[Array, "1 B"]
+    ) -> Bool[Array, "1 B"]:
+        """Mask: no contact is loaded or approaches."""
         works, *_ = self.at_work(modes, y, LEFT * self.patience(passes))
         return ~any_of(works)
 
-    def finish(self, modes: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Indentations set to 0, after the impulses of a single contact."""
+    def finish(
+        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]
+    ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
+        """Modes and state with indentations of 0, after the impulses of a single contact."""
         if self.at_once:
             return modes, self._after_one(modes, y)
         m = self.contacts
         x = jnp.zeros_like(y[:m])
         return modes, jnp.concatenate([x, y[m:]])
 
-    def _after_one(self, modes: jax.Array, y: jax.Array) -> jax.Array:
-        """The state (n, B) after a single contact."""
+    def _after_one(
+        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]
+    ) -> Float[Array, "n B"]:
+        """The state after the impact of a single contact, in closed form.
+
+        With its normal impulse p gamma grows at the rate `1 + K_nt r`, u at `K_nt + K_tt r`, where
+        r = lambda / F: `drag` until slip stops, from then on `hold`, -K_nt / K_tt within the cone.
+        """
         works, gamma, _ = self.at_work(modes, y, LEFT * self.tolerance)
         (x, _, p), u, slip = self.rows(y), self.slip(y), modes[2:]
-        across, own, mu = self.normal_tangent[0], self.tangent[0], self.friction
+        across, own, mu = self.normal_tangent[0], self.tangent[0], self.friction  # K_nt, K_tt, mu
         drag = -slip.astype(u.dtype) * mu
         movable = own > 0
         hold = jnp.where(movable, -across / jnp.where(movable, own, 1.0), 0.0)
@@ -330,17 +367,19 @@ class FrictionFlow(ContactFlow):
 
 
 class SingleContact(NamedTuple):
-    """A contact on its way, and the impulses that it has carried, (1, B) each."""
+    """A single contact during its impact, and the normal impulses that it has carried."""
 
-    gap_velocity: jax.Array
-    energy: jax.Array  # twice what is stored; 0: it is unloaded
-    left: jax.Array  # impulse until slip stops
-    sliding: jax.Array  # impulse until then
-    holding: jax.Array  # impulse since then
+    gap_velocity: Float[Array, "1 B"]
+    energy: Float[Array, "1 B"]  # twice what is stored; 0: it is unloaded
+    left: Float[Array, "1 B"]  # impulse until slip stops
+    sliding: Float[Array, "1 B"]  # impulse until then
+    holding: Float[Array, "1 B"]  # impulse since then
 
 
 def _next_piece(
-    s: SingleContact, slopes: tuple[jax.Array, jax.Array], e: jax.Array
+    s: SingleContact,
+    slopes: tuple[Float[Array, "1 B"], Float[Array, "1 B"]],
+    e: Float[Array, "1 B"],
 ) -> SingleContact:
     """The contact after its slip stops, it turns, or is unloaded; as it is where it is unloaded.
 
@@ -349,12 +388,14 @@ def _next_piece(
     """
     gamma, energy, slides = s.gap_velocity, s.energy, s.left > 0
     slope, most = jnp.where(slides, *slopes), jnp.where(slides, s.left, jnp.inf)
-    closes = (gamma < 0) | ((gamma == 0) & (slope < 0))
+    closes = (gamma < 0) | ((gamma == 0) & (slope < 0))  # is compressed
     expands = ~closes & (energy > 0) & ((gamma > 0) | (slope > 0))
+    # gamma reaches 0, and: the expansion starts from gamma = 0
     turns, rising = closes & (slope > 0), expands & (gamma == 0)
     some, up = jnp.where(expands, energy, 1.0), jnp.where(turns | rising, slope, 1.0)
     square = jnp.where(expands & ~rising, gamma**2 + e**2 * slope * energy, 1.0)
     back = square <= 0  # gamma falls to 0 before the energy does
+    # unloaded at gamma = end = sqrt(square), after the impulse e^2 energy / (gamma + end);
     # from gamma = 0 the end is a multiple of e: regular at e = 0
     end = jnp.where(rising, e * jnp.sqrt(up * some), jnp.sqrt(jnp.where(back, 1.0, square)))
     whole = e**2 * some / jnp.where(expands & ~rising & ~back, gamma + end, 1.0)

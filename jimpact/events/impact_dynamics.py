@@ -12,6 +12,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
 
 from jimpact.core.contact import Contact
 from jimpact.events import implicit_steps
@@ -68,58 +69,57 @@ DENSE_CHAIN = 4  # contacts up to which a dense product is faster than shifts by
 
 
 class Problem(NamedTuple):
-    """What the dimensionless outcome depends on, arrays (m,) but `off_diagonal`."""
+    """Data of the dimensionless outcome, of one impact or of a batch in the last axis."""
 
-    off_diagonal: jax.Array  # of G, see `off_diagonal`
-    omega: jax.Array
-    restitution: jax.Array
-    exponent: jax.Array | None
-    gamma: jax.Array
-    energy: jax.Array  # x^(eta + 1) of contacts loaded beforehand
-    gap: jax.Array | None  # in units of the indentation
-    tolerance: jax.Array  # (1,)
-    taking_part: jax.Array  # (1,) contacts that are not open for good
-    step: jax.Array  # (1,) of the impulse form: the tolerance itself, whatever the stiffnesses
+    off_diagonal: Float[Array, "..."]  # of G, see `off_diagonal`
+    omega: Float[Array, "m *B"]
+    restitution: Float[Array, "m *B"]
+    exponent: Float[Array, "m *B"] | None
+    gamma: Float[Array, "m *B"]
+    energy: Float[Array, "m *B"]  # x^(eta + 1) of contacts loaded beforehand
+    gap: Float[Array, "m *B"] | None  # in units of the indentation
+    tolerance: Float[Array, "1 *B"]
+    taking_part: Float[Array, "1 *B"]  # contacts that are not open for good
+    step: Float[Array, "1 *B"]  # of the impulse form: the tolerance, whatever the stiffnesses
     viscous: Viscous | None = None
     tangential: "Tangential | None" = None
-    limit: jax.Array | None = None  # indentation at which the force stays
+    limit: Float[Array, "m *B"] | None = None  # indentation at which the force stays
 
 
 class Tangential(NamedTuple):
     """The tangential block with friction: normalized as the normal one."""
 
     block: TangentialBlock  # K_nt (m, t), K_tt (t, t), u- (t,)
-    friction: jax.Array  # mu (m,)
+    friction: Float[Array, "m *B"]  # mu
 
 
 class ImpactUnits(NamedTuple):
-    """Scales back to SI: Q [m/s sqrt(kg)], time [s], `sqrt(W_jj)`, x_ref [m], the error [m/s] that
-    `rtol` allows."""
+    """Scales from dimensionless numbers back to SI."""
 
-    velocity: jax.Array
-    time: jax.Array
-    root: jax.Array
-    indentation: jax.Array
-    error: jax.Array
+    velocity: Float[Array, ""]  # Q [m/s sqrt(kg)]
+    time: Float[Array, ""]  # T [s]
+    root: Float[Array, "m"]  # sqrt(W_jj) [1/sqrt(kg)]
+    indentation: Float[Array, "m"]  # x_ref [m]
+    error: Float[Array, ""]  # [m/s] that `rtol` allows
 
     @property
-    def momentum(self) -> jax.Array:
-        """Unit of the impulses (m,) [N s]."""
+    def momentum(self) -> Float[Array, "m"]:
+        """Unit `Q / sqrt(W_jj)` of the impulses [N s]."""
         return self.velocity / self.root
 
 
 def dimensionless(
     delassus: Symmetric,
-    gamma: jax.Array,
-    restitution: jax.Array,
-    stiffness: jax.Array,
+    gamma: Float[Array, "m"],
+    restitution: Float[Array, ""] | Float[Array, "m"],
+    stiffness: Float[Array, ""] | Float[Array, "m"],
     exponent: Exponent,
-    stored: jax.Array,
-    rtol: float,
-    gaps: jax.Array | None = None,
-    closed: jax.Array | None = None,
+    stored: Float[Array, "m"],
+    rtol: Float[Array, ""] | float,
+    gaps: Float[Array, "m"] | None = None,
+    closed: Bool[Array, "m"] | None = None,
 ) -> tuple[Problem, ImpactUnits]:
-    """The dimensionless problem and the units to return from it; `closed`: those that take part."""
+    """The dimensionless problem and its units; `stored` energies [J], `closed`: who takes part."""
     m, dtype = gamma.shape[0], gamma.dtype
     eta = jnp.broadcast_to(jnp.asarray(exponent, dtype), (m,))
     root = jnp.sqrt(diagonal(delassus))
@@ -156,15 +156,17 @@ def dimensionless(
     return problem, ImpactUnits(q, time, root, x_ref, jax.lax.stop_gradient(rtol * fastest))
 
 
-def tangential_of(contact: Contact, friction: jax.Array, units: ImpactUnits) -> Tangential:
-    """The tangential block of the contacts in the units of the normal one."""
+def tangential_of(
+    contact: Contact, friction: Float[Array, ""] | Float[Array, "m"], units: ImpactUnits
+) -> Tangential:
+    """The tangential block of the contacts in the units of the normal one, and mu."""
     assert contact.tangential_block is not None  # see `check_law`
     block = contact.tangential_block.scaled(units.root, units.velocity)
     return Tangential(block, friction * jnp.ones_like(units.root))
 
 
-def normal_coupling(problem: Problem, structure: Structure) -> jax.Array:
-    """G (m, m, B) from the entries that a problem holds."""
+def normal_coupling(problem: Problem, structure: Structure) -> Float[Array, "m m B"]:
+    """G with unit diagonal, from the entries above it: all, or G_j,j+1 of a chain."""
     m, (_, *batch) = problem.omega.shape[0], problem.omega.shape
     chain = structure == "chain"
     i, j = (jnp.arange(m - 1), jnp.arange(1, m)) if chain else jnp.triu_indices(m, 1)
@@ -181,8 +183,8 @@ def coupling_of(problem: Problem, structure: Structure) -> Coupling:
     return Dense(normal_coupling(problem, structure))
 
 
-def first_indentation(problem: Problem, exponent: Exponent | None) -> jax.Array:
-    """Indentations x (m, B) before the impact: of what is stored, otherwise minus the gap."""
+def first_indentation(problem: Problem, exponent: Exponent | None) -> Float[Array, "m *B"]:
+    """Indentations before the impact: `energy^(1 / (eta + 1))` if loaded, else minus the gap."""
     eta: Any = exponent if problem.exponent is None else problem.exponent
     loaded = problem.energy > 0
     energy = jnp.where(loaded, problem.energy, 1.0)
@@ -193,8 +195,8 @@ def first_indentation(problem: Problem, exponent: Exponent | None) -> jax.Array:
 
 def flow_of(
     problem: Problem, exponent: Exponent | None, structure: Structure, tighten: float = 1.0
-) -> tuple[ContactFlow, jax.Array, jax.Array]:
-    """The flow of a problem in columns (.., B), and its first modes and state."""
+) -> tuple[ContactFlow, Int[Array, "modes B"], Float[Array, "n B"]]:
+    """The flow of a problem with a batch in the last axis, its first modes and state."""
     m, viscous = problem.omega.shape[0], problem.viscous
     parts: dict[str, Any] = dict(
         coupling=coupling_of(problem, structure),
@@ -221,10 +223,10 @@ def flow_of(
 
 @dataclasses.dataclass(frozen=True)
 class ImpulseProgram:
-    """From the leaves of a `Problem` in columns to impulses (m, B), (t, B), time, status, passes.
+    """Outcomes from the leaves of a `Problem` with a batch in the last axis.
 
-    Of (1, B) is the time of the last event (of the end where `with_end_time`: no closed form ends
-    it), the status and the number of passes.
+    Results: p (m, B), p_t (t, B); the time of the last event (of the end where `with_end_time`: no
+    closed form ends it), the status and the number of passes (1, B).
     """
 
     tree: Any
@@ -237,7 +239,9 @@ class ImpulseProgram:
     checkpoints: bool = False  # its loops have the reverse mode, in the place of the forward mode
     queues: ClassVar[bool] = True  # its impacts need not wait for the slowest (`until_over`)
 
-    def flow(self, problem: Problem, tighten: float) -> tuple[ContactFlow, jax.Array, jax.Array]:
+    def flow(
+        self, problem: Problem, tighten: float
+    ) -> tuple[ContactFlow, Int[Array, "modes B"], Float[Array, "n B"]]:
         """The flow of a problem, its first modes and state."""
         flow, modes, y = flow_of(problem, self.exponent, self.structure, tighten)
         closed_form = flow.closed_form and not self.with_end_time
@@ -245,11 +249,11 @@ class ImpulseProgram:
 
     @property
     def takes_duals(self) -> bool:
-        """Whether its arguments may have tangents (see `tangents.py`)."""
+        """True if its arguments may have tangents (see `tangents.py`)."""
         return self.finely
 
     def results(self, *kinds: Kind) -> tuple[Kind, ...]:
-        """Of the results from leaves of these kinds."""
+        """Kinds of the results from leaves of these kinds."""
         normal = jax.tree.unflatten(self.tree, kinds).gamma
         one, code = normal._replace(shape=(1,)), Kind((1,), jnp.dtype(jnp.int32))
         return normal, normal._replace(shape=(self.tangents,)), one, code, code
@@ -280,14 +284,14 @@ class ImpulseProgram:
 
 @dataclasses.dataclass(frozen=True)
 class ImplicitProgram(ImpulseProgram):
-    """As `ImpulseProgram`, by steps without events."""
+    """Outcomes as those of `ImpulseProgram`, by steps without events."""
 
     def only_first(self, values: Arrays) -> Arrays:
-        """The values; a second derivative raises."""
+        """The values as they are; a second derivative raises."""
         return without_derivatives(values, NotImplementedError(NO_SECOND))
 
     def steps(self, problem: Problem) -> tuple[ImplicitSteps, implicit_steps.ImplicitState]:
-        """The contacts of a problem, and their state before the impact."""
+        """The contacts of a problem as `ImplicitSteps`, and their state before the impact."""
         coupling, m = coupling_of(problem, self.structure), problem.omega.shape[0]
         friction, velocity = jnp.zeros_like(problem.omega), problem.gamma
         sliding = None
@@ -324,15 +328,14 @@ class ImplicitProgram(ImpulseProgram):
         impulses = pushforward(lambda p: (p[:m], p[m:]), run.state.impulse)
         return *impulses, run.state.time, self.code(flow, run), run.passes
 
-    def code(self, flow: ImplicitSteps, run: implicit_steps.ImplicitRun) -> jax.Array:
-        """Status (1, B) of a run."""
+    def code(self, flow: ImplicitSteps, run: implicit_steps.ImplicitRun) -> Int[Array, "1 B"]:
+        """Status of a run: max_steps where it has not ended."""
         busy = value_of(flow).busy(value_of(run.state))
-        code = jnp.where(busy, CODE["max_steps"], CODE["ok"])
-        return code.astype(jnp.int32)
+        return jnp.where(busy, CODE["max_steps"], CODE["ok"]).astype(jnp.int32)
 
 
 def method_for(method: str, contact: Contact, friction: bool) -> str:
-    """What 'auto' stands for at these contacts; another method is itself."""
+    """The method; for 'auto' 'implicit' of several contacts with friction in space, else 'time'."""
     if method != "auto":
         return method
     in_space = friction and contact.tangents == 2
@@ -340,7 +343,7 @@ def method_for(method: str, contact: Contact, friction: bool) -> str:
 
 
 class Dynamics(NamedTuple):
-    """What a law with impact dynamics gives: its problem, the units, and what is compiled in."""
+    """Impact dynamics of a law: its problem, the units, and what is compiled in."""
 
     problem: Problem
     units: ImpactUnits
@@ -357,7 +360,7 @@ class Dynamics(NamedTuple):
 
     @property
     def tangents(self) -> int:
-        """Tangential rows t."""
+        """Number of tangential rows t."""
         return 0 if self.problem.tangential is None else self.problem.tangential.block.slip.shape[0]
 
     def columns(self) -> tuple[tuple[jax.Array, ...], Any]:
@@ -366,17 +369,16 @@ class Dynamics(NamedTuple):
         return tuple(x[..., None] for x in leaves), tree
 
     def program(self, with_end_time: bool = False) -> ImpulseProgram:
-        """From `columns` to impulses; `whole`: no closed form ends it."""
+        """The program from `columns` to impulses; `with_end_time`: no closed form ends it."""
         kind = ImplicitProgram if self.method == "implicit" else ImpulseProgram
-        tree = self.columns()[1]
-        parts = tree, self.static_exponent, self.structure, self.max_steps, self.tangents
-        return kind(*parts, with_end_time=with_end_time)
+        fixed = self.static_exponent, self.structure, self.max_steps, self.tangents
+        return kind(self.columns()[1], *fixed, with_end_time=with_end_time)
 
 
 def solve(
     dynamics: Dynamics, condition_check: Contact | None = None
-) -> tuple[jax.Array, jax.Array | None, jax.Array]:
-    """Impulses p (m,) and p_t (t,) [N s] (None without friction) and the status ().
+) -> tuple[Float[Array, "m"], Float[Array, "t"] | None, Int[Array, ""]]:
+    """Impulses p and p_t [N s] (None without friction) and the status.
 
     `condition_check`: the contacts, if a second run is to show whether the outcome is
     `ill_conditioned`. Differentiable in both modes; method 'time' in all orders.
@@ -400,22 +402,19 @@ def solve(
 
 def is_ill_conditioned(
     contact: Contact,
-    p: jax.Array,
-    tangential: jax.Array | None,
-    code: jax.Array,
-    error: jax.Array,
-) -> jax.Array:
-    """Whether two runs, the columns of (m, 2) and (t, 2), differ by more than ILL times `error`.
-
-    Also where the second one ends with a failure (`code` (2,)).
-    """
+    p: Float[Array, "m 2"],
+    tangential: Float[Array, "t 2"] | None,
+    code: Int[Array, "2"],
+    error: Float[Array, ""],
+) -> Bool[Array, ""]:
+    """True if velocities of two runs (columns) differ by over ILL `error`, or the second failed."""
     difference = None if tangential is None else tangential[:, 1] - tangential[:, 0]
     change = velocity_changes(contact, p[:, 1] - p[:, 0], difference)
     return ~(jnp.all(jnp.abs(change) <= ILL * error) & (code[1] <= CODE["plastic_limit"]))
 
 
 def perturbed(problem: Problem) -> Problem:
-    """The same at another tolerance, gamma- and omega changed in the last digits that can be held.
+    """The problem at another tolerance, gamma- and omega changed in the last digits.
 
     This shows how far errors grow also where rounding limits them, not the tolerance.
     """
@@ -432,8 +431,10 @@ def perturbed(problem: Problem) -> Problem:
     )
 
 
-def velocity_changes(contact: Contact, p: jax.Array, p_t: jax.Array | None) -> jax.Array:
-    """Changes (m,) or (m + t,) of gap velocities and slip [m/s] that impulses make."""
+def velocity_changes(
+    contact: Contact, p: Float[Array, "m"], p_t: Float[Array, "t"] | None
+) -> Float[Array, "n"]:
+    """Changes of gap velocities, `W p + W_nt p_t`, then of slip, `W_nt^T p + W_tt p_t` [m/s]."""
     if p_t is None:
         return contact.delassus @ p
     assert contact.tangential_block is not None

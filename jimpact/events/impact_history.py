@@ -1,4 +1,4 @@
-"""What a flow of contacts does over the time of an impact, sampled between its steps.
+"""Forces and motion of contacts over the time of an impact, sampled between the steps of a flow.
 
 A first run tells how long the impact takes. A second one keeps, for each sample, the state before
 the step that contains it; the sample is one more step from there.
@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from jimpact.events import implicit_steps
 from jimpact.events.contact_flow import ContactStates
@@ -27,17 +28,17 @@ def history_program(outcome: ImpulseProgram, samples: int) -> "HistoryProgram":
 
 
 class Seen(NamedTuple):
-    """What is kept of the steps: states (s, .., B), their step, largest forces (m, B)."""
+    """The step that contains each sample, as far as seen: state and modes before it, its clock."""
 
-    states: Any
-    modes: jax.Array
-    clock: jax.Array
-    force: jax.Array
+    states: Float[Array, "s n B"]
+    modes: Int[Array, "s modes B"]
+    clock: Float[Array, "s 4 B"]
+    force: Float[Array, "m B"]  # the largest so far
 
 
 @dataclasses.dataclass(frozen=True)
 class HistoryProgram:
-    """From the leaves of a `Problem` in columns to rows of samples (s, .., B) in time.
+    """Samples (s, .., B) in time, from the leaves of a `Problem` with a batch in the last axis.
 
     Results: the times (s, 1, B), twice the energy (s, m, B), the rows of `ContactStates`, the
     largest force of each contact (m, B), the status (1, B) as a floating-point number.
@@ -46,12 +47,12 @@ class HistoryProgram:
     outcome: ImpulseProgram  # `with_end_time`: no closed form ends it
     samples: int
 
-    def one_per_sample(self, x: jax.Array) -> jax.Array:
-        """x (k, B), once for each sample (s, k, B)."""
+    def one_per_sample(self, x: Shaped[Array, "rows B"]) -> Shaped[Array, "s rows B"]:
+        """x, once for each sample."""
         return jnp.broadcast_to(x, (self.samples, *x.shape))
 
-    def fractions(self, dtype: Any) -> jax.Array:
-        """Times of the samples (s,) over the duration, from 0 to 1."""
+    def fractions(self, dtype: Any) -> Float[Array, "s"]:
+        """Times of the samples over the duration, from 0 to 1."""
         return jnp.linspace(0.0, 1.0, self.samples, dtype=dtype)
 
     def __call__(self, *leaves: jax.Array) -> tuple[jax.Array, ...]:
@@ -63,8 +64,8 @@ class HistoryProgram:
         duration = run(*constant, most, inspect, checkpoints).reached[-1:]
         t = self.fractions(y.dtype)[:, None, None] * jax.lax.stop_gradient(duration)[None]
 
-        def observe(seen: Seen, now: stepper.StepperState, accept: jax.Array) -> Seen:
-            """With this step where it may contain a sample."""
+        def observe(seen: Seen, now: stepper.StepperState, accept: Bool[Array, "1 B"]) -> Seen:
+            """The steps that may contain samples, this one included, and the largest forces."""
             force = flow.contact_states(now.step.modes, now.y).force
             may_hold_sample = accept[None] & (now.y[None, -1:] <= t)
             return Seen(
@@ -83,8 +84,8 @@ class HistoryProgram:
         last = flow.contact_states(end.carry.step.modes, end.reached).force
         no_target = jnp.zeros(end.carry.step.target.shape, bool)
 
-        def at(sample: Any) -> tuple[jax.Array, jax.Array, ContactStates]:
-            """A sample is one more step, in time, from the state before it."""
+        def at(sample: Any) -> tuple[Float[Array, "1 B"], Float[Array, "m B"], ContactStates]:
+            """Time, twice the energy and contact states of a sample, by one more step."""
             part, state, now, clock = sample
             rate = flow.contact_states(now, state).rate
             since = part * end.reached[-1:] - state[-1:]
@@ -106,7 +107,7 @@ class HistoryProgram:
 
 @dataclasses.dataclass(frozen=True)
 class ImplicitHistoryProgram(HistoryProgram):
-    """As `HistoryProgram`, of the steps of method 'implicit'.
+    """Samples as those of `HistoryProgram`, of the steps of method 'implicit'.
 
     Tangential forces are the means of the steps that the samples are in.
     """
@@ -127,12 +128,12 @@ class ImplicitHistoryProgram(HistoryProgram):
         # it only chooses the step of a sample; the time in the step is that of the second run
         t = self.fractions(duration.dtype)[:, None, None] * jax.lax.stop_gradient(duration)[None]
 
-        def force(s: ImplicitState) -> jax.Array:
-            """Normal forces (m, B)."""
+        def force(s: ImplicitState) -> Float[Array, "m B"]:
+            """Normal forces in a state."""
             return flow.force_of(s.indentation, s.velocity[:m])
 
-        def observe(seen: Any, before: ImplicitState, accept: jax.Array) -> Any:
-            """What is kept, with the state before an accepted step where a sample comes later."""
+        def observe(seen: Any, before: ImplicitState, accept: Bool[Array, "1 B"]) -> Any:
+            """The last state before each sample, and the largest forces, up to this step."""
             states, largest = seen
             earlier = accept[None] & (before.time[None] <= t)
             kept = jax.tree.map(lambda a, b: jnp.where(earlier, a[None], b), before, states)
@@ -142,8 +143,8 @@ class ImplicitHistoryProgram(HistoryProgram):
         run = implicit_steps.run(flow, start, most, checkpoints, observe, seen)
         states, largest = run.seen
 
-        def at(sample: Any) -> tuple[jax.Array, jax.Array, ContactStates]:
-            """A sample is one more step from the state before it."""
+        def at(sample: Any) -> tuple[Float[Array, "1 B"], Float[Array, "m B"], ContactStates]:
+            """Time, twice the energy and contact states of a sample, by one more step."""
             fraction, before = sample
             ahead = fraction * run.state.time - before.time
             s = implicit_steps.between(flow, before, ahead)

@@ -29,6 +29,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
 
 from jimpact.events.contact_flow import (
     Coupling,
@@ -75,36 +76,45 @@ STIFF = 0.5
 
 
 class ImplicitState(NamedTuple):
-    """x (m, B), w (n, B), impulses in unit time of the last step and in all (n, B), time (1, B)."""
+    """State of the contacts between two steps."""
 
-    indentation: jax.Array
-    velocity: jax.Array
-    rate: jax.Array
-    impulse: jax.Array
-    time: jax.Array
+    indentation: Float[Array, "m B"]  # x
+    velocity: Float[Array, "n B"]  # w = (gamma, u)
+    rate: Float[Array, "n B"]  # impulses of the last step, over its length
+    impulse: Float[Array, "n B"]  # of all steps so far
+    time: Float[Array, "1 B"]
 
 
 class Middle(NamedTuple):
-    """The contacts (m, B) in the middle of a step: x, normal impulse, and how fast it falls."""
+    """The contacts in the middle of a step."""
 
-    indentation: jax.Array
-    load: jax.Array
-    unloading: jax.Array
+    indentation: Float[Array, "m B"]  # x_half
+    load: Float[Array, "m B"]  # f, normal impulse of the step
+    unloading: Float[Array, "m B"]  # a: f falls by a gamma
+
+
+class StageImpulses(NamedTuple):
+    """Impulses of a step by its stages."""
+
+    impulse: Float[Array, "n B"]  # of the step
+    rate: Float[Array, "n B"]  # those of the last stage, over the length of the step
+    load: Float[Array, "m B"]  # f, before unloading
+    error: Float[Array, "1 B"]  # of the velocities that the solves leave
 
 
 @as_pytree
 @dataclasses.dataclass
 class ImplicitSteps:
-    """Contacts with or without friction, arrays with the batch last; n = m + t rows."""
+    """Contacts with or without friction and their steps; n = m + t rows."""
 
     coupling: Coupling  # K (n, n, B): G and the tangential block
-    omega: jax.Array  # (m, B)
-    restitution: jax.Array  # (m, B)
-    exponent_array: jax.Array | None  # (m, B)
-    friction: jax.Array  # (m, B)
-    descent: jax.Array  # (n, B), see `descent_lengths`
-    tolerance: jax.Array  # (1, B)
-    sliding: jax.Array | None = None  # (n, B), the same where no normal impulse is unknown
+    omega: Float[Array, "m B"]  # (m, B)
+    restitution: Float[Array, "m B"]  # (m, B)
+    exponent_array: Float[Array, "m B"] | None  # (m, B)
+    friction: Float[Array, "m B"]  # (m, B)
+    descent: Float[Array, "n B"]  # see `descent_lengths`
+    tolerance: Float[Array, "1 B"]  # (1, B)
+    sliding: Float[Array, "n B"] | None = None  # the same where no normal impulse is unknown
     viscous: Viscous | None = None
     exponent_static: float | tuple[float, ...] | None = None
     gapped: bool = False
@@ -116,42 +126,42 @@ class ImplicitSteps:
 
     @property
     def exponent(self) -> Exponent:
-        """Exponents of the contacts: compiled in, or an array (m, B)."""
+        """Exponents of the contacts: compiled in, or an array."""
         static = self.exponent_static
         return static if static is not None else self.exponent_array  # type: ignore[return-value]
 
     @property
-    def eta(self) -> jax.Array:
-        """Exponents as rows that broadcast against (m, B)."""
+    def eta(self) -> Float[Array, "#m #B"]:
+        """Exponents as rows that broadcast against those of the contacts."""
         return per_row(self.exponent, self.omega)
 
     @property
-    def least(self) -> jax.Array:
-        """e (m, B), not below the least one."""
+    def least(self) -> Float[Array, "m B"]:
+        """Restitution e, not below LEAST_RESTITUTION tolerances."""
         return self.restitution + LEAST_RESTITUTION * jax.lax.stop_gradient(self.tolerance)
 
     @property
-    def force_scale(self) -> jax.Array:
-        """Force over x^eta (m, B)."""
+    def force_scale(self) -> Float[Array, "m B"]:
+        """Force over x^eta: `(eta + 1) / 2 omega`."""
         return (self.eta + 1) / 2 * self.omega
 
-    def start(self, x: jax.Array, velocity: jax.Array) -> ImplicitState:
-        """The state before the impact."""
+    def start(self, x: Float[Array, "m B"], velocity: Float[Array, "n B"]) -> ImplicitState:
+        """The state before the impact, from indentations and w = (gamma, u)."""
         none = jnp.zeros_like(velocity)
         return ImplicitState(x, velocity, none, none, jnp.zeros_like(self.tolerance))
 
-    def energy(self, x: jax.Array) -> jax.Array:
-        """Twice the stored energy (m, B)."""
+    def energy(self, x: Float[Array, "m B"]) -> Float[Array, "m B"]:
+        """Twice the stored energy, `x^(eta + 1)`."""
         return power(x, self.exponent) * jnp.where(x > 0, x, 0.0)
 
-    def busy(self, s: ImplicitState) -> jax.Array:
-        """Whether (1, B) the impact goes on: a contact is loaded, or approaches."""
+    def busy(self, s: ImplicitState) -> Bool[Array, "1 B"]:
+        """Mask of the impacts that go on: a contact is loaded, or approaches."""
         idle = NEGLIGIBLE * self.tolerance
         loaded = self.energy(s.indentation) > idle**2
         return jnp.any(loaded | (s.velocity[: self.contacts] < -idle), axis=0, keepdims=True)
 
     def coasted(self, s: ImplicitState) -> ImplicitState:
-        """The state when the next gap closes, if no contact is loaded."""
+        """The state when the next gap closes, x - omega gamma t = 0, if no contact is loaded."""
         x, gamma = s.indentation, s.velocity[: self.contacts]
         closes = (x < 0) & (gamma < 0)
         rate = self.omega * jnp.where(closes, gamma, -1.0)
@@ -163,22 +173,31 @@ class ImplicitSteps:
 
     # ---- one step
 
-    def force_of(self, x: jax.Array, gamma: jax.Array) -> jax.Array:
-        """Normal forces (m, B)."""
+    def force_of(self, x: Float[Array, "m B"], gamma: Float[Array, "m B"]) -> Float[Array, "m B"]:
+        """Normal forces `(eta + 1) / 2 omega x^eta`, or those of a viscous model."""
         if self.viscous is None:
             return self.force_scale * power(x, self.exponent)
         return jnp.where(x > 0, self.viscous.push(x, gamma), 0.0)
 
-    def unloading(self, x: jax.Array, h: jax.Array) -> jax.Array:
-        """By how much (m, B) a step's normal impulse falls with the velocity of separation."""
+    def unloading(self, x: Float[Array, "m B"], h: Float[Array, "1 B"]) -> Float[Array, "m B"]:
+        """Rate a at which a step's normal impulse falls with the velocity of separation.
+
+        Equation: `a = h^2 F'(x) omega / e^2`, as x falls by `h omega gamma / e^2` within the step.
+        """
         if self.viscous is not None:
             return jnp.zeros_like(x)
         some = x > precision(x.dtype).tiny ** 0.5  # the derivative divides by the square
         slope = self.eta * self.force_scale * power(x, self.exponent) / jnp.where(some, x, 1.0)
         return h**2 * slope * self.omega / self.least**2
 
-    def moved(self, x: jax.Array, gamma: jax.Array, h: jax.Array, stiff: jax.Array) -> jax.Array:
-        """Indentations (m, B) after the time h; those that expand implicitly (`stiff`) stay.
+    def moved(
+        self,
+        x: Float[Array, "m B"],
+        gamma: Float[Array, "m B"],
+        h: Float[Array, "1 B"],
+        stiff: Bool[Array, "m B"],
+    ) -> Float[Array, "m B"]:
+        """Indentations `x - h omega c gamma` after the time h; stiff ones that expand stay.
 
         A contact that opens within this time goes on as a gap: `e^2` as fast.
         """
@@ -191,18 +210,27 @@ class ImplicitSteps:
         return ahead if self.gapped else jnp.maximum(ahead, 0.0)
 
     def problem(
-        self, velocity: jax.Array, load: jax.Array, unloading: jax.Array, friction: jax.Array
+        self,
+        velocity: Float[Array, "n B"],
+        load: Float[Array, "m B"],
+        unloading: Float[Array, "m B"],
+        friction: Float[Array, "m B"],
     ) -> StepProblem:
-        """The convex problem of a stage."""
+        """The convex problem of a stage, with the lengths of descent that suit it."""
         descent = self.descent
         if self.sliding is not None:
             unloads = jnp.any(unloading > 0, axis=0, keepdims=True)
             descent = jnp.where(unloads, descent, self.sliding)
         return StepProblem(self.coupling, velocity, load, unloading, friction, descent)
 
-    def substep(self, s: ImplicitState, h: jax.Array) -> tuple[ImplicitState, jax.Array]:
-        """The state after h (1, B), and its errors (1, B) that halves may not show: what it loses
-        by opening within the step, what its impulses leave, and what they drop too early."""
+    def substep(
+        self, s: ImplicitState, h: Float[Array, "1 B"]
+    ) -> tuple[ImplicitState, Float[Array, "1 B"]]:
+        """The state after the time h, and its errors that halves of the step may not show.
+
+        These are the speed that a contact loses by opening within the step, errors of velocities
+        after the solves, and impulses that are dropped too early.
+        """
         m = self.contacts
         x, gamma = s.indentation, s.velocity[:m]
         stiff = jax.lax.stop_gradient(self.unloading(x, h)) > STIFF
@@ -210,10 +238,11 @@ class ImplicitSteps:
         load = h * self.force_of(half, gamma)
         unloading = jnp.where(stiff, self.unloading(half, h), 0.0)
         impulses = self.frictional_impulses if len(s.velocity) > m else self.normal_impulses
-        impulse, rate, load, left = impulses(s, h, Middle(half, load, unloading))
+        impulse, rate, load, error = impulses(s, h, Middle(half, load, unloading))
         velocity = s.velocity + self.coupling.times(impulse)
         normal, after = impulse[:m], velocity[:m]
 
+        # where unloading has reduced the impulse, x in the middle is that of the reduced force
         cut = stiff & (normal < load)
         middle = cond(
             jnp.any(cut),
@@ -225,17 +254,16 @@ class ImplicitSteps:
         opened = cut & (normal <= 0) & (after > 0)
         x = jnp.where(opened, -h / 2 * self.omega * after if self.gapped else 0.0, x)
         loss = self.lost(s.indentation, jnp.where(stiff, s.indentation, half), x, after)
-        loss = loss + left + self.dropped(load, opened, gamma, after)
+        loss = loss + error + self.dropped(load, opened, gamma, after)
         loss = loss + self.slackened(s.indentation, x, gamma, after, h)
         # no tangents: where nothing is stored, the slope of a root would be infinite
         loss = jax.lax.stop_gradient(loss)
         return ImplicitState(x, velocity, rate, s.impulse + impulse, s.time + h), loss
 
     def frictional_impulses(
-        self, s: ImplicitState, h: jax.Array, middle: Middle
-    ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-        """Impulses (n, B) of both stages, those in unit time of the last one, the load, and the
-        error (1, B) of the velocities that the two solves leave."""
+        self, s: ImplicitState, h: Float[Array, "1 B"], middle: Middle
+    ) -> StageImpulses:
+        """Impulses of a step with friction: y1 and y2 of both stages, see above."""
         m, inner = self.contacts, INNER * self.tolerance
         gamma = s.velocity[:m]
         half, load, unloading = middle
@@ -245,7 +273,7 @@ class ImplicitSteps:
         # first stage of friction; the normal rows are those at the end of the step
         ahead = jnp.concatenate([gamma, s.velocity[m:] / PART])
         stage = self.problem(ahead, load, unloading, self.friction)
-        first, left = solve(stage, self.guess(s.rate, load), inner)
+        first, error = solve(stage, self.guess(s.rate, load), inner)
         if self.viscous is not None:  # the force at the velocity in the middle of the step
             load = h * self.force_of(half, gamma + self.coupling.times(first)[:m] / 2)
         side = (1 - PART) * first[m:]
@@ -254,44 +282,49 @@ class ImplicitSteps:
         # second stage, in units in which both rows have the weight PART
         stage = self.problem(base / PART, load / PART, unloading, self.friction * PART)
         guess = jnp.concatenate([first[:m] / PART, first[m:]])
-        second, left_then = solve(stage, guess, inner)
+        second, second_error = solve(stage, guess, inner)
         normal = PART * second[:m]
         impulse = jnp.concatenate([normal, side + PART * second[m:]])
-        left = (1 - PART) * left + PART * left_then
-        return impulse, jnp.concatenate([normal, second[m:]]) / h, load, left
+        error = (1 - PART) * error + PART * second_error
+        return StageImpulses(impulse, jnp.concatenate([normal, second[m:]]) / h, load, error)
 
-    def guess(self, rate: jax.Array, load: jax.Array) -> jax.Array:
-        """Impulses (n, B): this load, and the parts of it that friction had in the last step."""
+    def guess(self, rate: Float[Array, "n B"], load: Float[Array, "m B"]) -> Float[Array, "n B"]:
+        """Impulses (f, y): this load, and the parts of it that friction had in the last step."""
         m = self.contacts
-        rows = len(rate) // m - 1
+        rows = len(rate) // m - 1  # tangents of a contact
         pressed = rate[:m] > 0
         carried = jnp.repeat(jnp.where(pressed, rate[:m], 1.0), rows, axis=0)
         loads = jnp.repeat(jnp.where(pressed, load, 0.0), rows, axis=0)
         return jnp.concatenate([load, rate[m:] / carried * loads])
 
     def normal_impulses(
-        self, s: ImplicitState, h: jax.Array, middle: Middle
-    ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-        """As `frictional_impulses`, without friction: the load, where nothing expands too fast."""
+        self, s: ImplicitState, h: Float[Array, "1 B"], middle: Middle
+    ) -> StageImpulses:
+        """Impulses of a step without friction: the load, where nothing expands too fast."""
         half, load, unloading = middle
         none = jnp.zeros_like(self.tolerance)
         if self.viscous is not None:  # never stiff; the force at the velocity in the middle
             load = h * self.force_of(half, s.velocity + self.coupling.times(load) / 2)
-            return load, load / h, load, none
+            return StageImpulses(load, load / h, load, none)
 
-        def cut() -> tuple[jax.Array, jax.Array]:
-            """What fast expansions leave of the load."""
+        def cut() -> tuple[Float[Array, "n B"], Float[Array, "1 B"]]:
+            """Impulses that fast expansions leave of the load, and their error."""
             problem = self.problem(s.velocity, load, unloading, self.friction)
             return solve(problem, h * s.rate, INNER * self.tolerance)
 
         some = jnp.any(unloading > 0)
-        normal, left = cond(some, cut, lambda: (load, none))
-        return normal, normal / h, load, left
+        normal, error = cond(some, cut, lambda: (load, none))
+        return StageImpulses(normal, normal / h, load, error)
 
     def turned(
-        self, x: jax.Array, half: jax.Array, before: jax.Array, after: jax.Array, h: jax.Array
-    ) -> jax.Array:
-        """What (m, B) the moment at which gamma changes its sign within a step adds to x.
+        self,
+        x: Float[Array, "m B"],
+        half: Float[Array, "m B"],
+        before: Float[Array, "m B"],
+        after: Float[Array, "m B"],
+        h: Float[Array, "1 B"],
+    ) -> Float[Array, "m B"]:
+        """Change of x by the moment at which gamma changes its sign within a step.
 
         With gamma linear in time, the integral of c gamma differs from h/2 (c gamma + c' gamma')
         by h/2 (c - c') |gamma gamma'| / (|gamma| + |gamma'|): compression and expansion; or, where
@@ -306,17 +339,23 @@ class ImplicitSteps:
         kink = jnp.where(loaded, 1 / square - 1, closes)
         return h / 2 * self.omega * kink * part
 
-    def indentation_of(self, impulse: jax.Array, h: jax.Array) -> jax.Array:
-        """Where (m, B) the force gives this normal impulse in h."""
+    def indentation_of(
+        self, impulse: Float[Array, "m B"], h: Float[Array, "1 B"]
+    ) -> Float[Array, "m B"]:
+        """Indentations whose force gives this normal impulse in the time h: `h F(x) = impulse`."""
         part = impulse / (h * self.force_scale)
         some = part > 0
         root = jnp.exp(jnp.log(jnp.where(some, part, 1.0)) / self.eta)
         return jnp.where(some, root, 0.0)
 
     def lost(
-        self, x_before: jax.Array, last: jax.Array, x: jax.Array, gamma: jax.Array
-    ) -> jax.Array:
-        """Speed over e (1, B) that contacts would still have gained from what they stored last.
+        self,
+        x_before: Float[Array, "m B"],
+        last: Float[Array, "m B"],
+        x: Float[Array, "m B"],
+        gamma: Float[Array, "m B"],
+    ) -> Float[Array, "1 B"]:
+        """Largest speed over e that contacts would still have gained from what they stored last.
 
         Not the speed itself: where others push a contact open, at e = 0, its expansion decides.
         """
@@ -330,9 +369,13 @@ class ImplicitSteps:
         return jnp.max(speed, axis=0, keepdims=True)
 
     def dropped(
-        self, load: jax.Array, opened: jax.Array, before: jax.Array, after: jax.Array
-    ) -> jax.Array:
-        """Impulse (1, B) until gamma is 0, where contacts have `opened` (m, B) from the beginning.
+        self,
+        load: Float[Array, "m B"],
+        opened: Bool[Array, "m B"],
+        before: Float[Array, "m B"],
+        after: Float[Array, "m B"],
+    ) -> Float[Array, "1 B"]:
+        """Largest impulse until gamma is 0 of contacts that have `opened` as the step begins.
 
         While they approach, their force still acts; others then push them open.
         """
@@ -341,9 +384,14 @@ class ImplicitSteps:
         return jnp.max(jnp.where(turns, part * load, 0.0), axis=0, keepdims=True)
 
     def slackened(
-        self, x_before: jax.Array, x: jax.Array, before: jax.Array, after: jax.Array, h: jax.Array
-    ) -> jax.Array:
-        """Impulse (1, B) of a damped force that ends, or sets in again, within the step.
+        self,
+        x_before: Float[Array, "m B"],
+        x: Float[Array, "m B"],
+        before: Float[Array, "m B"],
+        after: Float[Array, "m B"],
+        h: Float[Array, "1 B"],
+    ) -> Float[Array, "1 B"]:
+        """Largest impulse of a damped force that ends, or sets in again, within the step.
 
         It has a kink at x > 0, which the difference between one step and two halves may not show.
         """
@@ -353,21 +401,29 @@ class ImplicitSteps:
         turns = (x_before > 0) & (x > 0) & ((first > 0) != (last > 0))
         return jnp.max(jnp.where(turns, h / 2 * (first + last), 0.0), axis=0, keepdims=True)
 
-    def unseen(self, s: ImplicitState, end: ImplicitState, h: jax.Array) -> jax.Array:
-        """Part (1, B) of a force that sets in with a jump which a step may miss by its estimate."""
+    def unseen(
+        self, s: ImplicitState, end: ImplicitState, h: Float[Array, "1 B"]
+    ) -> Float[Array, "1 B"]:
+        """Largest part `h F / 2` of a force that begins with a jump: the estimate may miss it."""
         closes = (s.indentation <= 0) & (end.indentation > 0)
         force = self.force_of(end.indentation, end.velocity[: self.contacts])
         return jnp.max(jnp.where(closes, h * force / 2, 0.0), axis=0, keepdims=True)
 
-    def step(self, s: ImplicitState, h: jax.Array) -> tuple[ImplicitState, jax.Array]:
-        """The state after h (1, B), whole and in halves, and its error (1, B) in tolerances."""
+    def step(
+        self, s: ImplicitState, h: Float[Array, "1 B"]
+    ) -> tuple[ImplicitState, Float[Array, "1 B"]]:
+        """The state after the time h, whole and in halves, and its error in tolerances.
+
+        Equation: `end + (end - whole) / 3`, `end` after both halves; error `|end - whole| / 3`.
+        """
         lengths = jnp.stack([h, h / 2, h / 2])
         whole = jnp.asarray([True, False, False])
 
         def part(
-            carry: tuple[ImplicitState, ImplicitState], which: tuple[jax.Array, jax.Array]
+            carry: tuple[ImplicitState, ImplicitState],
+            which: tuple[Float[Array, "1 B"], Bool[Array, ""]],
         ) -> tuple[tuple[ImplicitState, ImplicitState], jax.Array]:
-            """The whole step first, then both halves from the same start."""
+            """States after the halves so far and after the whole step; the loss of a half."""
             at, big = carry
             length, is_whole = which
             after, loss = self.substep(at, length)
@@ -393,8 +449,8 @@ class ImplicitSteps:
         return new, (error + jnp.sum(losses, axis=0)) / allowed
 
 
-def descent_of(coupling: Coupling, contacts: int) -> jax.Array:
-    """Lengths (n, B) of descent of a coupling; see `descent_lengths`."""
+def descent_of(coupling: Coupling, contacts: int) -> Float[Array, "n B"]:
+    """Lengths of descent of a coupling; see `descent_lengths`."""
     if isinstance(coupling, Dense):
         return descent_lengths(coupling.matrix, contacts)
     batch = jax.tree.leaves(coupling)[0].shape[-1]
@@ -404,30 +460,30 @@ def descent_of(coupling: Coupling, contacts: int) -> jax.Array:
 
 
 class ImplicitRun(NamedTuple):
-    """An impact on its way: its state, the next step (1, B), attempts (1, B), what steps showed."""
+    """An impact on its way."""
 
     state: ImplicitState
-    length: jax.Array
-    passes: jax.Array
-    seen: Any
+    length: Float[Array, "1 B"]  # of the next step
+    passes: Int[Array, "1 B"]  # steps tried
+    seen: Any  # by `observe`, see `run`
 
-    def over(self, flow: ImplicitSteps, most: int) -> jax.Array:
-        """Whether (1, B) it has ended or is given up."""
+    def over(self, flow: ImplicitSteps, most: int) -> Bool[Array, "1 B"]:
+        """Mask of the impacts that have ended or are given up."""
         stalled = (self.length < SHORTEST) | (self.passes >= most)
         return stalled | ~flow.busy(value_of(self.state))
 
 
-def next_length(length: jax.Array, error: jax.Array) -> jax.Array:
-    """The length (1, B) of the step after one of this error (1, B), which falls with h^3."""
+def next_length(length: Float[Array, "1 B"], error: Float[Array, "1 B"]) -> Float[Array, "1 B"]:
+    """Length `SAFETY error^(-1/3) length` of the next step, as the error falls with h^3."""
     # 1e-12 keeps the root from 0, far beyond GROWTH
     factor = jnp.clip(SAFETY / jnp.cbrt(error + 1e-12), SHRINK, GROWTH)
     return jnp.where(error < jnp.inf, factor, SHRINK) * length
 
 
 def attempt(
-    flow: ImplicitSteps, state: ImplicitState, length: jax.Array, live: jax.Array
-) -> tuple[ImplicitState, jax.Array, jax.Array]:
-    """State, next length and acceptance (1, B) after one step tried in `live` (1, B) runs.
+    flow: ImplicitSteps, state: ImplicitState, length: Float[Array, "1 B"], live: Bool[Array, "1 B"]
+) -> tuple[ImplicitState, Float[Array, "1 B"], Bool[Array, "1 B"]]:
+    """State, next length and acceptance after one step tried in the runs `live`.
 
     `flow` and `state` may have tangents (`Dual`); the length of the step has none.
     """
@@ -452,7 +508,7 @@ def run(
     observe: Callable[[Any, ImplicitState, jax.Array], Any] | None = None,
     seen: Any = None,
 ) -> ImplicitRun:
-    """From the start to the end of the impact, in at most so many passes.
+    """The impact from its start to its end, in at most so many passes.
 
     `flow` and `start` may have tangents (`Dual`), which are carried along. With `checkpoints` the
     loop has a reverse mode, and no forward mode. `observe(seen, state, accepted)` follows the
@@ -462,12 +518,12 @@ def run(
     length = FIRST * jnp.ones_like(value_of(flow.tolerance))
     first = ImplicitRun(start, length, jnp.zeros(length.shape, jnp.int32), seen)
 
-    def goes_on(flow: ImplicitSteps, run: ImplicitRun) -> jax.Array:
-        """Which impacts (1, B) are not over."""
+    def goes_on(flow: ImplicitSteps, run: ImplicitRun) -> Bool[Array, "1 B"]:
+        """Mask of the impacts that are not over."""
         return ~run.over(value_of(flow), most)
 
     def attempt_all(flow: ImplicitSteps, run: ImplicitRun) -> ImplicitRun:
-        """One step tried in all impacts that go on."""
+        """The impacts after one step tried in all that go on."""
         live = goes_on(flow, run)
         state, length, accepted = attempt(flow, run.state, run.length, live)
         seen = run.seen if observe is None else observe(run.seen, run.state, accepted)
@@ -477,8 +533,8 @@ def run(
     return until_over(goes_on, attempt_all, flow, first, checkpoints, slots)
 
 
-def between(flow: ImplicitSteps, s: ImplicitState, ahead: jax.Array) -> ImplicitState:
-    """The state at `ahead` (1, B) after s, within the step that follows it."""
+def between(flow: ImplicitSteps, s: ImplicitState, ahead: Float[Array, "1 B"]) -> ImplicitState:
+    """The state at the time `ahead` after s, within the step that follows it."""
     coasted = flow.coasted(s)
     waits = ahead < coasted.time - s.time
     drifted = s.indentation - ahead * flow.omega * s.velocity[: flow.contacts]

@@ -1,4 +1,4 @@
-"""Whether the contacts of a long chain come to rest together: a look ahead.
+"""Do the contacts of a long chain come to rest together? A look ahead.
 
 A chain that loses much energy ends as a block. Waves run back and forth in it, each contact closes
 hundreds of times, and no state returns as a multiple of an earlier one. But momentum is conserved:
@@ -19,8 +19,8 @@ digits. Otherwise nothing is concluded, and the law's own steps go on.
 import dataclasses
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
 
 from jimpact.events.implicit_steps import (
     FIRST,
@@ -48,22 +48,30 @@ LONGEST = 1000
 
 
 class _Look(NamedTuple):
-    """A look on its way: the state, the next step (1, B), passes (1, B), whether all is clear."""
+    """A look ahead on its way."""
 
     state: ImplicitState
-    length: jax.Array
-    passes: jax.Array
-    clear: jax.Array
+    length: Float[Array, "1 B"]  # of the next step
+    passes: Int[Array, "1 B"]  # steps tried
+    clear: Bool[Array, "1 B"]  # dp_j - p_j was far enough from 0 in all states
 
 
 def comes_to_rest(
-    flow: Any, modes: jax.Array, y: jax.Array, block: jax.Array, dp: jax.Array, asked: jax.Array
-) -> jax.Array:
-    """Whether (1, B) the contacts of the `block` (m, B), which would have to carry dp (m, B), come
-    to rest, and no other one carries anything; only impacts `asked` (1, B) are looked at."""
+    flow: Any,
+    modes: Int[Array, "modes B"],
+    y: Float[Array, "n B"],
+    block: Bool[Array, "m B"],
+    dp: Float[Array, "m B"],
+    asked: Bool[Array, "1 B"],
+) -> Bool[Array, "1 B"]:
+    """Mask of the impacts whose contacts of the `block` come to rest, with the impulses dp.
+
+    No other contact then carries anything. Only the impacts `asked` are looked at.
+    """
     m = flow.contacts
     x, g, _ = flow.rows(y)
-    visible = flow.tolerance * jnp.maximum(flow.taking_part, 2) / 2  # see `dimensionless`
+    # error that the law's tolerance allows in the outcome, see `dimensionless`
+    visible = flow.tolerance * jnp.maximum(flow.taking_part, 2) / 2
     steps = ImplicitSteps(
         coupling=flow.coupling,
         omega=flow.omega,
@@ -75,27 +83,30 @@ def comes_to_rest(
         exponent_static=flow.exponent_static,
     )
 
-    def holds(s: ImplicitState) -> jax.Array:
-        """Approach or root of energy (m, B) of each contact."""
+    def holds(s: ImplicitState) -> Float[Array, "m B"]:
+        """Approach, or root of the stored energy if that is more, of each contact."""
         return jnp.maximum(jnp.sqrt(steps.energy(s.indentation)), -s.velocity)
 
-    def size(s: ImplicitState) -> jax.Array:
-        """The largest of them (1, B)."""
+    def size(s: ImplicitState) -> Float[Array, "1 B"]:
+        """Largest approach or root of the energy of all contacts."""
         return jnp.max(holds(s), axis=0, keepdims=True)
 
-    def goes_on(steps: ImplicitSteps, look: _Look) -> jax.Array:
-        """Which looks (1, B) are not over."""
+    def goes_on(steps: ImplicitSteps, look: _Look) -> Bool[Array, "1 B"]:
+        """Mask of the looks that are not over."""
         left = size(look.state) > LEFT * visible
         return asked & look.clear & left & (look.passes < LONGEST * m)
 
-    def is_clear(s: ImplicitState) -> jax.Array:
-        """Whether (1, B) no contact of the block is close to separating, and no other carries."""
+    def is_clear(s: ImplicitState) -> Bool[Array, "1 B"]:
+        """Mask: no contact of the block is close to separating, and no other one carries.
+
+        Close: `dp - p < MARGIN` times its approach or root of the energy.
+        """
         own = holds(s)
         close = (own > COMPARED * visible) & (dp - s.impulse < MARGIN * own)
         return ~any_of(jnp.where(block, close, s.impulse > flow.tolerance))
 
     def coarse_step(steps: ImplicitSteps, look: _Look) -> _Look:
-        """One step tried, with errors that are a part of what is left."""
+        """The look after one step tried, with errors that are a part COARSE of what is left."""
         live = goes_on(steps, look)
         coarse = dataclasses.replace(steps, tolerance=COARSE * size(look.state))
         state, length, _ = attempt(coarse, look.state, look.length, live)

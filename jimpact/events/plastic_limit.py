@@ -19,12 +19,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
 
 from jimpact.events.contact_flow import OFTEN, ContactFlow
 from jimpact.events.look_ahead import comes_to_rest
 from jimpact.events.run import Rest
 from jimpact.numerics import stepper
-from jimpact.numerics.sparse import conjugate_step
+from jimpact.numerics.sparse import Iterate, conjugate_step
 from jimpact.numerics.stepper import Mark, any_of, total
 from jimpact.numerics.tangents import value_of
 from jimpact.tools.loops import cond, fori_loop, scan
@@ -49,15 +50,15 @@ def _values(flow: Any, carry: stepper.StepperState) -> tuple[Any, stepper.Steppe
 
 def inspect(
     flow: Any,
-    gamma: jax.Array,
+    gamma: Float[Array, "m B"],
     carry: stepper.StepperState,
     rest: Rest,
-    which: jax.Array,
+    which: Bool[Array, "1 B"],
     at_end: bool,
 ) -> Rest:
-    """`rest` anew for impacts `which` (1, B) pause, or are over: see `run`.
+    """Contacts at rest in impacts `which` pause or, `at_end`, are over; else those of `rest`.
 
-    Of those that are over, where contacts that closed often hardly move.
+    Of impacts that are over, where contacts that closed often hardly move.
     """
     flow, values = _values(flow, carry)
     gamma, rest = jax.lax.stop_gradient((gamma, rest))
@@ -78,8 +79,8 @@ def inspect(
     )
 
 
-def at_rest(flow: ContactFlow, end: stepper.StepperState) -> jax.Array:
-    """Contacts (m, B) as good as at rest where some of them re-closed again and again."""
+def at_rest(flow: ContactFlow, end: stepper.StepperState) -> Bool[Array, "m B"]:
+    """Mask of contacts as good as at rest where some of them re-closed again and again."""
     m, modes = flow.contacts, end.step.modes
     gamma = flow.scales(modes) * flow.rows(end.y)[1]
     # no wider than what ended the impact: a ball of a long chain may be slower
@@ -88,65 +89,80 @@ def at_rest(flow: ContactFlow, end: stepper.StepperState) -> jax.Array:
 
 
 def contacts_at_rest(
-    flow: ContactFlow, gamma: jax.Array, carry: stepper.StepperState, last: Rest, resting: jax.Array
+    flow: ContactFlow,
+    gamma: Float[Array, "m B"],
+    carry: stepper.StepperState,
+    last: Rest,
+    resting: Bool[Array, "m B"],
 ) -> Rest:
-    """Which contacts are at rest at the end, or would come to rest after a pause.
+    """Contacts at rest at the end, or that would come to rest after a pause, and their impulses.
 
     Contacts at rest carry what keeps each of them from approaching: `0 <= dp _|_ gamma+ >= 0`, on
     the gamma+ that their impulses give: errors of many closings add up.
     """
     m, modes, state = flow.contacts, carry.step.modes, carry.y
-    count = modes[m : 2 * m]
+    count = modes[m : 2 * m]  # closings so far
     since = count - last.closings
     most, before = (jnp.max(x, axis=0, keepdims=True) for x in (count, last.closings))
     paused = (carry.mark == Mark.PAUSED) & (most > before) & (most >= OFTEN)
+    # closed since the last inspection at least half as often as any other contact
     often = paused & (2 * since >= jnp.max(since, axis=0, keepdims=True)) & (count > 0)
-    rest = resting | often
+    rest = resting | often  # contacts asked about
     now = gamma + flow.change(state)
 
     start = often | (rest & (now < 0))
     carries, dp = plastic_impulses(flow, rest, start, now)
 
-    # is it a multiple of the state at the last check?
+    # is (gamma, root of the energy, dp) a multiple of that at the last inspection?
     root = jnp.sqrt(flow.energy(state[:m], jnp.zeros_like(now)))
     rows = jnp.where(often, jnp.stack([now, root, dp]), 0.0)
     size, old = (jnp.max(jnp.abs(x), axis=1, keepdims=True) for x in (rows, last.rows))
     ratio = size[:1] / jnp.where(old[:1] > 0, old[:1], size[:1])
     returns = jnp.abs(rows - ratio * last.rows) <= SHAPE * (1 - ratio) * size
-    after = now + flow.coupling.times(dp)
+    after = now + flow.coupling.times(dp)  # gamma+
+    # the impact ends if its state returns, and all but those contacts have settled
     settled = ~flow.at_work(modes, state, flow.tolerance)[0] & (after >= -flow.tolerance)
     meets = jnp.where(often, carries, settled) & jnp.all(returns, axis=0)
     ends = paused & ~any_of(~meets) & any_of(often & (flow.restitution < 1))
     rest = resting | (often & ends)
     new = Rest(rest, rest & carries, rows.at[2].set(dp), count, ends)
-    fresh = paused | any_of(resting)
-    return jax.tree.map(lambda a, b: jnp.where(fresh, a, b), new, last)
+    inspected = paused | any_of(resting)
+    return jax.tree.map(lambda a, b: jnp.where(inspected, a, b), new, last)
 
 
 def block_at_rest(
-    flow: ContactFlow, gamma: jax.Array, carry: stepper.StepperState, rest: Rest, due: jax.Array
+    flow: ContactFlow,
+    gamma: Float[Array, "m B"],
+    carry: stepper.StepperState,
+    rest: Rest,
+    due: Bool[Array, "1 B"],
 ) -> Rest:
-    """As `rest`; but where a look ahead is `due` (1, B) and shows a block, its contacts."""
+    """`rest`, but the contacts of a block where a look ahead is `due` and shows its rest."""
     now = gamma + flow.change(carry.y)
     everywhere = jnp.ones_like(now, bool)
     block, dp = plastic_impulses(flow, everywhere, everywhere, now)
-    after = now + flow.coupling.times(dp)
-    right = ~any_of((jnp.where(block, dp, 0.0) < 0) | (after < -flow.tolerance))
-    ended = comes_to_rest(flow, carry.step.modes, carry.y, block, dp, due & right)
+    after = now + flow.coupling.times(dp)  # gamma+
+    admissible = ~any_of((jnp.where(block, dp, 0.0) < 0) | (after < -flow.tolerance))
+    ended = comes_to_rest(flow, carry.step.modes, carry.y, block, dp, due & admissible)
     new = Rest(block, block, rest.rows.at[2].set(dp), rest.closings, ended)
     return jax.tree.map(lambda a, b: jnp.where(ended, a, b), new, rest)
 
 
 def plastic_impulses(
-    flow: ContactFlow, allowed: jax.Array, start: jax.Array, now: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Which `allowed` contacts (m, B) carry, and the impulses with which `0 <= dp _|_ gamma+ >= 0`.
+    flow: ContactFlow,
+    allowed: Bool[Array, "m B"],
+    start: Bool[Array, "m B"],
+    now: Float[Array, "m B"],
+) -> tuple[Bool[Array, "m B"], Float[Array, "m B"]]:
+    """Mask of the `allowed` contacts that carry, and the impulses dp: `0 <= dp _|_ gamma+ >= 0`.
 
-    `start`: those that are taken to carry at first; `now` gamma (m, B).
+    `start`: those that are taken to carry at first; `now`: gamma.
     """
 
-    def choose(_: Any, both: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        """Those that would pull leave, those that still approach carry, too."""
+    def choose(
+        _: Any, both: tuple[Bool[Array, "m B"], Float[Array, "m B"]]
+    ) -> tuple[Bool[Array, "m B"], Float[Array, "m B"]]:
+        """Contacts that carry, less those that would pull, and those that still approach; dp."""
         carries, _ = both
         dp = impulse_of_rest(flow, carries, now)
         after = now + flow.coupling.times(dp)
@@ -156,9 +172,12 @@ def plastic_impulses(
 
 
 def final_impulses(
-    flow: ContactFlow, gamma: jax.Array, state: jax.Array, carries: jax.Array
-) -> jax.Array:
-    """p (m, B) after the last `state`, from gap velocities gamma (m, B) before the impact.
+    flow: ContactFlow,
+    gamma: Float[Array, "m B"],
+    state: Float[Array, "n B"],
+    carries: Bool[Array, "m B"],
+) -> Float[Array, "m B"]:
+    """p after the last `state`, from gap velocities gamma before the impact.
 
     Equation: `gamma_R + (W p)_R = 0` of the contacts R at rest, which `carries` marks, with the
     impulses of the others as they are. So p_R does not depend on the many closings before, whose
@@ -166,8 +185,8 @@ def final_impulses(
     """
     m, p = flow.contacts, flow.rows(state)[2]
 
-    def solved() -> jax.Array:
-        """Impulses where contacts rest."""
+    def solved() -> Float[Array, "m B"]:
+        """Impulses with which contacts R are at rest; those of the others."""
         others = state.at[2 * m : 3 * m].set(jnp.where(carries, 0.0, p))  # the rows of p
         at_rest = impulse_of_rest(flow, carries, gamma + flow.change(others))  # gamma + W p
         return jnp.where(carries, at_rest, p)
@@ -175,17 +194,19 @@ def final_impulses(
     return cond(jnp.any(carries), solved, lambda: p)
 
 
-def impulse_of_rest(flow: ContactFlow, carries: jax.Array, after: jax.Array) -> jax.Array:
-    """dp (m, B) of the contacts that carry, with which their gamma+ is 0: conjugate gradients."""
+def impulse_of_rest(
+    flow: ContactFlow, carries: Bool[Array, "m B"], after: Float[Array, "m B"]
+) -> Float[Array, "m B"]:
+    """dp of the contacts R that carry, with which gamma_R + (G dp)_R = 0: conjugate gradients."""
     right = jnp.where(carries, -after, 0.0)
 
-    def product(x: jax.Array) -> jax.Array:
-        """G x (m, B) in the contacts that carry."""
+    def product(x: Float[Array, "m B"]) -> Float[Array, "m B"]:
+        """G x in the contacts that carry, 0 elsewhere."""
         return jnp.where(carries, flow.coupling.times(x), 0.0)
 
-    def step(at: Any, _: None) -> tuple[Any, None]:
-        """One step of conjugate gradients in each impact."""
+    def step(at: Iterate, _: None) -> tuple[Iterate, None]:
+        """State after one step of conjugate gradients in each impact."""
         return conjugate_step(product, lambda x, y: total(x * y), at)[0], None
 
-    start = (jnp.zeros_like(right), right, right, total(right * right))
-    return scan(step, start, None, length=2 * right.shape[0])[0][0]
+    start = Iterate(jnp.zeros_like(right), right, right, total(right * right))
+    return scan(step, start, None, length=2 * right.shape[0])[0].x

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
 
 from jimpact.events.contact_flow import ContactFlow
 from jimpact.numerics import stepper
@@ -22,18 +23,18 @@ from jimpact.tools.status import CODE
 
 
 class Rest(NamedTuple):
-    """Which contacts (m, B) come to rest, and the state of the impact at its last inspection."""
+    """Contacts that come to rest, and the state of the impact at its last inspection."""
 
-    contacts: jax.Array  # whose closings have no end
-    carries: jax.Array  # those of them that carry an impulse
+    contacts: Bool[Array, "m B"]  # whose closings have no end
+    carries: Bool[Array, "m B"]  # those of them that carry an impulse
     # (3, m, B): gamma, root of the energy stored, impulse that takes what is left of the approach
-    rows: jax.Array
-    closings: jax.Array
-    ended: jax.Array  # (1, B): by a state that returned as a part of itself
+    rows: Float[Array, "3 m B"]
+    closings: Int[Array, "m B"]
+    ended: Bool[Array, "1 B"]  # by a state that returned as a part of itself
 
     @classmethod
-    def none(cls, gamma: jax.Array, modes: jax.Array) -> "Rest":
-        """Before the first inspection."""
+    def none(cls, gamma: Float[Array, "m B"], modes: Int[Array, "modes B"]) -> "Rest":
+        """The state before the first inspection: no contact is at rest."""
         no = jnp.zeros(gamma.shape, bool)
         rows = jnp.zeros((3, *gamma.shape), gamma.dtype)
         return cls(no, no, rows, jnp.zeros(gamma.shape, modes.dtype), no[:1])
@@ -48,34 +49,34 @@ class ImpactEnd(NamedTuple):
     seen: Any  # what its steps showed
 
     @property
-    def carries(self) -> jax.Array:
-        """Contacts at rest that carry an impulse (m, B); uses both, see it."""
+    def carries(self) -> Bool[Array, "m B"]:
+        """Mask of the contacts at rest that carry an impulse; uses both, see it."""
         return self.rest.carries & self.rest.contacts
 
     @property
-    def impulse(self) -> jax.Array:
-        """Of the contacts at rest (m, B)."""
+    def impulse(self) -> Float[Array, "m B"]:
+        """Impulses of the contacts at rest that end their approach."""
         return jnp.where(self.carries, self.rest.rows[2], 0.0)
 
     @property
-    def over(self) -> jax.Array:
-        """Whether (1, B) the impact has ended, not given up."""
+    def over(self) -> Bool[Array, "1 B"]:
+        """Mask of the impacts that have ended, not given up."""
         return self.carry.mark == Mark.OVER
 
     @property
-    def finishes(self) -> jax.Array:
-        """Ended by the flow itself (1, B)."""
+    def finishes(self) -> Bool[Array, "1 B"]:
+        """Mask of the impacts that the flow itself has ended."""
         return self.over & ~self.rest.ended
 
     @property
-    def status(self) -> jax.Array:
-        """Status (1, B) of the run."""
+    def status(self) -> Int[Array, "1 B"]:
+        """Status of the run: plastic_limit, ok, or max_steps where it is not over."""
         code = jnp.where(any_of(self.rest.contacts), CODE["plastic_limit"], CODE["ok"])
         return jnp.where(self.over, code, CODE["max_steps"]).astype(jnp.int32)
 
 
 class _OnItsWay(NamedTuple):
-    """An impact on its way."""
+    """An impact on its way: state of the stepper, contacts at rest, what `observe` has kept."""
 
     carry: stepper.StepperState
     rest: Rest
@@ -89,8 +90,8 @@ Observe = Callable[[Any, stepper.StepperState, jax.Array], Any]
 
 def run(
     flow: Any,
-    gamma: jax.Array,
-    modes: jax.Array,
+    gamma: Float[Array, "m B"],
+    modes: Int[Array, "modes B"],
     y: Any,
     most: int,
     inspect: Inspect,
@@ -98,14 +99,14 @@ def run(
     observe: Observe | None = None,
     seen: Any = None,
 ) -> ImpactEnd:
-    """From gap velocities gamma (m, B) to the end, in at most so many passes.
+    """The impact from gap velocities gamma to its end, in at most so many passes.
 
-    What of `flow` and y has tangents (see `tangents.py`) gives a state with tangents.
+    Parts of `flow` and y that have tangents (see `tangents.py`) give a state with tangents.
 
     Args:
-        flow: of the contacts, with the batch B of impacts in the last axis of its arrays.
-        gamma: gap velocities (m, B) before the impact.
-        modes: of the contacts at first, rows (k, B).
+        flow: the contacts, with the batch B of impacts in the last axis of its arrays.
+        gamma: gap velocities before the impact.
+        modes: of the contacts at first.
         y: the state at first (n, B).
         most: passes.
         inspect: asked where a self-similar flow pauses, and at the end of each.
@@ -116,7 +117,7 @@ def run(
     """
 
     def one_pass(at: tuple[Any, jax.Array], now: _OnItsWay) -> _OnItsWay:
-        """One step tried; impacts that pause are inspected."""
+        """The impact after one step tried; impacts that pause are inspected."""
         flow, gamma = at
         carry, accept = stepper.advance(flow, now.carry, most)
         if observe is not None:
@@ -139,12 +140,14 @@ def run(
     return _finished(flow, gamma, last, inspect)
 
 
-def _finished(flow: Any, gamma: jax.Array, last: _OnItsWay, inspect: Inspect) -> ImpactEnd:
-    """The end; the flow finishes the state where it has ended by itself."""
+def _finished(
+    flow: Any, gamma: Float[Array, "m B"], last: _OnItsWay, inspect: Inspect
+) -> ImpactEnd:
+    """The end of the impact; the flow finishes the state where it has ended by itself."""
     carry, rest, seen = last
     over = (carry.mark == Mark.OVER) & ~rest.ended
 
-    def at_end(flow: ContactFlow, y: jax.Array) -> jax.Array:
+    def at_end(flow: ContactFlow, y: Float[Array, "n B"]) -> Float[Array, "n B"]:
         """The state, finished where the impact is over."""
         return jnp.where(over, flow.finish(carry.step.modes, y)[1], y)
 

@@ -28,6 +28,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from jimpact.events.contact_flow import ContactStates, Frozen, as_pytree
 from jimpact.events.friction_flow import FrictionFlow
@@ -39,7 +40,7 @@ from jimpact.tools.loops import cond
 
 
 class Slip(enum.IntEnum):
-    """How a contact with friction moves along its plane, see above."""
+    """Motion of a contact with friction along its plane, see above."""
 
     STICKS = 0
     SLIPS = 1
@@ -71,95 +72,97 @@ class Reduced(NamedTuple):
     """
 
     frozen: Frozen
-    coupling: jax.Array  # (m, m, B)
-    normal_tangent: jax.Array  # (m, t, B)
-    pull: jax.Array  # (t, m, B)
-    tangent: jax.Array  # (t, t, B)
-    held: jax.Array  # (t, m, B)
-    carried: jax.Array  # (t, t, B)
+    coupling: Float[Array, "m m B"]  # (m, m, B)
+    normal_tangent: Float[Array, "m t B"]  # (m, t, B)
+    pull: Float[Array, "t m B"]  # (t, m, B)
+    tangent: Float[Array, "t t B"]  # (t, t, B)
+    held: Float[Array, "t m B"]  # (t, m, B)
+    carried: Float[Array, "t t B"]  # (t, t, B)
 
 
 class SlipRates(NamedTuple):
-    """Forces and the rates of slip in the flow's own time before it is shortened."""
+    """Forces and the rates of slip in the flow's own time before it is shortened, t = 2 m."""
 
-    force: jax.Array  # F (m, B)
-    sliding: jax.Array  # lambda of those that slide (t, B)
-    holding: jax.Array  # lambda of those that stick (t, B)
-    rate: jax.Array  # of the rows of slip (m, 2, B)
-    direction: jax.Array  # of slip (m, 2, B)
-    turning: jax.Array  # its rate (m, B); of those that creep to first order in their deviation
-    haste: jax.Array  # (1, B) >= 1: by how much time is shortened
+    force: Float[Array, "m B"]  # F
+    sliding: Float[Array, "t B"]  # lambda of those that slide
+    holding: Float[Array, "t B"]  # lambda of those that stick
+    rate: Float[Array, "m 2 B"]  # of the rows of slip
+    direction: Float[Array, "m 2 B"]  # of slip
+    turning: Float[Array, "m B"]  # its rate; of those that creep to first order in their deviation
+    haste: Float[Array, "1 B"]  # >= 1: by how much time is shortened
 
 
-def pairs(rows: jax.Array) -> jax.Array:
-    """Rows (2 m, B) of contacts as (m, 2, B)."""
+def pairs(rows: Shaped[Array, "t *B"]) -> Shaped[Array, "m 2 *B"]:
+    """The two tangential rows of each contact, side by side."""
     return rows.reshape(-1, 2, *rows.shape[1:])
 
 
-def flat(pair: jax.Array) -> jax.Array:
-    """The inverse of `pairs`."""
+def flat(pair: Shaped[Array, "m 2 *B"]) -> Shaped[Array, "t *B"]:
+    """Tangential rows, contact by contact: the inverse of `pairs`."""
     return pair.reshape(-1, *pair.shape[2:])
 
 
-def twice(rows: jax.Array) -> jax.Array:
-    """Values (m, B) of contacts for both of their tangents (2 m, B)."""
+def twice(rows: Shaped[Array, "m *B"]) -> Shaped[Array, "t *B"]:
+    """Values of contacts, for both of their tangents."""
     return jnp.repeat(rows, 2, axis=0)
 
 
-def length(pair: jax.Array) -> jax.Array:
-    """|u_j| (m, B) of (m, 2, B), with derivative 0 at 0."""
+def length(pair: Float[Array, "m 2 B"]) -> Float[Array, "m B"]:
+    """Lengths |u_j|, with derivative 0 at 0."""
     square = pair[:, 0] ** 2 + pair[:, 1] ** 2
     some = square > 0
     return jnp.where(some, jnp.sqrt(jnp.where(some, square, 1.0)), 0.0)
 
 
-def perpendicular_to(direction: jax.Array) -> jax.Array:
-    """Vectors (m, 2, B) turned by a right angle."""
+def perpendicular_to(direction: Float[Array, "m 2 B"]) -> Float[Array, "m 2 B"]:
+    """Vectors (-y, x): (x, y) turned by a right angle."""
     return jnp.stack([-direction[:, 1], direction[:, 0]], 1)
 
 
 @jax.custom_jvp
-def towards(angle: jax.Array) -> jax.Array:
-    """Unit vectors (m, 2, B) in this direction; tangents evaluate no cosine again."""
+def towards(angle: Float[Array, "m B"]) -> Float[Array, "m 2 B"]:
+    """Unit vectors (cos, sin) in this direction; tangents evaluate no cosine again."""
     return jnp.stack([jnp.cos(angle), jnp.sin(angle)], 1)
 
 
 @towards.defjvp
-def _turning(angle: Any, rate: Any) -> tuple[jax.Array, jax.Array]:
-    """The vector turns at right angles to itself."""
+def _turning(angle: Any, rate: Any) -> tuple[Float[Array, "m 2 B"], Float[Array, "m 2 B"]]:
+    """Unit vectors `d`, and their tangents `rate n`, n at right angles to d."""
     direction = towards(*angle)
     return direction, perpendicular_to(direction) * rate[0][:, None]
 
 
-def polar(angle: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Unit vectors (m, 2, B) in this direction and at right angles to it."""
+def polar(angle: Float[Array, "m B"]) -> tuple[Float[Array, "m 2 B"], Float[Array, "m 2 B"]]:
+    """Unit vectors in this direction, and at right angles to it."""
     direction = towards(angle)
     return direction, perpendicular_to(direction)
 
 
-def turned(vectors: tuple[jax.Array, jax.Array], angle: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Vectors as those of `polar`, turned by small angles, to second order: without a cosine."""
+def turned(
+    vectors: tuple[Float[Array, "m 2 B"], Float[Array, "m 2 B"]], angle: Float[Array, "m B"]
+) -> tuple[Float[Array, "m 2 B"], Float[Array, "m 2 B"]]:
+    """Unit vectors of `polar`, turned by small angles a, tan(a / 2) ~ a / 2: without a cosine."""
     direction, perpendicular = vectors
     half = (angle / 2)[:, None]
     cosine, sine = (1 - half**2) / (1 + half**2), 2 * half / (1 + half**2)
     return cosine * direction + sine * perpendicular, cosine * perpendicular - sine * direction
 
 
-def angle_of(pair: jax.Array) -> jax.Array:
-    """Direction (m, B) of (m, 2, B); 0, without a derivative, of the zero vector."""
+def angle_of(pair: Float[Array, "m 2 B"]) -> Float[Array, "m B"]:
+    """Angles of directions; 0, without a derivative, of the zero vector."""
     some = (pair[:, 0] != 0) | (pair[:, 1] != 0)
     return jnp.arctan2(jnp.where(some, pair[:, 1], 0.0), jnp.where(some, pair[:, 0], 1.0))
 
 
-def dot(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Scalar products (m, B) of (m, 2, B)."""
+def dot(a: Float[Array, "m 2 B"], b: Float[Array, "m 2 B"]) -> Float[Array, "m B"]:
+    """Scalar products of the vectors of each contact."""
     return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1]
 
 
 @as_pytree
 @dataclasses.dataclass(kw_only=True)
 class SlipFlow(FrictionFlow):
-    """Contacts with friction in space."""
+    """The motion of m contacts with friction in space, t = 2 m."""
 
     # normal_tangent: K_nt (m, 2 m, B); tangent: K_tt (2 m, 2 m, B)
 
@@ -168,20 +171,20 @@ class SlipFlow(FrictionFlow):
 
     # ---- the state: x, g, p (m each), slip, its impulse (2 m each), time
 
-    def slip(self, y: jax.Array) -> jax.Array:
-        """The two rows of slip (m, 2, B) of each contact."""
+    def slip(self, y: Float[Array, "driving B"]) -> Float[Array, "m 2 B"]:
+        """Both rows of slip of each contact."""
         m = self.contacts
         return pairs(y[3 * m : 5 * m])
 
-    def with_slip(self, y: jax.Array, q: jax.Array) -> jax.Array:
+    def with_slip(self, y: Float[Array, "n B"], q: Float[Array, "m 2 B"]) -> Float[Array, "n B"]:
         """The state with these rows of slip."""
         m = self.contacts
         return jnp.concatenate([y[: 3 * m], flat(q), y[5 * m :]])
 
     def start_with(
-        self, gamma: jax.Array, x: jax.Array, u: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """Modes and state before the impact."""
+        self, gamma: Float[Array, "m B"], x: Float[Array, "m B"], u: Float[Array, "t B"]
+    ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
+        """Modes and state before the impact, from gamma, indentations x and slip u."""
         m = self.contacts
         modes, y = self.start(gamma, x)
         modes = jnp.concatenate([modes, jnp.zeros_like(modes[:m])])
@@ -189,21 +192,25 @@ class SlipFlow(FrictionFlow):
         loaded = self.loaded(modes)
         return self.decided(modes, y, jnp.zeros_like(loaded), loaded)
 
-    def sliding(self, modes: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Which loaded contacts (m, B) stick, slip and creep."""
+    def sliding(
+        self, modes: Int[Array, "modes B"]
+    ) -> tuple[Bool[Array, "m B"], Bool[Array, "m B"], Bool[Array, "m B"]]:
+        """Masks of the loaded contacts that stick, that slip, and that creep."""
         slip, loaded = modes[2 * self.contacts :], self.loaded(modes)
         sticks, slips, creeps = (loaded & (slip == kind) for kind in Slip)
         return sticks, slips, creeps
 
-    def speed(self, modes: jax.Array, q: jax.Array) -> jax.Array:
-        """r (m, B) of loaded contacts; 0 of those that stick."""
+    def speed(self, modes: Int[Array, "modes B"], q: Float[Array, "m 2 B"]) -> Float[Array, "m B"]:
+        """Speeds r of slip of loaded contacts; 0 of those that stick."""
         _, slips, creeps = self.sliding(modes)
         return jnp.where(
             slips, jnp.exp(jnp.where(slips, q[:, 0], 0.0)), jnp.where(creeps, q[:, 0], 0.0)
         )
 
-    def allowance(self, modes: jax.Array, y: jax.Array) -> jax.Array:
-        """Tolerances that errors of each row may be; of ln r and angle times r."""
+    def allowance(
+        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]
+    ) -> Float[Array, "n B"]:
+        """Allowed error of each row, in tolerances; of ln r and angle it grows as 1 / r."""
         m, one = self.contacts, jnp.ones_like(y[: self.contacts])
         _, slips, creeps = self.sliding(modes)
         relative = LOOSE / self.tolerance
@@ -215,8 +222,11 @@ class SlipFlow(FrictionFlow):
 
     # ---- the protocol
 
-    def constants(self, modes: jax.Array) -> Any:
-        """The field without the forces of sticking."""
+    def constants(self, modes: Int[Array, "modes B"]) -> Any:
+        """The field without the forces of sticking, which are `-(Z K_tn F + Z K_tt lambda)`.
+
+        Z is the pseudoinverse of K_tt in the contacts that stick; lambda are the sliding forces.
+        """
         stick, slips, creeps = self.sliding(modes)
         free = twice(slips | creeps | ~self.loaded(modes))
         z = pseudoinverse(self.tangent, twice(stick))
@@ -235,22 +245,24 @@ class SlipFlow(FrictionFlow):
             carried=carried,
         )
 
-    def motion(self, const: Reduced, modes: jax.Array, y: jax.Array) -> SlipRates:
-        """Forces, and how fast slip changes."""
+    def motion(
+        self, const: Reduced, modes: Int[Array, "modes B"], y: Float[Array, "driving B"]
+    ) -> SlipRates:
+        """Forces, and the rates of slip `r' = d . a`, `angle' = n . a / r` of those that slip."""
         frozen = const.frozen
         x, g, _ = self.rows(y)
         stick, slips, creeps = self.sliding(modes)
         slides, q = slips | creeps, self.slip(y)
         f = self.force(frozen, x, g)
-        c = jnp.where(slides, self.friction * f, 0.0)
+        c = jnp.where(slides, self.friction * f, 0.0)  # mu F
         angle, r = jnp.where(slides, q[:, 1], 0.0), self.speed(modes, q)
         over_r = jnp.where(slips, frozen.unit / jnp.where(slips, r, 1.0), 0.0)
         frame = polar(angle)
         drift, correction = self._creep(const, modes, y, f, c, frame, over_r)
         direction, perpendicular = turned(frame, correction)
         side = flat(-c[:, None] * direction)
-        a = pairs(times(const.pull, f) + times(const.tangent, side))
-        grows, turns = dot(direction, a), dot(perpendicular, a)
+        a = pairs(times(const.pull, f) + times(const.tangent, side))  # u'
+        grows, turns = dot(direction, a), dot(perpendicular, a)  # r' = d . a and r angle' = n . a
         rate = jnp.stack(
             [
                 jnp.where(slips, over_r * grows, jnp.where(creeps, frozen.unit * grows, 0.0)),
@@ -258,6 +270,7 @@ class SlipFlow(FrictionFlow):
             ],
             1,
         )
+        # rows of contacts without load are u itself
         rate = jnp.where(
             self.loaded(modes)[:, None], rate, (frozen.unit * jnp.ones_like(x))[:, None] * a
         )
@@ -266,38 +279,43 @@ class SlipFlow(FrictionFlow):
         turning = jnp.where(slips, over_r * turns, drift)
         return SlipRates(f, side, holding, rate, direction, turning, haste)
 
-    def _stiffness(self, const: Reduced, c: jax.Array) -> jax.Array:
-        """c K_tt (m, B), K_tt the mean of its two directions."""
+    def _stiffness(self, const: Reduced, c: Float[Array, "m B"]) -> Float[Array, "m B"]:
+        """Stiffness c K_tt of the angle, K_tt the mean of the two directions of a contact."""
         rows = np.arange(2 * self.contacts)
         diagonal = pairs(const.tangent[rows, rows])
         return c * (diagonal[:, 0] + diagonal[:, 1]) / 2
 
     def _holding(
-        self, const: Reduced, stick: jax.Array, f: jax.Array, side: jax.Array
-    ) -> jax.Array:
-        """Forces of sticking (2 m, B), or their rates, from those of F and of sliding forces."""
+        self,
+        const: Reduced,
+        stick: Bool[Array, "m B"],
+        f: Float[Array, "m B"],
+        side: Float[Array, "t B"],
+    ) -> Float[Array, "t B"]:
+        """Forces of sticking `-(held F + carried lambda)`; rates from rates of F and lambda."""
         holding = times(const.held, f)
         if self.contacts > 1:  # one contact alone sticks or slides
             holding = holding + times(const.carried, side)
         return jnp.where(twice(stick), -holding, 0.0)
 
-    def _blocks(self, const: Reduced) -> jax.Array:
-        """K_tt (m, 2, m, 2, B)."""
+    def _blocks(self, const: Reduced) -> Float[Array, "m 2 m 2 B"]:
+        """K_tt in blocks of two rows for each contact."""
         m = self.contacts
         return const.tangent.reshape(m, 2, m, 2, *const.tangent.shape[2:])
 
     def _creep(
         self,
         const: Reduced,
-        modes: jax.Array,
-        y: jax.Array,
-        f: jax.Array,
-        c: jax.Array,
-        frame: tuple[jax.Array, jax.Array],
-        over_r: jax.Array,
-    ) -> tuple[jax.Array, jax.Array]:
-        """How fast the directions (m, B) of creep drift, and their deviation from those of `frame`.
+        modes: Int[Array, "modes B"],
+        y: Float[Array, "driving B"],
+        f: Float[Array, "m B"],
+        c: Float[Array, "m B"],
+        frame: tuple[Float[Array, "m 2 B"], Float[Array, "m 2 B"]],
+        over_r: Float[Array, "m B"],
+    ) -> tuple[Float[Array, "m B"], Float[Array, "m B"]]:
+        """Rates at which the directions of creep drift, and their deviation from those of `frame`.
 
+        `c` is mu F, `frame` the directions d and n, `over_r` 1 / r of the contacts that slip.
         With G = n . a of all contacts that creep, G' at fixed angles and J = -dG/d angle, the
         quasi-static solution G = 0 drifts by J^-1 G'. The directions lag behind it by
         (J + diag(r'))^-1 r drift, as r angle' = G and r grows at the rate r'.
@@ -308,20 +326,23 @@ class SlipFlow(FrictionFlow):
         r = jnp.where(creeps, self.slip(y)[:, 0], 0.0)
         direction, perpendicular = frame
 
-        def acceleration(f: jax.Array, side: jax.Array) -> jax.Array:
-            """u' (m, 2, B) of normal forces and those of sliding."""
+        def acceleration(
+            f: Float[Array, "m B"], side: Float[Array, "m 2 B"]
+        ) -> Float[Array, "m 2 B"]:
+            """Accelerations `u' = K_tn F + K_tt lambda` of slip by normal and sliding forces."""
             return pairs(times(const.pull, f) + times(const.tangent, flat(side)))
 
         side = -c[:, None] * direction
         a = acceleration(f, side)
-        grows, turns = dot(direction, a), dot(perpendicular, a)
+        grows, turns = dot(direction, a), dot(perpendicular, a)  # r' and G
+        # G' from the rates of F, of the radii c, and of the directions that slip
         pull = times(const.coupling, f) + times(const.normal_tangent, flat(side))
         rates = (frozen.closing * g, frozen.ratio * pull)
         _, df = jax.jvp(lambda x, g: self.force(frozen, x, g), (x, g), rates)
         dc = jnp.where(c > 0, self.friction * df, 0.0)
-        swung = (c * over_r * turns)[:, None] * perpendicular  # of those that slip
+        swung = (c * over_r * turns)[:, None] * perpendicular
         changes = dot(perpendicular, acceleration(df, -dc[:, None] * direction - swung))
-        # all in units of the largest entry: forces begin at 0
+        # J = n K_tt n c + diag(r'), all in units of the largest entry: forces begin at 0
         blocks = self._blocks(const)
         j = sum(
             perpendicular[:, i][:, None] * blocks[:, i, :, k] * perpendicular[:, k][None]
@@ -335,8 +356,8 @@ class SlipFlow(FrictionFlow):
         j, eye = j / size[None], unit(j)
         turns, changes = (jnp.where(creeps, z / size, 0.0) for z in (turns, changes))
         away = jnp.where(creeps, LEAST_STIFFNESS, 1.0)
-        whole = j + eye * (growth + away)[:, None]
-        drift, newton = (solve(whole, z[:, None])[:, 0] for z in (changes, turns))
+        jacobian = j + eye * (growth + away)[:, None]
+        drift, newton = (solve(jacobian, z[:, None])[:, 0] for z in (changes, turns))
         lagging = jnp.where(creeps, frozen.unit, 1.0)[:, None] * (
             j + eye * (2 * growth + away)[:, None]
         )
@@ -344,7 +365,7 @@ class SlipFlow(FrictionFlow):
         correction = jnp.clip(newton - lag, -1.0, 1.0)
         return jnp.where(creeps, drift, 0.0), jnp.where(creeps, correction, 0.0)
 
-    def contact_states(self, modes: jax.Array, y: jax.Array) -> ContactStates:
+    def contact_states(self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]) -> ContactStates:
         """Forces, velocities and slip in a state."""
         m, (x, g, p) = self.contacts, self.rows(y)
         const, loaded, q = self.constants(modes), self.loaded(modes), self.slip(y)
@@ -361,8 +382,13 @@ class SlipFlow(FrictionFlow):
             rate=const.frozen.unit / motion.haste,
         )
 
-    def field(self, const: Reduced, modes: jax.Array, y: jax.Array) -> jax.Array:
-        """Rates of x, g, p, slip, its impulses and time, all in the shortened time."""
+    def field(
+        self, const: Reduced, modes: Int[Array, "modes B"], y: Float[Array, "driving B"]
+    ) -> Float[Array, "n B"]:
+        """Rates of x, g, p, slip, its impulses and time, all over `haste`: in shortened time.
+
+        Equation: `g' = ratio (G F + K_nt lambda)`, without the forces of sticking in K.
+        """
         _, g, _ = self.rows(y)
         frozen, motion = const.frozen, self.motion(const, modes, y)
         pull = times(const.coupling, motion.force) + times(const.normal_tangent, motion.sliding)
@@ -378,15 +404,27 @@ class SlipFlow(FrictionFlow):
         )
         return dy / motion.haste
 
-    def margins(self, const: Reduced, modes: jax.Array, y: jax.Array) -> jax.Array:
-        """Beside those of the normal flow: until slip stops; until stick, or creep, ends."""
+    def margins(
+        self, const: Reduced, modes: Int[Array, "modes B"], y: Float[Array, "driving B"]
+    ) -> Float[Array, "k B"]:
+        """Margins of the normal flow; until slip stops; until stick, or creep, ends (m each)."""
         motion = self.motion(const, modes, y)
         return self._margins_of(const, modes, y, motion.force, motion.holding)
 
     def _margins_of(
-        self, const: Reduced, modes: jax.Array, y: jax.Array, f: jax.Array, holding: jax.Array
-    ) -> jax.Array:
-        """The margins from the state, F (m, B) and the forces of sticking (2 m, B)."""
+        self,
+        const: Reduced,
+        modes: Int[Array, "modes B"],
+        y: Float[Array, "driving B"],
+        f: Float[Array, "m B"],
+        holding: Float[Array, "t B"],
+    ) -> Float[Array, "k B"]:
+        """The margins in a state, given its normal forces F and its forces of sticking.
+
+        slip stops   ln r - ln FLOOR tolerance; r + FLOOR tolerance of creep
+        stick ends   (mu F - |lambda|) / sum F
+        creep ends   (slow - r) / (slow + |r|), r less 2 FLOOR tolerance; see CREEP for slow
+        """
         r = self.slip(y)[:, 0]
         stick, slips, creeps = self.sliding(modes)
         floor = FLOOR * self.tolerance
@@ -403,8 +441,13 @@ class SlipFlow(FrictionFlow):
         return jnp.concatenate([self.normal_margins(const.frozen, modes, y), stops, ends])
 
     def margins_with_rates(
-        self, const: Reduced, modes: jax.Array, y: jax.Array, dy: jax.Array, target: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
+        self,
+        const: Reduced,
+        modes: Int[Array, "modes B"],
+        y: Float[Array, "driving B"],
+        dy: Float[Array, "driving B"],
+        target: Bool[Array, "k B"],
+    ) -> tuple[Float[Array, "k B"], Float[Array, "k B"]]:
         """The margins, and their rates from those of the forces.
 
         Forces of sticking depend on the directions of creep, whose rates are those of first order,
@@ -434,9 +477,13 @@ class SlipFlow(FrictionFlow):
         return value, rates
 
     def switch(
-        self, modes: jax.Array, y: jax.Array, which: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """Modes after events; slip changes its variables with the mode."""
+        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"], which: Bool[Array, "k B"]
+    ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
+        """Modes and state after events; slip changes its variables with the mode.
+
+        A contact that opens keeps u = r d, one that breaks loose creeps from r = 0, and creep that
+        ends goes on with ln r.
+        """
         m = self.contacts
         stopped, ended = which[2 * m : 3 * m], which[3 * m :]
         stick, slips, creeps = self.sliding(modes)
@@ -460,14 +507,23 @@ class SlipFlow(FrictionFlow):
         return self.decided(after, self.with_slip(y, q), stopped & remains, remains & ~loaded)
 
     def decided(
-        self, modes: jax.Array, y: jax.Array, stopped: jax.Array, closed: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """Which contacts stick, and where the others creep to, after slip has stopped or begun."""
+        self,
+        modes: Int[Array, "modes B"],
+        y: Float[Array, "n B"],
+        stopped: Bool[Array, "m B"],
+        closed: Bool[Array, "m B"],
+    ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
+        """Modes and state once it is decided which contacts stick, and where others creep to.
+
+        This is asked anew where slip has `stopped`, or a contact has `closed` without slip: from
+        the forces of a moment later, by `distribute`.
+        """
         m = self.contacts
         q, slip, loaded = self.slip(y), modes[2 * m :], self.loaded(modes)
         stick = loaded & (slip == Slip.STICKS) & ~closed
         r = jnp.where(closed, length(q), self.speed(modes, q))
         resting = loaded & (r <= REST * self.tolerance) & ~stick
+        # contacts that close with slip: its Cartesian rows become ln r and angle
         slips = closed & ~resting
         moving = jnp.where(slips[:, None], q, 1.0)
         q = jnp.where(slips[:, None], jnp.stack([jnp.log(length(moving)), angle_of(moving)], 1), q)
@@ -477,6 +533,7 @@ class SlipFlow(FrictionFlow):
         constant, state = jax.lax.stop_gradient((self, y))
         f = constant.soon(modes, state)
         most = constant.friction * f
+        # b = u' by normal forces and by the friction of contacts that slide on
         slides = jnp.where(
             (to_check | ~loaded)[:, None], 0.0, polar(jax.lax.stop_gradient(q[:, 1]))[0]
         )
@@ -484,6 +541,7 @@ class SlipFlow(FrictionFlow):
         b = b - times(constant.tangent, flat(most[:, None] * slides))
         inside, towards = distribute(constant.tangent, b, most, to_check)
         towards = angle_of(pairs(towards))
+        # stick is (0, 0), creep begins at r = 0
         begins = jnp.stack([jnp.zeros_like(towards), jnp.where(inside, 0.0, towards)], 1)
         lost = jnp.where((closed & resting & inside)[:, None], q, 0.0)
         q = jnp.where(to_check[:, None], begins, q)
@@ -493,9 +551,13 @@ class SlipFlow(FrictionFlow):
         return modes, self._stopped(modes, self.with_slip(y, q), flat(lost), held)
 
     def _stopped(
-        self, modes: jax.Array, y: jax.Array, lost: jax.Array, held: jax.Array
-    ) -> jax.Array:
-        """The state after slips (2 m, B) of nothing have been taken from contacts `held` (m, B).
+        self,
+        modes: Int[Array, "modes B"],
+        y: Float[Array, "n B"],
+        lost: Float[Array, "t B"],
+        held: Bool[Array, "m B"],
+    ) -> Float[Array, "n B"]:
+        """The state after slips `lost`, whose values are 0, have been taken from contacts `held`.
 
         As in the plane: the tangents of these slips are taken by a tangential impulse.
         """

@@ -41,6 +41,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from jimpact.tools.compiling import full_precision
 from jimpact.tools.loops import cond, fori_loop, while_loop
@@ -67,15 +68,15 @@ _NEWTON_SCHULZ = 3  # iterations, each of which squares the error; ten times mor
 # ---- products
 
 
-def unit(matrix: jax.Array) -> jax.Array:
-    """The unit matrix (n, n, 1) to be added to a matrix (n, n, B)."""
+def unit(matrix: Float[Array, "n n *B"]) -> Float[Array, "n n ..."]:
+    """The unit matrix, with an axis of length 1 for each batch axis of the matrix."""
     return jnp.eye(len(matrix), dtype=matrix.dtype).reshape(
         *matrix.shape[:2], *[1] * (matrix.ndim - 2)
     )
 
 
-def times(matrix: jax.Array, vector: jax.Array) -> jax.Array:
-    """`matrix @ vector` (a, B) of (a, b, B) and (b, B), or of one matrix (a, b) for all columns."""
+def times(matrix: Float[Array, "a b *#B"], vector: Float[Array, "b *#B"]) -> Float[Array, "a *#B"]:
+    """Products `A x = sum_j A_j x_j` of columns A_j; one matrix without batch serves all x."""
     if matrix.ndim == 2:
         return matrix @ vector
     if matrix.shape[1] > COLUMNS_WRITTEN_OUT:
@@ -84,8 +85,8 @@ def times(matrix: jax.Array, vector: jax.Array) -> jax.Array:
     return functools.reduce(jnp.add, columns)
 
 
-def product(a: jax.Array, b: jax.Array) -> jax.Array:
-    """`a @ b` (n, l, B) of (n, k, B) and (k, l, B)."""
+def product(a: Float[Array, "n k *#B"], b: Float[Array, "k l *#B"]) -> Float[Array, "n l *#B"]:
+    """Products of matrices, `A B = sum_j A_j b_j`, of columns A_j of A and rows b_j of B."""
     if a.shape[1] > COLUMNS_WRITTEN_OUT:
         return jnp.sum(a[:, :, None] * b[None], axis=1)
     return functools.reduce(jnp.add, [a[:, j, None] * b[j][None] for j in range(a.shape[1])])
@@ -94,8 +95,10 @@ def product(a: jax.Array, b: jax.Array) -> jax.Array:
 # ---- elimination
 
 
-def solve(matrix: jax.Array, right: jax.Array) -> jax.Array:
-    """`matrix^-1 right` (n, c, B) of (n, n, B) and right sides (n, c, B).
+def solve(
+    matrix: Float[Array, "n n *#B"], right: Float[Array, "n c *#B"]
+) -> Float[Array, "n c *#B"]:
+    """`A^-1 right` for c right sides of each matrix A.
 
     Gauss-Jordan in a loop over the pivots, which are not chosen: matrices that are similar to a
     positive definite one do not need that.
@@ -109,14 +112,16 @@ def solve(matrix: jax.Array, right: jax.Array) -> jax.Array:
 
 
 def _eliminated(
-    matrix: jax.Array, right: jax.Array, inverted: Callable[[jax.Array], jax.Array]
-) -> jax.Array:
-    """`solve` by the loop, with the inverses of the pivots."""
+    matrix: Float[Array, "n n *#B"],
+    right: Float[Array, "n c *#B"],
+    inverted: Callable[[jax.Array], jax.Array],
+) -> Float[Array, "n c *#B"]:
+    """`A^-1 right` by Gauss-Jordan in a loop over the pivots; `inverted` gives 1 / pivot."""
     n = len(matrix)
     number = jnp.arange(n).reshape(n, 1, *[1] * (matrix.ndim - 2))
 
-    def eliminate(k: jax.Array, rows: jax.Array) -> jax.Array:
-        """Rows after the pivot k."""
+    def eliminate(k: Int[Array, ""] | int, rows: Float[Array, "n w *B"]) -> Float[Array, "n w *B"]:
+        """Rows of [A, right] after pivot k: row k is divided by it, other a_jk are 0."""
         row = jax.lax.dynamic_index_in_dim(rows, k, 0)
         row = row * inverted(jax.lax.dynamic_index_in_dim(row, k, 1))
         factor = jax.lax.dynamic_index_in_dim(rows, k, 1)
@@ -125,46 +130,50 @@ def _eliminated(
     return fori_loop(0, n, eliminate, jnp.concatenate([matrix, right], axis=1))[:, n:]
 
 
-def _solve_two(matrix: jax.Array, right: jax.Array) -> jax.Array:
-    """`solve` for two rows, by the same operations."""
-    scale, factor = 1 / matrix[0, :1], matrix[1, :1]
+def _solve_two(
+    matrix: Float[Array, "2 2 *#B"], right: Float[Array, "2 c *#B"]
+) -> Float[Array, "2 c *#B"]:
+    """`A^-1 right` for two rows, by the operations of `_eliminated`, written out."""
+    scale, factor = 1 / matrix[0, :1], matrix[1, :1]  # of row 0, 1 / a_00 and a_10
     above, x = matrix[0, 1:] * scale, right[0] * scale
     last = (right[1] - factor * x) * (1 / (matrix[1, 1:] - factor * above))
     return jnp.stack([x - above * last, last])
 
 
-def inverse(matrix: jax.Array) -> jax.Array:
-    """The inverse (n, n, B), without pivots as in `solve`, which it replaces in place."""
+def inverse(matrix: Float[Array, "n n *B"]) -> Float[Array, "n n *B"]:
+    """A^-1 by Gauss-Jordan in place of A, without a choice of pivots as in `solve`."""
     n = len(matrix)
     if n <= 2:
         return solve(matrix, jnp.broadcast_to(unit(matrix), matrix.shape))
     number = jnp.arange(n).reshape(n, 1, *[1] * (matrix.ndim - 2))
 
-    def eliminate(k: jax.Array, rows: jax.Array) -> jax.Array:
-        """Rows after the pivot k, whose column is that of the inverse now."""
-        here, there = number == k, number[:, 0][None] == k
+    def eliminate(k: Int[Array, ""] | int, rows: Float[Array, "n n *B"]) -> Float[Array, "n n *B"]:
+        """The matrix after pivot k; column k is then that of the eliminations so far."""
+        in_row, in_column = number == k, number[:, 0][None] == k  # masks of row and column k
         column = jax.lax.dynamic_index_in_dim(rows, k, 1)
         row = jax.lax.dynamic_index_in_dim(rows, k, 0)
         scale = 1 / jax.lax.dynamic_index_in_dim(row, k, 1)
-        row = jnp.where(there, scale, row * scale)
-        return jnp.where(here, row, jnp.where(there, 0.0, rows) - column * row)
+        row = jnp.where(in_column, scale, row * scale)
+        return jnp.where(in_row, row, jnp.where(in_column, 0.0, rows) - column * row)
 
     return fori_loop(0, n, eliminate, matrix)
 
 
 @jax.jit
-def solve_definite(g: jax.Array, right: jax.Array) -> jax.Array:
-    """`G x = right` for a symmetric positive definite G (m, m); right sides (m,) or (m, c)."""
+def solve_definite(g: Float[Array, "m m"], right: Float[Array, "m *c"]) -> Float[Array, "m *c"]:
+    """`G^-1 right` for a symmetric positive definite G and one or several right sides."""
     if len(g) > _BY_LOOP:
         return jnp.linalg.solve(g, right)
     return solve(g[..., None], right.reshape(len(g), -1, 1)).reshape(right.shape)
 
 
 @jax.jit
-def solve_mass_matrix(mass: jax.Array, right: jax.Array) -> jax.Array:
-    """`M^-1 right` of M (n,), its diagonal, or (n, n); right sides (n,) or (n, c).
+def solve_mass_matrix(
+    mass: Float[Array, "n"] | Float[Array, "n n"], right: Float[Array, "n *c"]
+) -> Float[Array, "n *c"]:
+    """`M^-1 right` of a mass matrix M, or of its diagonal, for one or several right sides.
 
-    NaN where M (n, n) is not positive definite.
+    NaN where M is a matrix that is not positive definite.
     """
     if mass.ndim == 1:
         return right / mass.reshape(-1, *[1] * (right.ndim - 1))
@@ -175,8 +184,8 @@ def solve_mass_matrix(mass: jax.Array, right: jax.Array) -> jax.Array:
     return solved.reshape(right.shape)
 
 
-def block_inverse(matrix: jax.Array) -> jax.Array:
-    """Inverses of (m, b, m, b, N), block by block, b = 2 or 3, without pivots.
+def block_inverse(matrix: Float[Array, "m b m b N"]) -> Float[Array, "m b m b N"]:
+    """Inverses of N matrices of m by m blocks, block by block, b = 2 or 3, without pivots.
 
     A singular block is perturbed by eps^(2/3), which refinements by the caller undo. More would
     perturb regular blocks, too, in single precision.
@@ -184,23 +193,27 @@ def block_inverse(matrix: jax.Array) -> jax.Array:
     perturbation = precision(matrix.dtype).eps ** (2 / 3)
     m, eye = len(matrix), jnp.eye(matrix.shape[1], dtype=matrix.dtype)[..., None]
 
-    def eliminate(i: jax.Array, inverse: jax.Array) -> jax.Array:
-        """The matrix after the block pivot i."""
-        here = (jnp.arange(m) == i)[:, None, None, None]
-        column, row = inverse[:, :, i], inverse[i]
+    def eliminate(
+        i: Int[Array, ""] | int, inverse: Float[Array, "m b m b N"]
+    ) -> Float[Array, "m b m b N"]:
+        """Matrices after Gauss-Jordan elimination in place, with diagonal block i as pivot."""
+        pivot = (jnp.arange(m) == i)[:, None, None, None]
+        column, row = inverse[:, :, i], inverse[i]  # (m, b, b, N) and (b, m, b, N) of blocks
         block = _small_inverse(column[i], perturbation)
-        column = jnp.where(here, -eye[None], column)
-        row = jnp.where(here[:, 0][None], eye[:, None], row)
-        row = jnp.sum(block[:, :, None, None] * row[None], axis=1)
-        replaced = here[..., None] | here[None, None, :, 0]
-        spread = jnp.sum(column[:, :, :, None, None] * row[None, None], axis=2)
+        column = jnp.where(pivot, -eye[None], column)
+        row = jnp.where(pivot[:, 0][None], eye[:, None], row)
+        row = jnp.sum(block[:, :, None, None] * row[None], axis=1)  # block times row
+        replaced = pivot[..., None] | pivot[None, None, :, 0]  # row i and column i of blocks
+        spread = jnp.sum(column[:, :, :, None, None] * row[None, None], axis=2)  # column times row
         return jnp.where(replaced, 0.0, inverse) - spread
 
     return fori_loop(0, m, eliminate, matrix)
 
 
-def block_solve(matrix: jax.Array, right: jax.Array) -> jax.Array:
-    """`matrix^-1 right` (m, b, c) of one matrix (m, b, m, b), block by block, without pivots.
+def block_solve(
+    matrix: Float[Array, "m b m b"], right: Float[Array, "m b c"]
+) -> Float[Array, "m b c"]:
+    """`A^-1 right` of one matrix A of m by m blocks, block by block, without pivots.
 
     Of more than `_BLOCKS` rows by LAPACK.
     """
@@ -211,8 +224,8 @@ def block_solve(matrix: jax.Array, right: jax.Array) -> jax.Array:
     perturbation = precision(matrix.dtype).eps ** 2  # of a block that is singular
     rows = jnp.concatenate([matrix.reshape(m, b, m * b), right], axis=2)
 
-    def eliminate(i: jax.Array, rows: jax.Array) -> jax.Array:
-        """Rows after the block pivot i."""
+    def eliminate(i: Int[Array, ""] | int, rows: Float[Array, "m b w"]) -> Float[Array, "m b w"]:
+        """Rows of [A, right] after elimination with the diagonal block i as pivot."""
         row = jax.lax.dynamic_index_in_dim(rows, i, 0, keepdims=False)
         block = jax.lax.dynamic_slice_in_dim(row, i * b, b, axis=1)
         row = _small_inverse(block[..., None], perturbation)[..., 0] @ row
@@ -223,22 +236,22 @@ def block_solve(matrix: jax.Array, right: jax.Array) -> jax.Array:
     return fori_loop(0, m, eliminate, rows)[..., m * b :]
 
 
-def _small_inverse(block: jax.Array, perturbation: float) -> jax.Array:
-    """Inverses of blocks (b, b, N) by cofactors, b = 2 or 3."""
-    small = jnp.abs(_small_determinant(block)) < perturbation
+def _small_inverse(block: Float[Array, "b b N"], perturbation: float) -> Float[Array, "b b N"]:
+    """Inverses `adj(A) / det(A)` of blocks, b = 2 or 3, perturbed where they are singular."""
+    singular = jnp.abs(_small_determinant(block)) < perturbation
     eye = jnp.eye(len(block), dtype=block.dtype)[..., None]
-    block = block + jnp.where(small, perturbation, 0.0)[None, None] * eye
-    whole = _small_determinant(block)
-    return _cofactors(block) / jnp.where(whole == 0, 1.0, whole)[None, None]
+    block = block + jnp.where(singular, perturbation, 0.0)[None, None] * eye
+    determinant = _small_determinant(block)
+    return _cofactors(block) / jnp.where(determinant == 0, 1.0, determinant)[None, None]
 
 
-def _small_determinant(a: jax.Array) -> jax.Array:
-    """Determinants (N,) of (b, b, N), b = 2 or 3."""
+def _small_determinant(a: Float[Array, "b b N"]) -> Float[Array, "N"]:
+    """Determinants of blocks, b = 2 or 3: the first row times its cofactors."""
     return jnp.sum(a[0] * _cofactors(a)[:, 0], axis=0)
 
 
-def _cofactors(a: jax.Array) -> jax.Array:
-    """Adjugates (b, b, N) of (b, b, N), b = 2 or 3."""
+def _cofactors(a: Float[Array, "b b N"]) -> Float[Array, "b b N"]:
+    """Adjugates `adj(A) = det(A) A^-1` of blocks, b = 2 or 3; their columns are cross products."""
     if len(a) == 2:
         return jnp.stack([jnp.stack([a[1, 1], -a[0, 1]]), jnp.stack([-a[1, 0], a[0, 0]])])
     sides = [jnp.cross(a[i], a[j], axis=0) for i, j in ((1, 2), (2, 0), (0, 1))]
@@ -246,8 +259,10 @@ def _cofactors(a: jax.Array) -> jax.Array:
 
 
 @jax.jit
-def solve_by_pivots(matrix: jax.Array, right: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """`matrix^-1 right` (n, c) of any matrix (n, n), and its determinant ().
+def solve_by_pivots(
+    matrix: Float[Array, "n n"], right: Float[Array, "n c"]
+) -> tuple[Float[Array, "n c"], Float[Array, ""]]:
+    """`A^-1 right` of any matrix A, and its determinant.
 
     Gauss-Jordan with partial pivoting, in a loop over the pivots. Where the matrix is singular the
     determinant is 0 and the solution not finite.
@@ -255,11 +270,14 @@ def solve_by_pivots(matrix: jax.Array, right: jax.Array) -> tuple[jax.Array, jax
     n = len(matrix)
     number = jnp.arange(n)[:, None]
 
-    def eliminate(k: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        """Rows after the pivot k, and the product of the pivots."""
+    def eliminate(
+        k: Int[Array, ""] | int, state: tuple[Float[Array, "n w"], Float[Array, ""]]
+    ) -> tuple[Float[Array, "n w"], Float[Array, ""]]:
+        """Rows of [A, right] after the largest pivot in column k; the product of all pivots."""
         rows, determinant = state
         column = jax.lax.dynamic_index_in_dim(rows, k, 1)
         largest = jnp.argmax(jnp.where(number >= k, jnp.abs(column), -1.0), axis=0)[0]
+        # the rows k and `largest` change places
         own, chosen = (jax.lax.dynamic_index_in_dim(rows, i, 0) for i in (k, largest))
         pivot = jax.lax.dynamic_index_in_dim(chosen, k, 1)
         rows = jnp.where(number == largest, own, rows)
@@ -275,8 +293,11 @@ def solve_by_pivots(matrix: jax.Array, right: jax.Array) -> tuple[jax.Array, jax
     return rows[:, n:], determinant
 
 
-def determinants(k: jax.Array) -> jax.Array:
-    """Of (N, n, n); those of four rows by minors of two rows, which is quicker to compile."""
+def determinants(k: Float[Array, "N n n"]) -> Float[Array, "N"]:
+    """Determinants of N matrices.
+
+    Those of four rows are sums of products of minors of two rows (Laplace), quicker to compile.
+    """
     if k.shape[-1] != 4:
         none = jnp.zeros((k.shape[-1], 0), k.dtype)
         return jax.vmap(lambda matrix: solve_by_pivots(matrix, none)[1])(k)
@@ -290,8 +311,8 @@ def determinants(k: jax.Array) -> jax.Array:
 # ---- singular matrices: redundant contacts
 
 
-def load_shares(limit: jax.Array, least: float = 0.0) -> jax.Array:
-    """Weights of the contacts in the sharing of redundant forces: `limit` (m, ..) over the largest.
+def load_shares(limit: Float[Array, "m *B"], least: float = 0.0) -> Float[Array, "m *B"]:
+    """Weights `limit_j / max_k limit_k` of the contacts in the sharing of redundant forces.
 
     None is below `least`, which keeps the weights of contacts without load regular.
     """
@@ -301,28 +322,29 @@ def load_shares(limit: jax.Array, least: float = 0.0) -> jax.Array:
 
 
 def regularized(
-    matrix: jax.Array,
-    right: jax.Array,
-    ridge: jax.Array,
+    matrix: Float[Array, "n n *#B"],
+    right: Float[Array, "n *#B"],
+    ridge: Float[Array, "n *#B"],
     refinements: int,
     without_null: bool = False,
-) -> jax.Array:
-    """`matrix z = right` (n, B) where it may be singular: solved with a ridge (n, B) added to it.
+) -> Float[Array, "n *#B"]:
+    """z with `A z = right` where A may be singular: `(A + diag(ridge))^-1` and refinements.
 
-    Matrices are (n, n, B), or one (n, n) for all right sides with a ridge (n, 1).
-    Each refinement removes what the ridge changes where the matrix is regular, and makes the
-    derivatives right in one order more: the inverse has none. In its null space the inverse is
-    large, and so is its rounding: `without_null` subtracts this part of what it gives.
+    One matrix without batch serves all right sides, with a ridge of one column.
+    Each refinement `z <- z + (A + ridge)^-1 (right - A z)` removes what the ridge changes where A
+    is regular, and makes the derivatives right in one order more: the inverse has none. In the
+    null space of A the inverse is large, and so is its rounding: `without_null` subtracts that
+    part.
 
     The barriers keep XLA from computing what is multiplied once more for each column.
     """
-    kept = jax.lax.optimization_barrier
+    kept = jax.lax.optimization_barrier  # computed once, see above
     matrix, right = kept(matrix), kept(right)  # apart: only the right side is linear in tangents
     on_diagonal = ridge if matrix.ndim == 2 else ridge[:, None]
     inverted = jax.lax.stop_gradient(inverse(matrix + unit(matrix) * on_diagonal))
 
-    def solved(right: jax.Array) -> jax.Array:
-        """What the inverse gives."""
+    def solved(right: Float[Array, "n *#B"]) -> Float[Array, "n *#B"]:
+        """`z = (A + ridge)^-1 right`, `without_null` less `(A + ridge)^-1 ridge z`."""
         z = times(inverted, right)
         return z - times(inverted, ridge * z) if without_null else z
 
@@ -334,22 +356,28 @@ def regularized(
 
 
 @jax.custom_jvp
-def regularized_once(matrix: jax.Array, ridge: jax.Array, right: jax.Array) -> jax.Array:
-    """As `regularized` with one refinement; tangents solve the same equations."""
+def regularized_once(
+    matrix: Float[Array, "n n *#B"], ridge: Float[Array, "n *#B"], right: Float[Array, "n *#B"]
+) -> Float[Array, "n *#B"]:
+    """`regularized` with one refinement; tangents solve the same equations."""
     return regularized(matrix, right, ridge, 1)
 
 
 @regularized_once.defjvp
 @full_precision
-def _regularized_tangent(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
-    """The tangent `dz` of `matrix z = right` solves `matrix dz = dright - dmatrix z`."""
+def _regularized_tangent(
+    primals: Any, tangents: Any
+) -> tuple[Float[Array, "n *#B"], Float[Array, "n *#B"]]:
+    """z with `A z = right`, and its tangent dz, which solves `A dz = d right - dA z`."""
     (matrix, ridge, right), (dmatrix, _, dright) = primals, tangents
     z = regularized_once(matrix, ridge, right)
     return z, regularized_once(matrix, ridge, dright - times(dmatrix, z))
 
 
-def pseudoinverse(matrix: jax.Array, held: jax.Array) -> jax.Array:
-    """Of the rows and columns `held` (n, B) of a positive semidefinite (n, n, B); 0 elsewhere.
+def pseudoinverse(
+    matrix: Float[Array, "n n *B"], held: Bool[Array, "n *B"]
+) -> Float[Array, "n n *B"]:
+    """Pseudoinverses of positive semidefinite K in the rows and columns `held`; 0 elsewhere.
 
     It starts with a ridge, which Newton and Schulz's iteration `Z <- 2 Z - Z K Z` removes from what
     K transmits, to rounding; in the null space of K, forces are the least ones to some percent.
@@ -367,34 +395,37 @@ def pseudoinverse(matrix: jax.Array, held: jax.Array) -> jax.Array:
 
 
 class SingularValues(NamedTuple):
-    """`A = left diag(values) right` of a matrix (n, n), values (n,) falling; which of them are 0.
+    """Singular value decomposition `A = left diag(values) right`, values falling, of N matrices.
 
-    Where values are 0, vectors are an orthonormal basis of the null space.
+    `null` marks the values that are 0; their vectors are an orthonormal basis of the null space.
     """
 
-    left: jax.Array
-    values: jax.Array
-    right: jax.Array
-    null: jax.Array
+    left: Float[Array, "*N n n"]
+    values: Float[Array, "*N n"]
+    right: Float[Array, "*N n n"]
+    null: Bool[Array, "*N n"]
 
 
-def _are_null(values: jax.Array) -> jax.Array:
-    """Which of falling singular values (n, ..) are rounding of the largest one."""
+def _are_null(values: Float[Array, "n *N"]) -> Bool[Array, "n *N"]:
+    """Mask of singular values that are rounding: `<= precision.singular n` times the largest."""
     return values <= precision(values.dtype).singular * len(values) * values[:1]
 
 
 @jax.custom_batching.custom_vmap
-def singular_values(matrix: jax.Array) -> SingularValues:
-    """Of one matrix (n, n), without derivatives."""
+def singular_values(matrix: Float[Array, "n n"]) -> SingularValues:
+    """Singular value decomposition of one matrix, without derivatives."""
     left, values, right = jnp.linalg.svd(matrix)
     return SingularValues(left, values, right, _are_null(values))
 
 
 @singular_values.def_vmap
 def _batch_of_singular_values(
-    size: int, batched: Any, matrices: jax.Array
+    size: int, batched: Any, matrices: Float[Array, "N n n"]
 ) -> tuple[SingularValues, Any]:
-    """Batches by Jacobi's rotations: A V = U diag(values). A^T has U where values are 0."""
+    """Rule of `vmap`: Jacobi's rotations give `A V = U diag(values)` with orthogonal V.
+
+    Columns of U that belong to values of 0 come from the same rotations of A^T.
+    """
     all_batched: Any = SingularValues(True, True, True, True)  # type: ignore[arg-type]
     if matrices.shape[-1] > _BY_LOOP:
         left, values, right = jnp.linalg.svd(matrices)
@@ -408,23 +439,23 @@ def _batch_of_singular_values(
         lambda: jnp.where(null[None], _orthogonal(matrix.swapaxes(0, 1))[1], left),
         lambda: left,
     )
-    parts = SingularValues(left, values, right.swapaxes(0, 1), null)
-    return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), parts), all_batched
+    parts = left, values, right.swapaxes(0, 1), null
+    return SingularValues(*(jnp.moveaxis(x, -1, 0) for x in parts)), all_batched
 
 
 @jax.custom_batching.custom_vmap
-def eigenvectors(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Eigenvalues (n,) and eigenvectors (n, n), in columns, of one positive semidefinite matrix,
-    without derivatives."""
+def eigenvectors(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n"], Float[Array, "n n"]]:
+    """Eigenvalues and, in columns, eigenvectors of one positive semidefinite matrix, without
+    derivatives."""
     values, vectors = jnp.linalg.eigh(matrix)
     return values, vectors
 
 
 @eigenvectors.def_vmap
 def _batch_of_eigenvectors(
-    size: int, batched: Any, matrices: jax.Array
-) -> tuple[tuple[jax.Array, jax.Array], tuple[bool, bool]]:
-    """Batches by Jacobi's rotations: lengths of A V are the eigenvalues."""
+    size: int, batched: Any, matrices: Float[Array, "N n n"]
+) -> tuple[tuple[Float[Array, "N n"], Float[Array, "N n n"]], tuple[bool, bool]]:
+    """Rule of `vmap`: V by Jacobi's rotations, eigenvalues as the lengths of columns of A V."""
     if matrices.shape[-1] > _BY_LOOP:
         values, vectors = jnp.linalg.eigh(matrices)
         return (values, vectors), (True, True)
@@ -432,8 +463,10 @@ def _batch_of_eigenvectors(
     return (values.T, jnp.moveaxis(vectors, -1, 0)), (True, True)
 
 
-def _orthogonal(matrix: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """`A V` (n, n, B) with orthogonal columns, V, and their lengths (n, B), falling.
+def _orthogonal(
+    matrix: Float[Array, "n n B"],
+) -> tuple[Float[Array, "n n B"], Float[Array, "n n B"], Float[Array, "n B"]]:
+    """`A V` with orthogonal columns, the orthogonal V, and the falling lengths of columns of A V.
 
     In each round, columns at the same place of two rows are rotated. Then all but the first move
     on by one place, so that after a sweep each has met each.
@@ -446,15 +479,18 @@ def _orthogonal(matrix: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     both = jnp.pad(both, ((0, 0), (0, places - n), (0, 0)))
 
     class Sweep(NamedTuple):
-        """Two rows of columns, the largest square of a cosine between columns, sweeps done."""
+        """Columns of [A V; V] in two rows, the largest cos^2 between two of A V, sweeps done."""
 
-        first: jax.Array
-        second: jax.Array
-        cosine: jax.Array
-        done: jax.Array
+        first: Float[Array, "entries pairs B"]
+        second: Float[Array, "entries pairs B"]
+        cosine: Float[Array, ""]
+        done: Int[Array, ""]
 
-    def rotate(_: int, at: Sweep) -> Sweep:
-        """One round."""
+    def rotate(_: Any, at: Sweep) -> Sweep:
+        """State after one round: columns x, y of a pair are turned until x . y = 0, and move on.
+
+        The slope t of the angle is the small root of `t^2 + (|y|^2 - |x|^2) / (x . y) t = 1`.
+        """
         x, y, largest, done = at
         product = jnp.sum(x[:n] * y[:n], axis=0, keepdims=True)
         squares = [jnp.sum(columns[:n] ** 2, axis=0, keepdims=True) for columns in (x, y)]
@@ -474,7 +510,7 @@ def _orthogonal(matrix: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         return Sweep(first, jnp.concatenate([y[:, 1:], x[:, -1:]], axis=1), largest, done)
 
     def sweep(at: Sweep) -> Sweep:
-        """All rounds."""
+        """State after a sweep: as many rounds as make each column meet each other one."""
         start = at._replace(cosine=jnp.zeros_like(at.cosine))
         end = fori_loop(0, places - 1, rotate, start)
         return end._replace(done=at.done + 1)
@@ -493,8 +529,8 @@ def _orthogonal(matrix: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     return both[:n], both[n:], jnp.take_along_axis(length, order, axis=0)
 
 
-def null_projector(g: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Orthogonal projector (m, m) on the null space of G (unit diagonal), and whether it is not 0.
+def null_projector(g: Float[Array, "m m"]) -> tuple[Float[Array, "m m"], Bool[Array, ""]]:
+    """Orthogonal projector on the null space of G (unit diagonal), and whether it is not 0.
 
     Held constant in derivatives: a perturbation is taken to keep the rank.
     """
@@ -505,12 +541,12 @@ def null_projector(g: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def solve_symmetric(
-    g: jax.Array, right: jax.Array, *, regular: bool = False
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """`G x = right` of least norm (m,), whether G is singular, and whether no x solves it.
+    g: Float[Array, "m m"], right: Float[Array, "m"], *, regular: bool = False
+) -> tuple[Float[Array, "m"], Bool[Array, ""], Bool[Array, ""]]:
+    """x of least norm with `G x = right`, whether G is singular, and whether no x solves it.
 
-    `g` (m, m) is symmetric positive semidefinite with a diagonal of order 1, `regular` if that is
-    known beforehand.
+    G is symmetric positive semidefinite with a diagonal of order 1; `regular` if that is known
+    beforehand. With P the projector on its null space, `(G + P) x = right`.
     """
     if regular:
         no = jnp.asarray(False)

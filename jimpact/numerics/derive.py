@@ -26,6 +26,7 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
+from jaxtyping import Array, Float, Shaped
 
 from jimpact.numerics.tangents import TANGENT_AXIS, Dual, dual_like, is_dual, is_smooth, value_of
 from jimpact.tools.compiling import full_precision
@@ -52,14 +53,14 @@ REVERSE_ONLY = (
 
 
 class Kind(NamedTuple):
-    """Shape of an array but for the batch in its last axis, and type."""
+    """Shape of an array but for the batch in its last axis, and type of its numbers."""
 
     shape: tuple[int, ...]
     dtype: Any
 
     @property
     def smooth(self) -> bool:
-        """Whether it has derivatives."""
+        """True if arrays of this kind have derivatives."""
         return jnp.issubdtype(self.dtype, jnp.inexact)
 
 
@@ -86,7 +87,7 @@ def in_lanes(
 
 @contextmanager
 def naming_the_adjoint() -> Iterator[None]:
-    """Within, JAX's refusal of a forward mode names the option that forbids it."""
+    """Context in which JAX's refusal of a forward mode names the option that forbids it."""
     try:
         yield
     except TypeError as error:
@@ -102,11 +103,11 @@ def by_jacobian(function: Callable[[Any], Any], argument: Any) -> Any:
     as of any function.
     """
     leaves, tree = jax.tree.flatten(argument)
-    others = [None if eqx.is_array(x) else x for x in leaves]
+    others = [None if eqx.is_array(x) else x for x in leaves]  # leaves that are no arrays
     trees: list[Any] = []
 
     def of_arrays(*arrays: jax.Array) -> Arrays:
-        """The leaves of the result, from the arrays of the argument."""
+        """The leaves of the result, from the arrays in the argument."""
         values = iter(arrays)
         rebuilt = [next(values) if x is None else x for x in others]
         results, result_tree = jax.tree.flatten(function(jax.tree.unflatten(tree, rebuilt)))
@@ -128,7 +129,7 @@ def without_derivatives(values: Any, why: Exception) -> Any:
         return numbers
 
     def rule(primals: Any, tangents: Any) -> Any:
-        """Raises where a number is perturbed."""
+        """The values and their tangents of 0; raises `why` where a tangent is not known to be 0."""
         rates = jax.tree.leaves(tangents, is_leaf=lambda t: isinstance(t, SymbolicZero))
         if any(not isinstance(rate, SymbolicZero) for rate in rates):
             raise why
@@ -143,21 +144,21 @@ def without_derivatives(values: Any, why: Exception) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class _OneLane:
-    """A function of arrays, as one of arrays (.., 1)."""
+    """A function of arrays (..), as a function of arrays (.., 1): a batch of one."""
 
     function: Function
 
     def __call__(self, *arrays: jax.Array) -> Arrays:
-        """Its results, with an axis behind them."""
+        """Results (.., 1) of the function, from arrays (.., 1)."""
         return tuple(x[..., None] for x in self.function(*(x[..., 0] for x in arrays)))
 
 
 @dataclasses.dataclass(frozen=True)
 class _WithTangents:
-    """Results (.., B) of a function, then rates (.., B) of the smooth ones.
+    """Results (.., B) of a function f, then rates `sum_i (df / dx_i) t_i` of the smooth ones.
 
-    Arguments: those of the function, then tangents of those `marked`. With `many` tangents and
-    rates have an axis of directions in front.
+    Arguments: those of the function, then tangents t_i of those `marked`. With `many`, tangents and
+    rates have an axis of D directions in front: (D, .., B).
     """
 
     function: Function
@@ -165,13 +166,13 @@ class _WithTangents:
     many: bool = False
 
     def results(self, *kinds: Kind) -> Iterator[Kind]:
-        """Those of the function, then those of rates."""
+        """Kinds of the results of the function, then of the rates."""
         at, directions = kinds[: len(self.marked)], kinds[len(self.marked) :]
         many = directions[0].shape[:1] if self.many else ()
         return _with_rates(results_of(self.function, *at), many)
 
     def __call__(self, *arrays: jax.Array) -> Arrays:
-        """f(x), and `rate = sum_i (df / dx_i) t_i` for each direction t (a tangent of JAX)."""
+        """f(x), then the rates `sum_i (df / dx_i) t_i` in each direction t (a tangent of JAX)."""
         values, directions = arrays[: len(self.marked)], arrays[len(self.marked) :]
         if not self.many:
             directions = tuple(x[None] for x in directions)
@@ -183,32 +184,32 @@ class _WithTangents:
 
 @dataclasses.dataclass(frozen=True)
 class _WithJacobian:
-    """Results (.., B) of a function, then rates (D, .., B) of the smooth ones.
+    """Results (.., B) of a function f, then rates (D, .., B) of the smooth ones: their Jacobian.
 
-    D counts the entries of the `marked` arguments in a lane.
+    D counts the entries of the `marked` arguments in a lane: rate d is the derivative in entry d.
     """
 
     function: Function
     marked: tuple[bool, ...]
 
     def results(self, *kinds: Kind) -> Iterator[Kind]:
-        """Those of the function, then those of rates."""
+        """Kinds of the results of the function, then of the rates."""
         count = sum(math.prod(kind.shape) for kind, mark in zip(kinds, self.marked) if mark)
         return _with_rates(results_of(self.function, *kinds), (count,))
 
     def __call__(self, *arrays: jax.Array) -> Arrays:
-        """Results and rates; those of many directions by one run after the other."""
+        """f(x), then its Jacobian: rates along the unit vectors, DIRECTIONS of them in each run."""
         push = _WithTangents(self.function, self.marked, many=True)
         moving = [x for x, mark in zip(arrays, self.marked) if mark]
         sizes = [math.prod(x.shape[:-1]) for x in moving]
-        count = -(-sum(sizes) // DIRECTIONS)
-        size = -(-sum(sizes) // count)
+        count = -(-sum(sizes) // DIRECTIONS)  # runs, rounded up
+        size = -(-sum(sizes) // count)  # directions of a run
         unit = jnp.eye(count * size, sum(sizes), dtype=moving[0].dtype)
 
-        def along(rows: jax.Array) -> tuple[Arrays, Arrays]:
-            """Results, and rates in the directions (d, D) of these rows."""
+        def along(rows: Float[Array, "d D"]) -> tuple[Arrays, Arrays]:
+            """Results, and rates (d, .., B) in d directions, given by entries in all arguments."""
             directions, first = [], 0
-            for x, n in zip(moving, sizes):
+            for x, n in zip(moving, sizes):  # entries first .. first + n are those of x
                 own = rows[:, first : first + n].reshape(-1, *x.shape[:-1], 1)
                 own = jnp.broadcast_to(own, (len(rows), *x.shape))
                 directions.append(varying_like(own, x))
@@ -226,13 +227,13 @@ class _WithJacobian:
 
 
 def _with_rates(results: tuple[Kind, ...], many: tuple[int, ...]) -> Iterator[Kind]:
-    """Kinds of results, then of the rates of the smooth ones, in `many` directions."""
+    """Kinds of results, then of the rates of the smooth ones, with the axes `many` in front."""
     yield from results
     yield from (kind._replace(shape=(*many, *kind.shape)) for kind in results if kind.smooth)
 
 
 def _count_of_values(outs: Arrays) -> int:
-    """How many of the results with their rates are results."""
+    """Number of the results in a list of results and rates, in which each smooth one has a rate."""
     smooth = [is_smooth(x) for x in outs]
     return next(n for n in range(len(outs)) if n + sum(smooth[:n]) == len(outs))
 
@@ -240,15 +241,18 @@ def _count_of_values(outs: Arrays) -> int:
 def _push(
     function: Function, marked: tuple[bool, ...], arrays: Arrays, directions: Arrays
 ) -> tuple[Arrays, Arrays]:
-    """Results, and rates (d, .., B) of the smooth ones along directions of the `marked` arrays."""
+    """Results, and rates (d, .., B) of the smooth ones along d directions of the `marked` arrays.
+
+    Equation: `rate = sum_i (df / dx_i) t_i`, by one forward derivative (jvp) for each direction.
+    """
 
     def of_marked(*values: jax.Array) -> Arrays:
-        """`function` with the marked arguments replaced."""
+        """`function` of its marked arguments, the others as they are."""
         replaced = iter(values)
         return tuple(function(*(next(replaced) if m else x for x, m in zip(arrays, marked))))
 
     def one(*directions: jax.Array) -> tuple[Arrays, Arrays]:
-        """In one direction."""
+        """Results, and rates (.., B) of the smooth ones, in one direction."""
         outs, rates = jax.jvp(of_marked, moving, directions)
         return outs, tuple(rate for x, rate in zip(outs, rates) if is_smooth(x))
 
@@ -259,7 +263,7 @@ def _push(
 def _push_duals(
     function: Function, marked: tuple[bool, ...], arrays: Arrays, directions: Arrays
 ) -> tuple[Arrays, Arrays]:
-    """As `_push`, of a function that takes `Dual` arguments."""
+    """Results and rates as `_push`, of a function that takes `Dual` arguments."""
     inner = iter(jnp.moveaxis(x, 0, TANGENT_AXIS) for x in directions)
     duals = [Dual(x, next(inner)) if mark else x for x, mark in zip(arrays, marked)]
     outs = tuple(function(*duals))
@@ -269,12 +273,12 @@ def _push_duals(
 
 @functools.cache
 def _differentiable_lanes(function: Function, fine: Function, adjoint: str) -> Function:
-    """`_differentiable` in lanes, once for equal functions."""
+    """`function` in lanes with the derivatives of `fine`, made once for equal functions."""
     return _differentiable(_lanes(function), fine, adjoint, _differentiable_lanes)
 
 
 def _as_it_is(function: Function, fine: Function, adjoint: str) -> Function:
-    """`_differentiable` without lanes."""
+    """`function` with the derivatives of `fine`, not in lanes."""
     return _differentiable(function, fine, adjoint, _as_it_is)
 
 
@@ -285,11 +289,14 @@ def _differentiable(
 
     @jax.custom_jvp
     def value(*arrays: jax.Array) -> Arrays:
-        """The values."""
+        """The results of `run`."""
         return full_precision(run)(*arrays)
 
     def derivative(kind: Any, marked: tuple[bool, ...], *arrays: jax.Array) -> tuple[Arrays, Any]:
-        """Results of `fine` and their rates, which have derivatives again."""
+        """Results of `fine` and their rates, both with derivatives again.
+
+        `kind`: `_WithTangents` (arrays: arguments, tangents) or `_WithJacobian` (arguments).
+        """
         with_rates = kind(fine, marked)
         outs = again(with_rates, with_rates, adjoint)(*arrays)
         count = _count_of_values(outs)
@@ -297,7 +304,7 @@ def _differentiable(
 
     @full_precision
     def rule(primals: Arrays, tangents: tuple[Any, ...]) -> tuple[Arrays, tuple[Any, ...]]:
-        """Results of `fine`, and tangents: from its Jacobian, or along the direction."""
+        """Results of `fine` and their tangents: Jacobian times direction, or `forward` along it."""
         marked = tuple(not isinstance(t, SymbolicZero) for t in tangents)
         moving = [t for t, mark in zip(tangents, marked) if mark]
         if isinstance(fine, _WithTangents):
@@ -317,10 +324,13 @@ def _differentiable(
 def _second_order(
     first: _WithTangents, marked: tuple[bool, ...], primals: Arrays, moving: Arrays
 ) -> tuple[Arrays, tuple[Any, ...]]:
-    """Results of `first`, and their tangents: those of a product with the Jacobian."""
+    """Results of `first`, and their tangents: derivatives of its product with the Jacobian.
+
+    `first` is f'(x) t; its tangent is that of `J(x) t`, with J a function that has derivatives.
+    """
 
     def by_jacobian(*values: jax.Array) -> tuple[Arrays, Arrays]:
-        """Results, and those of them with derivatives."""
+        """Smooth results of `first`, then all, at its `marked` arguments x and t: `J(x) t`."""
         replaced = iter(values)
         arrays = [next(replaced) if mark else x for x, mark in zip(primals, marked)]
         count = len(first.marked)
@@ -337,13 +347,15 @@ def _second_order(
 
 
 def _with_zeros(outs: Arrays, rates: Iterator[jax.Array]) -> tuple[Any, ...]:
-    """Tangents of all results, from those of the smooth ones."""
+    """Tangents of all results: the `rates` of the smooth ones, symbolic zeros of the others."""
     none = (SymbolicZero(jax.typeof(x).to_tangent_aval()) for x in outs)
     return tuple(next(rates) if is_smooth(x) else zero for x, zero in zip(outs, none))
 
 
-def _contracted(rates: jax.Array, direction: jax.Array) -> jax.Array:
-    """The tangent (.., B) of a result from its rates (D, .., B) and the direction (D, B)."""
+def _contracted(
+    rates: Float[Array, "D *rows B"], direction: Float[Array, "D B"]
+) -> Float[Array, "*rows B"]:
+    """Tangent `sum_d rates_d direction_d` of a result: its Jacobian times a direction."""
     return jnp.einsum("d...b,db->...b", rates, direction)
 
 
@@ -353,17 +365,17 @@ def _reversible(function: Function, fine: Function) -> Function:
 
     @jax.custom_vjp
     def value(*arrays: jax.Array) -> Arrays:
-        """The values."""
+        """The results of `function`, without derivatives."""
         return _lanes(function)(*arrays)
 
     @full_precision
     def forward(*arrays: jax.Array) -> tuple[Arrays, Any]:
-        """Results of `fine`, and its transposed derivative."""
+        """Results of `fine`, and the product of cotangents with its transposed Jacobian."""
         if hasattr(fine, "only_first"):
             arrays = fine.only_first(arrays)
 
         def run(*arrays: jax.Array) -> tuple[Arrays, Arrays]:
-            """Results with derivatives, and all of them."""
+            """Results that have derivatives, and all results."""
             outs = fine(*arrays)
             return tuple(x for x in outs if is_smooth(x)), outs
 
@@ -371,7 +383,7 @@ def _reversible(function: Function, fine: Function) -> Function:
         return outs, back
 
     def backward(back: Any, cotangents: Arrays) -> Any:
-        """Cotangents of the arrays."""
+        """Cotangents of the arrays, `J^T c`, from those of the results."""
         return full_precision(back)(tuple(c for c in cotangents if is_smooth(c)))
 
     value.defvjp(forward, backward)
@@ -379,7 +391,7 @@ def _reversible(function: Function, fine: Function) -> Function:
 
 
 def _chunk_of(function: Any) -> int:
-    """Impacts that a CPU gets at a time."""
+    """Number of impacts that a CPU gets at a time of this function."""
     tangents = isinstance(function, _WithTangents | _WithJacobian)
     while isinstance(function, _WithTangents | _WithJacobian):
         function = function.function
@@ -408,7 +420,7 @@ def _lanes(function: Function) -> Function:
 
 @functools.cache
 def results_of(function: Function, *kinds: Kind) -> tuple[Kind, ...]:
-    """Of the results at arguments of these `kinds`: as the function states them, or by a trace."""
+    """Kinds of the results at arguments of these `kinds`: as the function says, or by a trace."""
     if hasattr(function, "results"):
         return tuple(function.results(*kinds))
     one = [jax.ShapeDtypeStruct((*kind.shape, 1), kind.dtype) for kind in kinds]
@@ -417,7 +429,7 @@ def results_of(function: Function, *kinds: Kind) -> tuple[Kind, ...]:
 
 @functools.cache
 def _compiled(function: Function) -> Function:
-    """`function` in chunks, compiled."""
+    """`function` in chunks of the batch, compiled."""
     return jax.jit(functools.partial(_in_chunks, function))
 
 
@@ -427,7 +439,7 @@ _lanes_p.multiple_results = True
 
 
 def _run_lanes(*arrays: jax.Array, function: Function, results: Any) -> Arrays:
-    """The operation as it is compiled, and run."""
+    """Results of the operation as it is compiled, and run."""
     return tuple(_compiled(function)(*arrays))
 
 
@@ -436,12 +448,12 @@ mlir.register_lowering(_lanes_p, mlir.lower_fun(_run_lanes, multiple_results=Tru
 
 
 def _kinds_of_results(*arguments: Any, function: Function, results: Any) -> list[Any]:
-    """What the operation returns: its results with the batch of the arguments."""
+    """Abstract arrays of the results: their kinds with the batch of the arguments behind."""
     first = arguments[0]
     batch = first.shape[-1]
 
     def like_first(kind: Kind) -> Any:
-        """An array of this kind that varies over the same axes of a mesh as the arguments."""
+        """An array of this kind that varies over the same axes of a mesh as the first argument."""
         shape = (*kind.shape, batch)
         whole = jax.sharding.PartitionSpec(*[None] * len(shape))
         sharding = jax.sharding.NamedSharding(first.sharding.mesh, whole)
@@ -476,8 +488,8 @@ def _batching_rule(
         values = _count_of_values(outs)
         return outs, tuple(None if i < values else 0 for i in range(len(outs)))
 
-    def wide(x: jax.Array, is_batched: bool) -> jax.Array:
-        """An array with both batches in its last axis."""
+    def wide(x: Shaped[Array, "..."], is_batched: bool) -> Shaped[Array, "..."]:
+        """An array with the batch of `vmap` and its own, one after the other, in its last axis."""
         if is_batched:
             x = jnp.moveaxis(x, 0, -2)
         else:
@@ -494,7 +506,7 @@ batching.primitive_batchers[_lanes_p] = _batching_rule
 
 @full_precision
 def _in_chunks(function: Function, *arrays: jax.Array) -> Arrays:
-    """On a CPU piece by piece, the last one filled up; on accelerators all at once."""
+    """Results of a function: chunk after chunk of the batch on a CPU, all at once elsewhere."""
     size = arrays[0].shape[-1]
     count = -(-size // _chunk_of(function))
     if count == 1:
@@ -502,15 +514,15 @@ def _in_chunks(function: Function, *arrays: jax.Array) -> Arrays:
     width = -(-size // count)
 
     def pieces(*whole: jax.Array) -> Arrays:
-        """All chunks, one after the other."""
+        """Results of all chunks, computed one after the other and joined."""
 
-        def cut(x: jax.Array) -> jax.Array:
-            """Chunks (count, .., width) of (.., B), the last one filled up with its last impact."""
+        def cut(x: Shaped[Array, "*rows B"]) -> Shaped[Array, "count *rows width"]:
+            """Chunks of the batch, the last one filled up with its last impact."""
             filled = jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, count * width - size)], mode="edge")
             return jnp.moveaxis(filled.reshape(*x.shape[:-1], count, width), -2, 0)
 
-        def join(x: jax.Array) -> jax.Array:
-            """The inverse of `cut`."""
+        def join(x: Shaped[Array, "count *rows width"]) -> Shaped[Array, "*rows B"]:
+            """The chunks side by side, without what fills up the last one: the inverse of `cut`."""
             joined = jnp.moveaxis(x, 0, -2)
             return joined.reshape(*joined.shape[:-2], count * width)[..., :size]
 

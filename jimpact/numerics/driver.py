@@ -6,6 +6,7 @@ from typing import Any, NamedTuple, TypeVar
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
 
 from jimpact.tools.loops import while_loop
 
@@ -27,11 +28,11 @@ Carry = TypeVar("Carry")
 class _Slots(NamedTuple):
     """Impacts that are being computed, one in each slot, and those that are over."""
 
-    impact: jax.Array  # (slots,) the impact that is in each slot
-    following: jax.Array  # () the first impact that still waits
-    flow: Any
-    carry: Any
-    ends: Any  # of all impacts, as far as they have left their slots
+    impact: Int[Array, "slots"]  # the impact that is in each slot
+    following: Int[Array, ""]  # the first impact that still waits
+    flow: Any  # parameters of the impacts in the slots
+    carry: Any  # their states
+    ends: Any  # states of all impacts, as far as they have left their slots
 
 
 def until_over(
@@ -42,19 +43,19 @@ def until_over(
     checkpoints: bool = False,
     slots: int | None = None,
 ) -> Carry:
-    """All impacts, or one motion, to their ends.
+    """States of all impacts, or of one motion, at their ends: passes until none goes on.
 
-    `goes_on(flow, carry)` says which (1, B) are not over, `advance(flow, carry)` makes one pass;
-    the batch B of impacts is the last axis of all arrays. With `checkpoints` the loop has a reverse
-    mode, in the place of a forward mode. A CPU has at most so many `slots` of impacts side by side;
-    None: all.
+    `goes_on(flow, carry)` is a mask (1, B) of those that are not over, `advance(flow, carry)` makes
+    one pass; the batch B of impacts is the last axis of all arrays. With `checkpoints` the loop has
+    a reverse mode, in the place of a forward mode. A CPU has at most so many `slots` of impacts
+    side by side; None: all.
     """
 
     def at_once(flow: Any, carry: Any) -> Any:
-        """All impacts side by side: they wait for the slowest one."""
+        """The ends of all impacts, side by side: they wait for the slowest one."""
 
-        def busy(carry: Any) -> jax.Array:
-            """Whether () any goes on."""
+        def busy(carry: Any) -> Bool[Array, ""]:
+            """True while an impact goes on."""
             return jnp.any(goes_on(flow, carry))
 
         if checkpoints:
@@ -63,7 +64,7 @@ def until_over(
         return while_loop(busy, lambda carry: advance(flow, carry), carry)
 
     def in_slots(flow: Any, carry: Any) -> Any:
-        """As a queue, in slots."""
+        """The ends of all impacts, as a queue for the slots."""
         return _in_slots(goes_on, advance, flow, carry, slots or count)
 
     count = jax.tree.leaves(carry)[0].shape[-1]
@@ -79,21 +80,22 @@ def _in_slots(
     carry: Any,
     size: int,
 ) -> Any:
-    """`until_over` of more impacts than there are slots, `size` of them."""
+    """The ends of more impacts than `size` slots: where one is over, the next one enters."""
     count = jax.tree.leaves(carry)[0].shape[-1]
     most_free = max(1, round(FREE * size))
 
-    def picked(tree: Any, impact: jax.Array) -> Any:
-        """The arrays (.., B) of these impacts."""
+    def picked(tree: Any, impact: Int[Array, "slots"]) -> Any:
+        """The columns of these impacts in all arrays (.., B) of the tree."""
         return jax.tree.map(lambda x: jnp.take(x, impact, axis=-1, mode="clip"), tree)
 
     def stored(s: _Slots) -> Any:
-        """All ends, those of the slots included."""
+        """The states of all impacts, those in slots as they are now."""
         return jax.tree.map(lambda x, new: x.at[..., s.impact].set(new), s.ends, s.carry)
 
     def refilled(s: _Slots) -> _Slots:
-        """The next impacts in place of those that are over."""
+        """The slots with the next waiting impacts in place of those that are over."""
         free = ~goes_on(s.flow, s.carry)[0]
+        # the first free slot gets the impact `following`, the second the one after it, ..
         next_one = s.following + jnp.cumsum(free, dtype=jnp.int32) - 1
         enters = free & (next_one < count)
         impact = jnp.where(enters, next_one, s.impact)
@@ -103,21 +105,22 @@ def _in_slots(
         return _Slots(impact, following, new_flow, new, stored(s))
 
     def next_round(s: _Slots) -> _Slots:
-        """Passes until enough slots are free, which are then filled."""
+        """The slots after passes until enough of them are free, which are then filled."""
 
-        def continues(carry: Any) -> jax.Array:
-            """Whether () too few slots are free to fill them, or some are busy at the end."""
+        def continues(carry: Any) -> Bool[Array, ""]:
+            """True while too few slots are free to fill them, or some are busy at the end."""
             busy = jnp.sum(goes_on(s.flow, carry), dtype=jnp.int32)
             return busy > jnp.where(s.following < count, size - most_free, 0)
 
         carry = while_loop(continues, lambda carry: advance(s.flow, carry), s.carry)
         return refilled(s._replace(carry=carry))
 
-    def open_work(s: _Slots) -> jax.Array:
-        """Whether () an impact goes on or waits."""
+    def open_work(s: _Slots) -> Bool[Array, ""]:
+        """True while an impact goes on or waits."""
         return jnp.any(goes_on(s.flow, s.carry)) | (s.following < count)
 
     first = jnp.arange(size, dtype=jnp.int32)
-    own, here = picked((flow, carry), first)
-    slots = _Slots(first, jnp.asarray(size, jnp.int32), own, here, carry)
+    flow_of_slots, carry_of_slots = picked((flow, carry), first)
+    following = jnp.asarray(size, jnp.int32)
+    slots = _Slots(first, following, flow_of_slots, carry_of_slots, carry)
     return stored(while_loop(open_work, next_round, slots))

@@ -13,11 +13,12 @@ in proportion to mu p, and normal impulses are the least, wherever that is allow
 """
 
 import itertools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from jimpact.numerics.dense import block_inverse, block_solve, load_shares, singular_values, times
 from jimpact.numerics.discs import in_disc, length_of, over
@@ -53,54 +54,53 @@ _SETTLED, _INSIDE = 1e-13, 1e-9
 
 
 class FrictionImpulses(NamedTuple):
-    """p (m,), p_t (m,) or (2 m,), the status code (), and columns (m + t, m + t) in which they are
-    free, p first (0: they are unique); without derivatives. Of up to 3 contacts also other `shares`
-    (2 m, m + t) with the same velocities: those with the least and the most p of each contact."""
+    """Impulses x = (p, p_t), n = m + t of them, and how far they are unique; without derivatives.
 
-    normal: jax.Array
-    tangential: jax.Array
-    status: jax.Array
-    free: jax.Array
-    shares: jax.Array | None
+    Of up to 3 contacts there are other `shares`, s = 2 m, with the same velocities: those with the
+    least and the most p of each contact.
+    """
+
+    normal: Float[Array, "m"]  # p
+    tangential: Float[Array, "t"]  # p_t, t = m or 2 m
+    status: Int[Array, ""]  # a code of `tools/status.py`
+    free: Float[Array, "n n"]  # columns in which they are free, p first; 0: they are unique
+    shares: Float[Array, "s n"] | None
 
 
 class _FrictionProblem(NamedTuple):
-    """A (m, b, m, b), (a, b) (m, b), mu (m,): contact-major, b = 1 + rows, diagonal of order 1."""
+    """The problem above, contact-major, b = 1 + rows, scaled to a diagonal of order 1."""
 
-    matrix: jax.Array
-    rate: jax.Array
-    friction: jax.Array
-    load: jax.Array | None
+    matrix: Float[Array, "m b m b"]  # A
+    rate: Float[Array, "m b"]  # (a, b)
+    friction: Float[Array, "m"]  # mu
+    load: Float[Array, "m"] | None
     complementary: bool
 
     @property
     def tolerance(self) -> float:
-        """Of what is satisfied, in parts of the size."""
+        """Misfit that counts as none, as a part of the size of the impulses."""
         return gathered_rounding(len(self.friction), self.matrix.dtype)
 
 
 class _Modes(NamedTuple):
-    """N modes: `taking` (m, N) has r = 0, not p = 0; `sticks` (m, N); `direction` (m, rows, N).
+    """N combinations of modes of m contacts."""
 
-    The direction of slip is 0 for a free contact. `turning` (m, N): see `_equations`.
-    """
-
-    taking: jax.Array
-    sticks: jax.Array
-    direction: jax.Array
-    turning: jax.Array
+    taking: Bool[Array, "m N"]  # r = 0, not p = 0
+    sticks: Bool[Array, "m N"]
+    direction: Float[Array, "m rows N"]  # of slip; 0 for a free contact
+    turning: Float[Array, "m N"]  # beta of `_equations`
 
 
 @full_precision
 def solve(
-    matrix: jax.Array,
-    normal: jax.Array,
-    slip: jax.Array,
-    friction: jax.Array,
+    matrix: Float[Array, "n n"],
+    normal: Float[Array, "m"],
+    slip: Float[Array, "t"],
+    friction: Float[Array, "m"],
     *,
     complementary: bool,
-    load: jax.Array | None = None,
-    sliding: jax.Array | None = None,
+    load: Float[Array, "m"] | None = None,
+    sliding: Float[Array, "t"] | None = None,
 ) -> FrictionImpulses:
     """Impulses `x = (p, p_t)` of contacts with Coulomb friction.
 
@@ -108,16 +108,16 @@ def solve(
     `s = slip + A_t x`, `p_t in -mu max(p, 0) Sgn(s)`.
 
     Args:
-        matrix: A (m + t, m + t), normals first, then the t = m (planar) or 2 m tangents,
+        matrix: A, n = m + t rows, normals first, then the t = m (planar) or 2 m tangents,
             contact-major. A contact that takes no part has rows and columns of a unit matrix.
-        normal: (m,) what gamma+ - gamma- must make up for; the same for accelerations.
-        slip: (t,) `(1 + e_t) u-`.
-        friction: mu (m,).
+        normal: what gamma+ - gamma- must make up for; the same for accelerations.
+        slip: `(1 + e_t) u-`.
+        friction: mu.
         complementary: contacts may part; otherwise they may pull (without friction).
-        load: (m,) >= 0, normal impulses in addition to p, which friction includes: it is bounded by
+        load: >= 0, normal impulses in addition to p, which friction includes: it is bounded by
             `mu (p + load)`, and acts on contacts with p = 0 too. None: 0. One below rounding counts
             as one that begins: where p = 0 = r, derivatives are those of a contact that opens.
-        sliding: (t,) unit vectors of slip where it is known (forces of contacts that slide
+        sliding: unit vectors of slip where it is known (forces of contacts that slide
             already: s, an acceleration, does not decide), 0 where it is unknown. Not together
             with `load`.
 
@@ -149,8 +149,10 @@ def solve(
     """
     m = len(normal)
     rows = len(slip) // m
+    # rows of A (m, b) of each contact: its normal, then its tangents
     order = np.concatenate([np.arange(m)[:, None], m + np.arange(m * rows).reshape(m, rows)], 1)
     of_contacts = matrix[order[:, :, None, None], order[None, None]]
+    # unknowns are scaled to a diagonal of 1, both tangents of a contact alike
     squares = jnp.diagonal(jax.lax.stop_gradient(matrix))[order]
     squares = jnp.stack([squares[:, 0], jnp.mean(squares[:, 1:], axis=1)], axis=1)
     norm = jnp.sqrt(jnp.where(squares > 0, squares, 1.0))
@@ -158,8 +160,8 @@ def solve(
     rate = jnp.concatenate([normal[:, None], slip.reshape(m, rows)], axis=1) * scale
     friction = friction * norm[:, 1] / norm[:, 0]
     of_contacts = of_contacts * scale[:, :, None, None] * scale[None, None]
-    drag = jnp.zeros((m, rows), matrix.dtype)
-    if sliding is not None:
+    drag = jnp.zeros((m, rows), matrix.dtype)  # p_t / p of contacts whose slip is known
+    if sliding is not None:  # their p_t = drag p moves into the column of p; unit rows of p_t
         slides = jnp.any(sliding.reshape(m, rows) != 0, axis=1)
         drag = -friction[:, None] * sliding.reshape(m, rows)
         dragged = jnp.sum(of_contacts[..., 1:] * drag[None, None], axis=3)
@@ -180,10 +182,11 @@ def solve(
         complementary,
     )
     fixed = _FrictionProblem(*jax.lax.stop_gradient(problem[:4]), complementary)
-    modes, decided, status, others = (_enumerate if m <= ENUMERATED else _search)(fixed)
-    modes, inverted = _most_at_rest(fixed, modes, decided)
+    decision = (_enumerate if m <= ENUMERATED else _search)(fixed)
+    decided = decision.impulse
+    modes, inverted = _most_at_rest(fixed, decision.modes, decided)
     free, code = _freedom(fixed, inverted)
-    status = jnp.maximum(status, code)
+    status = jnp.maximum(decision.status, code)
     x = _on_modes(problem, modes, inverted, decided)
     missed = _misfit(fixed, jax.lax.stop_gradient(x)[..., None], _size(decided[..., None]))[0]
     wrong = ~(missed <= fixed.tolerance)
@@ -193,51 +196,64 @@ def solve(
     free = jax.lax.stop_gradient(scale)[..., None] * free.reshape(*scale.shape, -1)
     free = _normals_first(free)
     shares = None
-    if others is not None:
-        shares = _normals_first(jax.lax.stop_gradient(scale * size)[..., None] * others).T
+    if decision.others is not None:
+        shares = _normals_first(jax.lax.stop_gradient(scale * size)[..., None] * decision.others).T
     return FrictionImpulses(p, x[:, 1:].reshape(-1), status, free, shares)
 
 
-def _normals_first(x: jax.Array) -> jax.Array:
-    """(m + t, N) of (m, b, N)."""
+class _Decision(NamedTuple):
+    """The modes that were decided on, and how far they are the only ones."""
+
+    modes: _Modes  # N = 1
+    impulse: Float[Array, "m b"]  # x on them
+    status: Int[Array, ""]
+    others: Float[Array, "m b s"] | None  # with the least and the most p of each contact, s = 2 m
+
+
+def _normals_first(x: Float[Array, "m b N"]) -> Float[Array, "n N"]:
+    """Rows of contacts reordered: the normal of each, then the tangents, contact-major."""
     return jnp.concatenate([x[:, 0], x[:, 1:].reshape(-1, x.shape[2])])
 
 
 # ------------------------------------------------------------------- the equations of modes
 
 
-def _rates(problem: _FrictionProblem, x: jax.Array) -> jax.Array:
-    """(r, s) (m, b, N) of impulses (m, b, N)."""
+def _rates(problem: _FrictionProblem, x: Float[Array, "m b N"]) -> Float[Array, "m b N"]:
+    """Rates `(r, s) = (a, b) + A x` of N impulses x."""
     if len(x) <= ENUMERATED:
         return problem.rate[..., None] + _times(problem.matrix[..., None], x)
     return problem.rate[..., None] + jnp.tensordot(problem.matrix, x, 2)  # never computed twice
 
 
-def _times(matrix: jax.Array, x: jax.Array) -> jax.Array:
-    """(m, b, N) of matrices (m, b, m, b, N) and (m, b, N)."""
+def _times(matrix: Float[Array, "m b m b #N"], x: Float[Array, "m b N"]) -> Float[Array, "m b N"]:
+    """Products `A x` of one or N matrices with N impulses x."""
     return jnp.sum(matrix * x[None, None], axis=(2, 3))
 
 
-def _bound(problem: _FrictionProblem, x: jax.Array) -> jax.Array:
-    """mu (p + load) (m, N)."""
+def _bound(problem: _FrictionProblem, x: Float[Array, "m b N"]) -> Float[Array, "m N"]:
+    """Radii `mu (max(p, 0) + load)` of the discs of friction."""
     p = jnp.maximum(x[:, 0], 0.0)
     return problem.friction[:, None] * (p if problem.load is None else p + problem.load[:, None])
 
 
-def _rubs(problem: _FrictionProblem) -> jax.Array:
-    """Which contacts (m, 1) have friction: without it none sticks, also where it does not slip."""
+def _rubs(problem: _FrictionProblem) -> Bool[Array, "m 1"]:
+    """Mask of contacts with friction: without it none sticks, also where it does not slip."""
     return problem.friction[:, None] > 0
 
 
-def _size(x: jax.Array) -> jax.Array:
-    """(N,) of (m, b, N); the rates without impulses have size 1."""
+def _size(x: Float[Array, "m b *N"]) -> Float[Array, "*N"]:
+    """Sizes `1 + max |x|` of one or N impulses; the rates without impulses have size 1."""
     return 1 + jnp.abs(x).max(axis=(0, 1))
 
 
-def _misfit(problem: _FrictionProblem, x: jax.Array, size: jax.Array | None = None) -> jax.Array:
-    """How far x (m, b, N) is from what the law makes of it (N,), in parts of its size.
+def _misfit(
+    problem: _FrictionProblem, x: Float[Array, "m b N"], size: Float[Array, "N"] | None = None
+) -> Float[Array, "N"]:
+    """Largest violation of the law by x, as a part of the size of x.
 
-    Or of another size (N,): impulses that follow from x must not hide their errors by growing.
+    Normal: |min(p, r)|, or |r| where r = 0 is prescribed; tangential: the distance of p_t from the
+    projection of p_t - s on the disc. Another `size` is given where impulses follow from x: they
+    must not hide their errors by growing.
     """
     rate = _rates(problem, x)
     p, r, side = x[:, 0], rate[:, 0], x[:, 1:]
@@ -247,8 +263,10 @@ def _misfit(problem: _FrictionProblem, x: jax.Array, size: jax.Array | None = No
     return most / (_size(x) if size is None else size)
 
 
-def _equations(problem: _FrictionProblem, modes: _Modes) -> tuple[jax.Array, jax.Array]:
-    """Linear equations (m, b, m, b, N), (m, b, N) of modes: r = 0 or p = 0, and
+def _equations(
+    problem: _FrictionProblem, modes: _Modes
+) -> tuple[Float[Array, "m b m b N"], Float[Array, "m b N"]]:
+    """Matrices and right sides of the linear equations of modes: r = 0 or p = 0, and
 
         Q s + (1 - Q) p_t + mu (p + load) d = 0
 
@@ -272,6 +290,7 @@ def _equations(problem: _FrictionProblem, modes: _Modes) -> tuple[jax.Array, jax
     pressed = friction_direction[:, :, None, None] * own * first
     # term by term: in single precision XLA may crash on sums within batches of so many axes
     apart = (problem.matrix - unit)[..., None]
+    # Q A + (1 - Q) = 1 + Q (A - 1)
     moved = sum(q[:, :, k, None, None] * apart[:, None, k] for k in range(1 + rows))
     right = -jnp.sum(q * problem.rate[:, None, :, None], axis=2)
     if problem.load is not None:
@@ -279,8 +298,11 @@ def _equations(problem: _FrictionProblem, modes: _Modes) -> tuple[jax.Array, jax
     return moved + pressed + unit[..., None], right
 
 
-def _turned(problem: _FrictionProblem, modes: _Modes, x: jax.Array) -> _Modes:
-    """The modes with the directions of slip that x (m, b, N) has, in space."""
+def _turned(problem: _FrictionProblem, modes: _Modes, x: Float[Array, "m b N"]) -> _Modes:
+    """Modes with the directions `d = (s - p_t) / |s - p_t|` of slip that x has, in space.
+
+    `turning` is the beta of `_equations`.
+    """
     if modes.direction.shape[1] == 1:
         return modes
     slip = _rates(problem, x)[:, 1:]
@@ -288,21 +310,21 @@ def _turned(problem: _FrictionProblem, modes: _Modes, x: jax.Array) -> _Modes:
     length, bound = length_of(pull), _bound(problem, x)
     slides = (length_of(modes.direction) > 0) & (length > 0)
     direction = jnp.where(slides[:, None], over(pull, length), modes.direction)
-    whole = bound + length_of(slip)
-    turning = jnp.where(slides & (whole > 0), bound / jnp.where(whole > 0, whole, 1.0), 0.0)
+    both = bound + length_of(slip)
+    turning = jnp.where(slides & (both > 0), bound / jnp.where(both > 0, both, 1.0), 0.0)
     return modes._replace(direction=direction, turning=turning)
 
 
-def _solved(problem: _FrictionProblem, modes: _Modes) -> jax.Array:
-    """x (m, b, N) on modes, contact by contact; wrong where their equations are singular.
+def _solved(problem: _FrictionProblem, modes: _Modes) -> Float[Array, "m b N"]:
+    """Impulses x on modes, contact by contact; wrong where their equations are singular.
 
     Refinements undo what `block_inverse` perturbs.
     """
     matrix, right = _equations(problem, modes)
     inverse = block_inverse(matrix)
 
-    def refine(_: int, x: jax.Array) -> jax.Array:
-        """One refinement by the approximate inverse."""
+    def refine(_: Any, x: Float[Array, "m b N"]) -> Float[Array, "m b N"]:
+        """One refinement `x + E^-1 (right - E x)` by the approximate inverse."""
         return x + _times(inverse, right - _times(matrix, x))
 
     return fori_loop(0, 3, refine, jnp.zeros_like(right))
@@ -312,9 +334,10 @@ def _solved(problem: _FrictionProblem, modes: _Modes) -> jax.Array:
 
 
 def _table(contacts: int, rows: int, loaded: bool) -> tuple[np.ndarray, np.ndarray]:
-    """All modes (m, N), sticking before sliding before free: 0 sticks, 1 is free, 2... slide.
+    """All combinations of modes (m, N), most sticking first: 0 sticks, 1 is free, 2, 3, .. slide.
 
-    And which take part: all that are not free, but with a load any other with p = 0 as well.
+    And the mask (m, N) of contacts with r = 0: all that are not free; with a load those may have
+    p = 0 instead, and none is free.
     """
     slides = 2 if rows == 1 else _DIRECTIONS
     if not loaded:
@@ -327,16 +350,14 @@ def _table(contacts: int, rows: int, loaded: bool) -> tuple[np.ndarray, np.ndarr
     return table[0], table[1] == 1
 
 
-def _enumerate(
-    problem: _FrictionProblem,
-) -> tuple[_Modes, jax.Array, jax.Array, jax.Array]:
-    """The consistent modes (N = 1) that stick most, their x (m, b), the status, and the x
-    (m, b, 2 m) of consistent modes with the least and the most p of each contact."""
+def _enumerate(problem: _FrictionProblem) -> _Decision:
+    """The consistent modes that stick most, of all modes, and what other consistent ones give."""
     m, rows = len(problem.friction), problem.rate.shape[1] - 1
     dtype = problem.matrix.dtype
     kinds, taking = _table(m, rows, problem.load is not None)
     angle = 2 * np.pi * (kinds - 2) / (2 if rows == 1 else _DIRECTIONS)
     turned = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    # rotations (rows, rows, m, N) of the first direction, 0 where a contact does not slide
     turn = jnp.asarray(np.where(kinds > 1, turned, 0.0)[:rows, :rows], dtype)
     begin = jnp.ones((m, 1, 1), dtype)
     if rows == 2:  # the slip without impulses, if there is some
@@ -355,8 +376,8 @@ def _enumerate(
     good = (misfit <= problem.tolerance) & (_size(x) < 1 / root)
     best = jnp.where(jnp.any(good), jnp.argmax(good), jnp.nanargmin(misfit))
 
-    def differ(values: jax.Array) -> jax.Array:
-        """Whether consistent modes differ in these values from the chosen ones."""
+    def differ(values: Float[Array, "m b N"]) -> Bool[Array, ""]:
+        """True if these values of consistent modes differ from those of the chosen ones."""
         apart = jnp.abs(values - values[..., best][..., None]).max(axis=(0, 1))
         return jnp.any(good & (apart > root * _size(x[..., best])))
 
@@ -364,29 +385,31 @@ def _enumerate(
     status = jnp.where(differ(_rates(problem, x)), CODE["several_outcomes"], status)
     none = CODE["infeasible" if rows == 1 else "max_steps"]
     chosen = jax.tree.map(lambda leaf: leaf[..., best][..., None], modes)
-    signed = jnp.concatenate([x[:, 0], -x[:, 0]])
+    signed = jnp.concatenate([x[:, 0], -x[:, 0]])  # p and -p (2 m, N)
     extreme = jnp.argmin(jnp.where(good, signed, jnp.inf), axis=1)
     others = x[..., jnp.where(jnp.any(good), extreme, best)]
-    return chosen, x[..., best], jnp.where(jnp.any(good), status, none), others
+    return _Decision(chosen, x[..., best], jnp.where(jnp.any(good), status, none), others)
 
 
-def _newton(problem: _FrictionProblem, modes: _Modes) -> tuple[_Modes, jax.Array]:
-    """x (m, b, N) of modes, in space with the directions of slip that they lead to."""
+def _newton(problem: _FrictionProblem, modes: _Modes) -> tuple[_Modes, Float[Array, "m b N"]]:
+    """Impulses x of modes, in space with the directions of slip that they lead to."""
     none = jnp.zeros((*problem.rate.shape, modes.taking.shape[1]), problem.matrix.dtype)
     if modes.direction.shape[1] == 1:
         return modes, _solved(problem, modes)
 
-    def step(_: int, state: tuple[_Modes, jax.Array]) -> tuple[_Modes, jax.Array]:
-        """Impulses, and the directions of slip that follow from them."""
+    def step(
+        _: Any, state: tuple[_Modes, Float[Array, "m b N"]]
+    ) -> tuple[_Modes, Float[Array, "m b N"]]:
+        """Modes with the directions of slip of their impulses x, and x."""
         x = _solved(problem, state[0])
         return _turned(problem, state[0], x), x
 
     return fori_loop(0, _ITERATIONS, step, (modes, none))
 
 
-def _at_rest(problem: _FrictionProblem, x: jax.Array, margin: jax.Array) -> _Modes:
-    """The modes (N = 1) that x (m, b) has: contacts stick that slip by less than `margin`."""
-    rate = _rates(problem, x[..., None])
+def _at_rest(problem: _FrictionProblem, x: Float[Array, "m b"], margin: Float[Array, ""]) -> _Modes:
+    """The modes (N = 1) that x has, where contacts stick that slip by less than `margin`."""
+    rate = _rates(problem, x[..., None])  # (r, s)
     margin = (margin * _size(x[..., None]))[None]
     taking = rate[:, 0] <= margin if problem.complementary else jnp.ones(rate[:, 0].shape, bool)
     if problem.load is not None:
@@ -404,21 +427,21 @@ def _at_rest(problem: _FrictionProblem, x: jax.Array, margin: jax.Array) -> _Mod
 
 
 class _Inverted(NamedTuple):
-    """Of the equations E of modes, with the weights D of the sharing and no derivatives.
+    """Inverse of the equations E of modes, with the weights D of the sharing and no derivatives.
 
-    B = E D = U S V^T: `inverse` (n, n) of B + U_0 V_0^T, `pairs` U_0 V_0^T of its null vectors,
-    and D (m, b). `held`: free contacts remain free, as the least is not allowed. Of more than
-    `_SHARED` rows the inverse is that of B with a ridge, and the pairs are 0.
+    B = E D = U S V^T with n = m b rows: `inverse` is that of B + U_0 V_0^T, U_0 and V_0 the null
+    vectors. `held`: free impulses remain as they are, as the least ones are not allowed. Of more
+    than `_SHARED` rows the inverse is that of B with a ridge, and the pairs are 0.
     """
 
-    inverse: jax.Array
-    pairs: jax.Array
-    weight: jax.Array
-    held: jax.Array
+    inverse: Float[Array, "n n"]
+    pairs: Float[Array, "n n"]  # U_0 V_0^T
+    weight: Float[Array, "m b"]  # D
+    held: Bool[Array, ""]
 
 
-def _inverted(problem: _FrictionProblem, modes: _Modes, x: jax.Array) -> _Inverted:
-    """The equations of modes, inverted; see the class."""
+def _inverted(problem: _FrictionProblem, modes: _Modes, x: Float[Array, "m b"]) -> _Inverted:
+    """The equations of modes at x, inverted; see the class."""
     n = x.size
     matrix, _ = _equations(problem, _turned(problem, modes, x[..., None]))
     weight = 1 / jnp.sqrt(_weights(problem, x))
@@ -431,14 +454,14 @@ def _inverted(problem: _FrictionProblem, modes: _Modes, x: jax.Array) -> _Invert
     return _Inverted(inverse, jnp.where(null[None], left, 0.0) @ right, weight, jnp.asarray(True))
 
 
-def _weights(problem: _FrictionProblem, x: jax.Array) -> jax.Array:
-    """(m, b) of the squares of impulses in what is least where they are shared."""
+def _weights(problem: _FrictionProblem, x: Float[Array, "m b"]) -> Float[Array, "m b"]:
+    """Weights w of the `sum w x^2` that shared impulses make least: 1 of p, 1 / share of p_t."""
     share = load_shares(_bound(problem, x[..., None]), _LEAST_SHARE)
     return jnp.concatenate([jnp.ones_like(share), jnp.repeat(1 / share, x.shape[1] - 1, 1)], 1)
 
 
 def _most_at_rest(
-    problem: _FrictionProblem, modes: _Modes, x: jax.Array
+    problem: _FrictionProblem, modes: _Modes, x: Float[Array, "m b"]
 ) -> tuple[_Modes, _Inverted]:
     """Modes with the velocities of x where all sticks that can, if its shared impulses are allowed.
 
@@ -458,8 +481,10 @@ def _most_at_rest(
     return jax.tree.map(lambda leaf: jnp.where(allowed, *leaf), (both, inverted))
 
 
-def _freedom(problem: _FrictionProblem, inverted: _Inverted) -> tuple[jax.Array, jax.Array]:
-    """Columns (n, n) in which impulses are free, and a status that says what they change."""
+def _freedom(
+    problem: _FrictionProblem, inverted: _Inverted
+) -> tuple[Float[Array, "n n"], Int[Array, ""]]:
+    """Columns `D V_0 U_0^T` in which impulses are free, and a status that says what they change."""
     free = inverted.weight.reshape(-1, 1) * inverted.pairs.T
     if len(free) > _SHARED:  # there the inverse is large where impulses are free
         not_unique = jnp.max(jnp.abs(inverted.inverse)) > _RIDGE**-0.5
@@ -472,18 +497,19 @@ def _freedom(problem: _FrictionProblem, inverted: _Inverted) -> tuple[jax.Array,
 
 
 def _on_modes(
-    problem: _FrictionProblem, modes: _Modes, inverted: _Inverted, x: jax.Array
-) -> jax.Array:
-    """x (m, b) on its modes, with derivatives up to the third, by as many chord steps.
+    problem: _FrictionProblem, modes: _Modes, inverted: _Inverted, x: Float[Array, "m b"]
+) -> Float[Array, "m b"]:
+    """Impulses x on their modes, with derivatives up to the third, by as many chord steps.
 
-    With y = x / D it solves `B y = f` and `V_0^T (D W D) y = 0`, or holds `V_0^T y`.
+    With y = x / D it solves `B y = f` and `V_0^T (D W D) y = 0`, W the `_weights`, or holds
+    `V_0^T y`.
     """
     shape, n = x.shape, x.size
     weight = inverted.weight.reshape(n)
     start = x.reshape(n) / weight
 
-    def step(_: int, y: jax.Array) -> jax.Array:
-        """One chord step."""
+    def step(_: Any, y: Float[Array, "n"]) -> Float[Array, "n"]:
+        """One chord step `y - inverse (E x - f + U_0 V_0^T D W D y)`, x = D y."""
         x = (weight * y).reshape(shape)
         matrix, right = _equations(problem, _turned(problem, modes, x[..., None]))
         shared = weight**2 * _weights(problem, x).reshape(n) * y
@@ -497,8 +523,11 @@ def _on_modes(
 # ------------------------------------------------------------------- many contacts
 
 
-def _modes_at(problem: _FrictionProblem, x: jax.Array) -> _Modes:
-    """The modes (N = 1) to which x (m, b) is closest, by which Newton's method goes on."""
+def _modes_at(problem: _FrictionProblem, x: Float[Array, "m b"]) -> _Modes:
+    """The modes (N = 1) to which x is closest, by which Newton's method goes on.
+
+    r = 0 where p > r; a contact sticks where |s - p_t| is within its disc.
+    """
     x = x[..., None]
     rate, p = _rates(problem, x), x[:, 0]
     taking = p > rate[:, 0] if problem.complementary else jnp.ones(p.shape, bool)
@@ -510,34 +539,36 @@ def _modes_at(problem: _FrictionProblem, x: jax.Array) -> _Modes:
     return _turned(problem, _Modes(taking, sticks, direction, jnp.zeros_like(p)), x)
 
 
-def _search(problem: _FrictionProblem) -> tuple[_Modes, jax.Array, jax.Array, None]:
-    """Modes, x (m, b) and status of many contacts; other shares are not looked for.
+def _search(problem: _FrictionProblem) -> _Decision:
+    """Modes of many contacts; other shares are not looked for.
 
     By attempts of interior points, the last one by projections where contacts may part, each
     with Newton's method on the modes that it leads to.
     """
 
-    def misfit(x: jax.Array) -> jax.Array:
-        """How far x is from the law."""
+    def misfit(x: Float[Array, "m b"]) -> Float[Array, ""]:
+        """Largest violation of the law by x, as a part of its size."""
         return _misfit(problem, x[..., None])[0]
 
-    def polish(x: jax.Array) -> jax.Array:
-        """A step of Newton's method on the modes of x; what is free in them stays as it is."""
+    def polish(x: Float[Array, "m b"]) -> Float[Array, "m b"]:
+        """x after a step of Newton's method on its modes; what is free in them stays as it is."""
         matrix, right = (y[..., 0] for y in _equations(problem, _modes_at(problem, x)))
         missed = (right - jnp.sum(matrix * x[None, None], axis=(2, 3)))[..., None]
         return x + block_solve(matrix + _RIDGE * unit, missed)[..., 0]
 
-    def newton(state: tuple[jax.Array, Best, jax.Array]) -> tuple[jax.Array, Best, jax.Array]:
-        """One step, which may lead away for once."""
+    def newton(
+        state: tuple[Float[Array, "m b"], Best, Int[Array, ""]],
+    ) -> tuple[Float[Array, "m b"], Best, Int[Array, ""]]:
+        """x after a step of Newton's method, which may be worse; the best x; steps done."""
         x = polish(state[0])
         return x, better(misfit, state[1], x), state[2] + 1
 
-    def wrong(best: Best) -> jax.Array:
-        """Whether the law is not satisfied; also NaN."""
+    def wrong(best: Best) -> Bool[Array, ""]:
+        """True if the law is not satisfied; also where the misfit is NaN."""
         return ~(best.misfit <= problem.tolerance)
 
-    def attempt(state: tuple[Best, jax.Array]) -> tuple[Best, jax.Array]:
-        """The best so far, or what another attempt leads to."""
+    def attempt(state: tuple[Best, Int[Array, ""]]) -> tuple[Best, Int[Array, ""]]:
+        """The best so far, or what attempt `number` leads to, and the number of the next one."""
         best, number = state
         tried = within_cones(cones, misfit, number, problem.tolerance)
         if problem.complementary:
@@ -558,11 +589,13 @@ def _search(problem: _FrictionProblem) -> tuple[_Modes, jax.Array, jax.Array, No
     most = ATTEMPTS + 1 if problem.complementary else ATTEMPTS
     best, _ = while_loop(lambda s: wrong(s[0]) & (s[1] < most), attempt, start)
     status = jnp.where(wrong(best), CODE["max_steps"], CODE["ok"])
-    return _modes_at(problem, best.impulse), best.impulse, status, None
+    return _Decision(_modes_at(problem, best.impulse), best.impulse, status, None)
 
 
-def _projected(problem: _FrictionProblem, x: jax.Array, needed: jax.Array) -> jax.Array:
-    """What projections make of x (m, b), if they are `needed` ()."""
+def _projected(
+    problem: _FrictionProblem, x: Float[Array, "m b"], needed: Bool[Array, ""]
+) -> Float[Array, "m b"]:
+    """Impulses after accelerated projections from x (`many_contacts.py`), if they are `needed`."""
     return solve_many(
         lambda x: jnp.sum(problem.matrix * x[None, None], axis=(2, 3)),
         jnp.ones_like(problem.rate),
@@ -580,22 +613,25 @@ def _projected(problem: _FrictionProblem, x: jax.Array, needed: jax.Array) -> ja
 
 
 def distribute(
-    matrix: jax.Array, rate: jax.Array, limit: jax.Array, candidates: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Which `candidates` stick, and where the others slide to; normal forces are known.
+    matrix: Float[Array, "t t B"],
+    rate: Float[Array, "t B"],
+    limit: Float[Array, "m B"],
+    candidates: Bool[Array, "m B"],
+) -> tuple[Bool[Array, "m B"], Float[Array, "t B"]]:
+    """Mask of the `candidates` that stick, and where the others slide to; normal forces are known.
 
     Equation: `u' = rate + K lambda`, lambda in the discs |lambda_j| <= limit_j,
     `lambda_j in -limit_j Sgn(u_j')`. This is a convex problem: u' is unique. A decision, without
     derivatives: forces follow from the modes, to rounding.
 
     Args:
-        matrix: K (t, t, B), positive semidefinite, t = m (planar) or 2 m, contact-major.
-        rate: (t, B) u' without the forces of these contacts.
-        limit: mu F (m, B).
-        candidates: (m, B); other contacts have no force here.
+        matrix: K, positive semidefinite, t = m (planar) or 2 m, contact-major.
+        rate: u' without the forces of these contacts.
+        limit: mu F.
+        candidates: other contacts have no force here.
 
     Returns:
-        Which contacts stick (m, B), and the directions (t, B) of slip of the others. A contact in
+        A mask of the contacts that stick, and the directions of slip of the others. A contact in
         space that others hold on the rim of its disc counts as sliding, at speed 0, against its
         force. Contacts are relaxed in turn, 200 times at most: of strongly coupled ones near the
         rim (of random pairs with nearly equal tangents 3 %) the last to settle may be wrong.
@@ -625,13 +661,15 @@ def distribute(
     return candidates & stick, jnp.where(pushed, -force, slip)
 
 
-def _lengths(force: jax.Array, rows: int) -> jax.Array:
-    """|lambda_j| (m, B) of tangential rows (t, B)."""
+def _lengths(force: Float[Array, "t *B"], rows: int) -> Float[Array, "m *B"]:
+    """|lambda_j| of each contact j, from its one or two tangential rows."""
     return jnp.sqrt(jnp.sum(force.reshape(-1, rows, *force.shape[1:]) ** 2, axis=1))
 
 
-def _relaxed(matrix: jax.Array, rate: jax.Array, limit: jax.Array) -> jax.Array:
-    """lambda (t, B) by projected Gauss-Seidel sweeps."""
+def _relaxed(
+    matrix: Float[Array, "t t B"], rate: Float[Array, "t B"], limit: Float[Array, "m B"]
+) -> Float[Array, "t B"]:
+    """Forces lambda that satisfy the law of `distribute`, by projected Gauss-Seidel sweeps."""
     m, (t, *batch) = len(limit), rate.shape
     rows = t // m
     least = _SETTLED * jnp.max(limit, axis=0, keepdims=True)
@@ -639,19 +677,20 @@ def _relaxed(matrix: jax.Array, rate: jax.Array, limit: jax.Array) -> jax.Array:
     own = matrix[np.arange(t), np.arange(t)].reshape(m, rows, *batch)
     stiffness = own[:, 0] if rows == 1 else own[:, 0] + own[:, 1]
     stiffness = jnp.where(stiffness > 0, stiffness, 1.0)[:, None]  # no step is too long
-    State = tuple[jax.Array, jax.Array, jax.Array]
 
-    def relax(j: jax.Array, force: jax.Array) -> jax.Array:
-        """The force of contact j after a projected step."""
-        here = jax.lax.dynamic_slice_in_dim(force, rows * j, rows)
+    def relax(j: Int[Array, ""] | int, force: Float[Array, "t B"]) -> Float[Array, "t B"]:
+        """Forces after `lambda_j <- P(lambda_j - u_j' / stiffness_j)`, P projects on disc j."""
+        at_contact = jax.lax.dynamic_slice_in_dim(force, rows * j, rows)
         change = jax.lax.dynamic_slice_in_dim(rate, rows * j, rows) + times(of_contacts[j], force)
-        tried, most = here - change / stiffness[j], limit[j][None]
+        tried, most = at_contact - change / stiffness[j], limit[j][None]
         length = _lengths(tried, rows)
         shrink = jnp.where(length > most, most / jnp.where(length > 0, length, 1.0), 1.0)
         return jax.lax.dynamic_update_slice_in_dim(force, tried * shrink, rows * j, 0)
 
-    def sweep(state: State) -> State:
-        """All contacts once."""
+    def sweep(
+        state: tuple[Float[Array, "t B"], Bool[Array, ""], Int[Array, ""]],
+    ) -> tuple[Float[Array, "t B"], Bool[Array, ""], Int[Array, ""]]:
+        """Forces after each contact was relaxed, whether any changed, and the sweeps so far."""
         before, _, count = state
         force = fori_loop(0, m, relax, before)
         return force, jnp.any(jnp.abs(force - before) > least), count + 1

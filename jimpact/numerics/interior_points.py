@@ -17,11 +17,12 @@ Source: Acary, Cadoux, Lemarechal and Malick, ZAMM 91 (2011) 155-175, for the co
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, Int
 
 from jimpact.numerics.dense import block_solve
 from jimpact.tools.compiling import full_precision
@@ -48,40 +49,43 @@ _LEAST_AIM = 1e-6
 
 
 class Cones(NamedTuple):
-    """b = 1 + rows columns a contact; rates `constant + coupling x`, impulses `scale` x."""
+    """Scaled problem: rates `constant + coupling x`, impulses `scale x`; b = 1 + rows columns."""
 
-    coupling: jax.Array  # (m, b, m, b)
-    constant: jax.Array  # (m, b)
-    scale: jax.Array  # (m, b)
-    load: jax.Array  # (m,)
+    coupling: Float[Array, "m b m b"]  # (m, b, m, b)
+    constant: Float[Array, "m b"]  # (m, b)
+    scale: Float[Array, "m b"]  # (m, b)
+    load: Float[Array, "m"]  # (m,)
     complementary: bool
 
 
 class _Inside(NamedTuple):
-    """A point inside the cones: a and nu (m,), y and s (m, rows), kappa (m,)."""
+    """A point inside the cones: Y = (a + load, y), K = (kappa, s), a and nu positive.
 
-    push: jax.Array
-    normal: jax.Array
-    side: jax.Array
-    bound: jax.Array
-    slip: jax.Array
+    Also a change of one, or its affine forms with an axis of w coefficients behind.
+    """
+
+    push: Float[Array, "m *w"]  # a
+    normal: Float[Array, "m *w"]  # nu
+    side: Float[Array, "m rows *w"]  # y
+    bound: Float[Array, "m *w"]  # kappa
+    slip: Float[Array, "m rows *w"]  # s
 
 
 class Best(NamedTuple):
-    """The impulses (m, b) of the least misfit () so far."""
+    """Impulses of the least misfit so far."""
 
-    impulse: jax.Array
-    misfit: jax.Array
+    impulse: Float[Array, "m b"]
+    misfit: Float[Array, ""]
 
 
 def cones_of(
-    matrix: jax.Array,
-    rate: jax.Array,
-    friction: jax.Array,
-    load: jax.Array | None,
+    matrix: Float[Array, "m b m b"],
+    rate: Float[Array, "m b"],
+    friction: Float[Array, "m"],
+    load: Float[Array, "m"] | None,
     complementary: bool,
 ) -> Cones:
-    """The scaled problem of A (m, b, m, b), rates (m, b), mu and load (m,)."""
+    """The problem in impulses `(p, p_t) = (g a, h y)`, g = 1 / max(mu, 1) and h = mu g."""
     large = jnp.maximum(friction, 1.0)
     sides = jnp.repeat((friction / large)[:, None], rate.shape[1] - 1, axis=1)
     scale = jnp.concatenate([1 / large[:, None], sides], axis=1)
@@ -92,14 +96,17 @@ def cones_of(
 
 @full_precision
 def within_cones(
-    cones: Cones, misfit: Callable[[jax.Array], jax.Array], attempt: jax.Array, tolerance: float
+    cones: Cones,
+    misfit: Callable[[jax.Array], jax.Array],
+    attempt: Int[Array, ""],
+    tolerance: float,
 ) -> Best:
-    """Impulses x = (p, p_t) (m, b) of contacts with friction, by interior points.
+    """Impulses x = (p, p_t) of contacts with friction, by interior points.
 
     Args:
         cones: the problem, with a diagonal and rates of order 1.
-        misfit: how far x (m, b) is from the law ().
-        attempt: () number of the attempt; from ATTEMPTS on nothing is done.
+        misfit: how far x is from the law, a number >= 0.
+        attempt: number of the attempt; from ATTEMPTS on nothing is done.
         tolerance: of the misfit.
 
     Returns:
@@ -113,8 +120,10 @@ def within_cones(
     close = jnp.where(attempt == 0, first_close, _CLOSER * tolerance)
     most = jnp.where(attempt < ATTEMPTS, _MOST, 0)
 
-    def iterate(state: tuple[_Inside, Best, jax.Array]) -> tuple[_Inside, Best, jax.Array]:
-        """One iteration."""
+    def iterate(
+        state: tuple[_Inside, Best, Int[Array, ""]],
+    ) -> tuple[_Inside, Best, Int[Array, ""]]:
+        """The next point, the best impulses so far, and the number of iterations."""
         at = _corrected(cones, state[0], slides)
         return at, better(misfit, state[1], _impulse(cones, at)), state[2] + 1
 
@@ -123,30 +132,30 @@ def within_cones(
     return while_loop(lambda s: ~(s[1].misfit <= close) & (s[2] < most), iterate, start)[1]
 
 
-def better(misfit: Callable[[jax.Array], jax.Array], best: Best, x: jax.Array) -> Best:
-    """The impulses of less misfit."""
+def better(misfit: Callable[[jax.Array], jax.Array], best: Best, x: Float[Array, "m b"]) -> Best:
+    """The impulses of less misfit: `best`, or x."""
     wrong = misfit(x)
     less = wrong < best.misfit
     return Best(jnp.where(less, x, best.impulse), jnp.where(less, wrong, best.misfit))
 
 
-def _impulse(cones: Cones, at: _Inside) -> jax.Array:
-    """x (m, b) in the units of the problem."""
+def _impulse(cones: Cones, at: _Inside) -> Float[Array, "m b"]:
+    """Impulses (p, p_t) of a point in the units of the problem."""
     return cones.scale * jnp.concatenate([_normal(cones, at)[:, None], at.side], axis=1)
 
 
-def _normal(cones: Cones, at: _Inside) -> jax.Array:
-    """Normal impulses (m,), that may pull where rates are prescribed."""
+def _normal(cones: Cones, at: _Inside) -> Float[Array, "m"]:
+    """Normal impulses a, or a - nu, which may pull, where rates are prescribed."""
     return at.push if cones.complementary else at.push - at.normal
 
 
-def _mean(cones: Cones, at: _Inside) -> jax.Array:
-    """The mean () of a nu and Y . K."""
+def _mean(cones: Cones, at: _Inside) -> Float[Array, ""]:
+    """Mean of the products a nu and Y . K over all contacts, which is 0 at the solution."""
     cone = (at.push + cones.load) * at.bound + jnp.sum(at.side * at.slip, axis=1)
     return jnp.mean(at.push * at.normal + cone) / 2
 
 
-def _corrected(cones: Cones, at: _Inside, slides: jax.Array) -> _Inside:
+def _corrected(cones: Cones, at: _Inside, slides: Float[Array, ""]) -> _Inside:
     """The next point: a predictor shows how small a nu and Y . K may become at once.
 
     Changes are affine in those of (p, y) and in the aim: arrays (.., n + 2) of the n coefficients,
@@ -157,16 +166,16 @@ def _corrected(cones: Cones, at: _Inside, slides: jax.Array) -> _Inside:
     change, matrix, right = _linearized(cones, at, slides)
     moves = block_solve(matrix, right).reshape(n, 2)
 
-    def ahead(aim: jax.Array) -> _Inside:
-        """The next point, if products shall be `aim` (), as far as the cones allow."""
+    def ahead(aim: Float[Array, ""]) -> _Inside:
+        """The next point, if all products shall be `aim`, as far as the cones allow."""
         way = jnp.concatenate([moves[:, 0] + aim * moves[:, 1], jnp.stack([1.0 + 0 * aim, aim])])
         way = jax.tree.map(lambda form: jnp.tensordot(form, way, axes=1), change)
         room = jnp.minimum(_room_in_cone(cones, at, way), _room_of_normals(at, way))
         part = jnp.minimum(1.0, _WITHIN * room)
         return jax.tree.map(lambda x, dx: x + part * dx, at, way)
 
-    def look(_: int, state: tuple[_Inside, jax.Array]) -> tuple[_Inside, jax.Array]:
-        """The point ahead with the aim of the state, and the aim that follows from it."""
+    def look(_: Any, state: tuple[_Inside, Float[Array, ""]]) -> tuple[_Inside, Float[Array, ""]]:
+        """The point ahead with this aim, and the aim that follows: `mean (mean+ / mean)^2`."""
         point = ahead(state[1])
         share = jnp.maximum(jnp.minimum(_mean(cones, point) / mean, 1.0) ** 2, _LEAST_AIM)
         return point, share * mean
@@ -175,10 +184,14 @@ def _corrected(cones: Cones, at: _Inside, slides: jax.Array) -> _Inside:
 
 
 def _linearized(
-    cones: Cones, at: _Inside, slides: jax.Array
-) -> tuple[_Inside, jax.Array, jax.Array]:
-    """Changes of a point as affine forms, and their equations: a matrix (m, b, m, b), right sides
-    (m, b, 2) of what is constant and of the aim."""
+    cones: Cones, at: _Inside, slides: Float[Array, ""]
+) -> tuple[_Inside, Float[Array, "m b m b"], Float[Array, "m b 2"]]:
+    """Changes of a point as affine forms, and the equations of their coefficients, linearized.
+
+    Returns:
+        Forms with a last axis of n coefficients, a constant and the factor of the aim; the matrix,
+        and two right sides: of what is constant and of the aim.
+    """
     m, b = cones.constant.shape
     n = m * b
     eye = jnp.eye(n + 2, dtype=cones.constant.dtype)
@@ -189,8 +202,8 @@ def _linearized(
     speed = jnp.sqrt(jnp.sum(at.slip**2, axis=1))
     turns = (speed / (speed**2 + slides * _mean(cones, at)))[:, None] * at.slip
 
-    def dot(values: jax.Array, forms: jax.Array) -> jax.Array:
-        """Sums over the tangents of a contact (m, n + 2)."""
+    def dot(values: Float[Array, "m rows"], forms: Float[Array, "m rows w"]) -> Float[Array, "m w"]:
+        """Sums `sum_i v_ji f_ji` over the tangents i of each contact j."""
         return jnp.sum(values[..., None] * forms, axis=1)
 
     side = x[:, 1:]
@@ -221,17 +234,17 @@ def _linearized(
     return _Inside(push, normal, side, bound, slip), matrix, -equations[..., n:]
 
 
-def _room_of_normals(at: _Inside, way: _Inside) -> jax.Array:
-    """How many times the change () can be added before an a or nu is 0."""
+def _room_of_normals(at: _Inside, way: _Inside) -> Float[Array, ""]:
+    """Largest multiple of the change `way` with which all a and nu stay >= 0."""
     value = jnp.concatenate([at.push, at.normal])
     falls = jnp.concatenate([way.push, way.normal]) / value
     return jnp.min(jnp.where(falls < 0, -1 / jnp.where(falls < 0, falls, 1.0), jnp.inf))
 
 
-def _room_in_cone(cones: Cones, at: _Inside, way: _Inside) -> jax.Array:
-    """How many times the change () can be added before a Y or K leaves the cone.
+def _room_in_cone(cones: Cones, at: _Inside, way: _Inside) -> Float[Array, ""]:
+    """Largest multiple of the change `way` with which all Y and K stay in the cone.
 
-    With it turned into the middle of the cone, by a hyperbolic rotation.
+    With each turned into the middle of the cone, by a hyperbolic rotation.
     """
     first = jnp.concatenate([at.push + cones.load, at.bound])
     side, change = (jnp.concatenate([x.side, x.slip]) for x in (at, way))

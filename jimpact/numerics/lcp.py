@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
 
 from jimpact.numerics.dense import null_projector, solve_by_pivots, solve_definite
 from jimpact.numerics.many_contacts import solve_many
@@ -33,32 +34,34 @@ _DESCENTS = 100_000  # steps of descent at most; packings of 3000 spheres take s
 
 
 class LCP(NamedTuple):
-    """`z` (m,) and `w = A z + q` (m,); `code`: ok, impulse_not_unique, infeasible, max_steps."""
+    """Solution z and `w = A z + q`; `code`: ok, impulse_not_unique, infeasible, max_steps."""
 
-    z: jax.Array
-    w: jax.Array
-    code: jax.Array
+    z: Float[Array, "m"]
+    w: Float[Array, "m"]
+    code: Int[Array, ""]
 
 
 class _Tableau(NamedTuple):
-    rows: jax.Array  # (m, 2 m + 2): columns of w, z, the artificial variable, right-hand side
-    basis: jax.Array  # (m,) number of the variable that each row stands for
-    entering: jax.Array
-    ray: jax.Array
-    pivots: jax.Array
+    """Tableau of Lemke's method for `w - A z - z_0 1 = q`, and the number of pivots."""
+
+    rows: Float[Array, "m w"]  # w = 2 m + 2 columns: w, z, the artificial variable, right-hand side
+    basis: Int[Array, "m"]  # number of the variable that each row stands for
+    entering: Int[Array, ""]  # number of the variable that enters the basis next
+    ray: Bool[Array, ""]  # no row limits the entering variable: there is no solution
+    pivots: Int[Array, ""]  # so far
 
 
 @full_precision
 def solve_lcp(
-    matrix: Symmetric, q: jax.Array, *, symmetric: bool = True, regular: bool | None = None
+    matrix: Symmetric, q: Float[Array, "m"], *, symmetric: bool = True, regular: bool | None = None
 ) -> LCP:
     """Solve `0 <= z _|_ A z + q >= 0`.
 
     Args:
-        matrix: A (m, m): symmetric positive semidefinite, stored in any way, or not symmetric
+        matrix: A: symmetric positive semidefinite, stored in any way, or not symmetric
             (`symmetric=False`) and such that Lemke's method applies (positive semidefinite,
             copositive plus, P).
-        q: (m,).
+        q: the constant term.
         symmetric: w is then unique; where z is not, the z of least norm (in the scaling that
             makes the diagonal 1) is returned, with the code `impulse_not_unique`.
         regular: A is known to be regular, which saves the search for its null space; None: as its
@@ -95,8 +98,8 @@ def solve_lcp(
     return LCP(z * scale * size, w / scale * size, code)
 
 
-def _solve_sparse(matrix: Sparse, q: jax.Array) -> LCP:
-    """As `solve_lcp` by products `A z` only, for A symmetric positive semidefinite.
+def _solve_sparse(matrix: Sparse, q: Float[Array, "m"]) -> LCP:
+    """Solve `0 <= z _|_ A z + q >= 0` by products `A z` only, A symmetric positive semidefinite.
 
     Which of several z is returned is left to the descent. Values are those of the descent, and
     derivatives those of the linear system on its support: where A is singular there, they are
@@ -120,17 +123,17 @@ def _solve_sparse(matrix: Sparse, q: jax.Array) -> LCP:
     a = matrix.scaled(scale).within(support)
     solved = scale * conjugate_gradients(lambda x: a @ x, jnp.where(support, -q * scale, 0.0))
     z = z + (solved - jax.lax.stop_gradient(solved))
-    # a vector that A makes nothing of, if there is one, has a part in nearly all others
+    # A is singular if a right side is not in its range: nearly all have a part in its null space
     other = jnp.where(support, jnp.cos(jnp.arange(1.0, len(q) + 1, dtype=q.dtype) ** 2), 0.0)
-    still_a = jax.lax.stop_gradient(a)
-    singular = jnp.any(jnp.isnan(conjugate_gradients(lambda x: still_a @ x, other)))
+    fixed = jax.lax.stop_gradient(a)
+    singular = jnp.any(jnp.isnan(conjugate_gradients(lambda x: fixed @ x, other)))
     code = jnp.where(singular, CODE["impulse_not_unique"], CODE["ok"])
     code = jnp.where(found.misfit > tolerance, CODE["max_steps"], code)
     return LCP(z, jnp.where(support, 0.0, matrix @ z + q), code)
 
 
 def gathered_rounding(unknowns: int, dtype: Any) -> float:
-    """Rounding m eps^(2/3) that a whole run may gather.
+    """Rounding `m eps^(2/3)` of m unknowns that a whole run may gather.
 
     A larger artificial variable left at its end means that there is no solution; a larger w means
     that the contact is open.
@@ -139,9 +142,12 @@ def gathered_rounding(unknowns: int, dtype: Any) -> float:
 
 
 def _solve_on(
-    support: jax.Array, a: jax.Array, right: jax.Array, symmetric: bool = True
-) -> jax.Array:
-    """Solve `A_SS z_S = right_S`, z = 0 elsewhere."""
+    support: Bool[Array, "m"],
+    a: Float[Array, "m m"],
+    right: Float[Array, "m"],
+    symmetric: bool = True,
+) -> Float[Array, "m"]:
+    """z with `A_SS z_S = right_S` on the support S, z = 0 elsewhere."""
     both = support[:, None] & support[None, :]
     masked = jnp.where(both, a, jnp.eye(a.shape[0], dtype=a.dtype))
     right = jnp.where(support, right, 0.0)
@@ -150,8 +156,10 @@ def _solve_on(
     return solve_by_pivots(masked, right[:, None])[0][:, 0]
 
 
-def _least_norm(a: jax.Array, b: jax.Array, z: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The solution of least norm among those with the w of `z`, and whether there are several.
+def _least_norm(
+    a: Float[Array, "m m"], b: Float[Array, "m"], z: Float[Array, "m"]
+) -> tuple[Float[Array, "m"], Bool[Array, ""]]:
+    """Solution of least norm among those with the w of `z`, and whether there are several.
 
     With P the projector on the null space of A where w = 0, they are `r + P y >= 0`, r = z - P z;
     the least has `y >= 0`, complementary to r + P y: one more such problem.
@@ -170,12 +178,14 @@ def _least_norm(a: jax.Array, b: jax.Array, z: jax.Array) -> tuple[jax.Array, ja
 
 
 def _rounding(unknowns: int, dtype: Any) -> float:
-    """Rounding in a tableau of Lemke's method."""
+    """Rounding `640 eps m` of entries in a tableau of Lemke's method with m unknowns."""
     return _ROUNDING * precision(dtype).eps * unknowns
 
 
-def _wrong(a: jax.Array, b: jax.Array, support: jax.Array, z: jax.Array) -> jax.Array:
-    """Whether z or w has a wrong sign, or z is so large that the rounding of A z hides q."""
+def _wrong(
+    a: Float[Array, "m m"], b: Float[Array, "m"], support: Bool[Array, "m"], z: Float[Array, "m"]
+) -> Bool[Array, ""]:
+    """True if z or w has a wrong sign, or z is so large that the rounding of A z hides b."""
     size, gathered = jnp.max(jnp.abs(z)), gathered_rounding(len(b), b.dtype)
     noise = _rounding(len(b), b.dtype) * size  # of A z, where the largest q is 1
     w = jnp.where(support, 0.0, a @ z + b)
@@ -183,8 +193,10 @@ def _wrong(a: jax.Array, b: jax.Array, support: jax.Array, z: jax.Array) -> jax.
     return ~(jnp.all(signs) & (noise < 1))  # True where z is NaN
 
 
-def _support(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Lemke's method: which z are basic at the end, and the status code."""
+def _support(
+    a: Float[Array, "m m"], b: Float[Array, "m"]
+) -> tuple[Bool[Array, "m"], Int[Array, ""]]:
+    """Mask of the positive z in `0 <= z _|_ A z + b >= 0`, and the code: Lemke's method."""
     m, dtype = b.shape[0], b.dtype
     tolerance = _rounding(m, dtype)
     ones = jnp.ones((m, 1), dtype)
@@ -198,13 +210,13 @@ def _support(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array]:
     first = _pivot(start, jnp.argmin(b))
     limit = _PIVOTS * (m + 1)
 
-    def going(state: _Tableau) -> jax.Array:
-        """Whether the artificial variable is still basic."""
+    def going(state: _Tableau) -> Bool[Array, ""]:
+        """True while the artificial variable is basic, no ray was found and pivots are left."""
         inside = jnp.any(state.basis == artificial)
         return needed & inside & ~state.ray & (state.pivots < limit)
 
     def one(state: _Tableau) -> _Tableau:
-        """One pivot, unless a ray shows that there is no solution."""
+        """Tableau after one pivot, or as it is if a ray shows that there is no solution."""
         row, ray = _leaving(state, tolerance)
         moved = _pivot(state, row)
         chosen = jax.tree.map(lambda new, old: jnp.where(ray, old, new), moved, state)
@@ -219,8 +231,8 @@ def _support(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array]:
     return support, jnp.where(stuck, reason, CODE["ok"])
 
 
-def _leaving(state: _Tableau, tolerance: float) -> tuple[jax.Array, jax.Array]:
-    """Row of the least ratio, and whether there is none.
+def _leaving(state: _Tableau, tolerance: float) -> tuple[Int[Array, ""], Bool[Array, ""]]:
+    """Row of the least ratio of right side to entering column, and whether there is none (a ray).
 
     No order among ties (lexicographic, say) changed any of over 80 000 degenerate problems; a cycle
     would end as `max_steps`.
@@ -232,8 +244,8 @@ def _leaving(state: _Tableau, tolerance: float) -> tuple[jax.Array, jax.Array]:
     return jnp.argmin(ratio), ~jnp.any(candidates)
 
 
-def _pivot(state: _Tableau, row: jax.Array) -> _Tableau:
-    """Exchange the entering variable with that of `row`; its complement enters next."""
+def _pivot(state: _Tableau, row: Int[Array, ""]) -> _Tableau:
+    """Tableau in which the entering variable replaces that of `row`; its complement enters next."""
     m, dtype = state.basis.shape[0], state.rows.dtype
     column = state.rows @ (jnp.arange(2 * m + 2) == state.entering).astype(dtype)
     chosen = jnp.arange(m) == row

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from jimpact.numerics.discs import in_disc
 from jimpact.tools.compiling import full_precision
@@ -31,53 +32,53 @@ MOMENTUM = np.array([1.0, 0.9, 0.7, 0.5])
 
 
 class Many(NamedTuple):
-    """Impulses x (m, b), their misfit, iterations, the inverse step size at the end."""
+    """Impulses of many contacts, and how the iteration ended."""
 
-    impulse: jax.Array
-    misfit: jax.Array  # () over the largest rate, both scaled to a diagonal of 1
-    residual_velocity: jax.Array  # () [m/s] at most
-    iterations: jax.Array
-    inverse_step_size: jax.Array
+    impulse: Float[Array, "m b"]  # x
+    misfit: Float[Array, ""]  # over the largest rate, both scaled to a diagonal of 1
+    residual_velocity: Float[Array, ""]  # [m/s] at most
+    iterations: Int[Array, ""]
+    inverse_step_size: Float[Array, ""]  # at the end
 
 
 class _At(NamedTuple):
-    """An iteration."""
+    """State of the iteration, in the scaling with diagonal 1."""
 
-    x: jax.Array
-    ax: jax.Array
-    y: jax.Array  # x with momentum
-    ay: jax.Array
-    weight: jax.Array
-    inverse_step_size: jax.Array
-    best: jax.Array  # x of the least misfit so far
-    misfit: jax.Array  # of `best`
-    tries: jax.Array
+    x: Float[Array, "m b"]
+    ax: Float[Array, "m b"]  # A x
+    y: Float[Array, "m b"]  # x with momentum
+    ay: Float[Array, "m b"]  # A y
+    weight: Float[Array, ""]  # t of Nesterov's momentum
+    inverse_step_size: Float[Array, ""]  # L
+    best: Float[Array, "m b"]  # x of the least misfit so far
+    misfit: Float[Array, ""]  # of `best`
+    tries: Int[Array, ""]  # iterations so far
 
 
 @full_precision
 def solve_many(
     product: Callable[[jax.Array], jax.Array],
-    diagonal: jax.Array,
-    rate: jax.Array,
-    friction: jax.Array,
-    start: jax.Array,
-    inverse_step_size: jax.Array,
+    diagonal: Float[Array, "m b"],
+    rate: Float[Array, "m b"],
+    friction: Float[Array, ""] | Float[Array, "m"],
+    start: Float[Array, "m b"],
+    inverse_step_size: Float[Array, ""],
     tolerance: float,
     most: Any,
-    load: jax.Array | None = None,
+    load: Float[Array, "m"] | None = None,
 ) -> Many:
-    """Impulses x (m, b) of contacts with Coulomb friction, normals first (b = 1, 2, 3).
+    """Impulses x of contacts with Coulomb friction, normals first (b = 1, 2, 3).
 
     Args:
-        product: x -> A x (m, b); rows of contacts that take no part are 0.
-        diagonal: of A (m, b).
-        rate: (a, b) (m, b) [m/s].
-        friction: mu () or (m,).
-        start: x (m, b) to begin with.
+        product: x -> A x; rows of contacts that take no part are 0.
+        diagonal: of A.
+        rate: (a, b) [m/s].
+        friction: mu.
+        start: x to begin with.
         inverse_step_size: estimate of the largest eigenvalue of A, scaled to a diagonal of 1.
         tolerance: misfit at which it ends, of the largest of `rate`.
         most: iterations, an int or ().
-        load: (m,) normal impulses in addition to p, which friction includes; None: 0.
+        load: normal impulses in addition to p, which friction includes; None: 0.
 
     Source: Nesterov (1983), O'Donoghue and Candes (2015) for the restart; Mazhar, Heyn, Negrut and
     Tasora, ACM Trans. Graph. 34 (2015) for granular media (there the cone is convexified, which
@@ -97,16 +98,16 @@ def solve_many(
     carried = None if load is None else load / scale[:, 0]
     size = jnp.max(jnp.abs(goal))
 
-    def times(x: jax.Array) -> jax.Array:
-        """A x, scaled."""
+    def times(x: Float[Array, "m b"]) -> Float[Array, "m b"]:
+        """`S A S x` with the scales S of the impulses."""
         return scale * product(scale * x)
 
-    def going(at: _At) -> jax.Array:
-        """Whether the misfit is too large and iterations are left."""
+    def going(at: _At) -> Bool[Array, ""]:
+        """True while the misfit is too large and iterations are left."""
         return (at.misfit > tolerance * size) & (at.tries < most)
 
     def iterate(at: _At) -> _At:
-        """One step against the rates, projected, and the momentum of the next one."""
+        """State after the step `x = P(y - (A y + rate) / L)`, P the projection on the cones."""
         x = _projected(at.y - (at.ay + goal) / at.inverse_step_size, slope, carried)
         return _with_momentum(at, x, times(x), most)
 
@@ -121,8 +122,8 @@ def solve_many(
     return Many(end.best * scale, relative, residual, end.tries, end.inverse_step_size)
 
 
-def _scale(diagonal: jax.Array) -> jax.Array:
-    """Scale (m, b) of the impulses: one of each normal, one of the tangents of each contact."""
+def _scale(diagonal: Float[Array, "m b"]) -> Float[Array, "m b"]:
+    """Scales of the impulses, 1 / sqrt of the diagonal; the tangents of a contact share one."""
     squares = jnp.concatenate(
         [diagonal[:, :1], jnp.mean(diagonal[:, 1:], axis=1, keepdims=True)], axis=1
     )
@@ -130,14 +131,16 @@ def _scale(diagonal: jax.Array) -> jax.Array:
     return 1 / jnp.sqrt(squares[:, jnp.minimum(jnp.arange(diagonal.shape[1]), 1)])
 
 
-def _projected(x: jax.Array, slope: jax.Array, load: jax.Array | None) -> jax.Array:
-    """The nearest normal impulses >= 0, and tangential ones (m, b - 1) in their discs."""
+def _projected(
+    x: Float[Array, "m b"], slope: Float[Array, "m"], load: Float[Array, "m"] | None
+) -> Float[Array, "m b"]:
+    """Nearest impulses with `p >= 0`, then with `|p_t| <= slope (p + load)`, slope: scaled mu."""
     p = jnp.maximum(x[:, :1], 0.0)
     radius = slope[:, None] * (p if load is None else p + load[:, None])
     return jnp.concatenate([p, in_disc(x[:, 1:, None], radius)[..., 0]], axis=1)
 
 
-def _with_momentum(at: _At, x: jax.Array, ax: jax.Array, most: Any) -> _At:
+def _with_momentum(at: _At, x: Float[Array, "m b"], ax: Float[Array, "m b"], most: Any) -> _At:
     """The iterate after a projected step from y to x, with A x: Nesterov's method with restarts.
 
     Equation: y+ is `x + (t - 1) / t+ (x - x before)`, `t+ = (1 + sqrt(1 + 4 t^2)) / 2`. Where

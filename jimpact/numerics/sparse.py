@@ -2,12 +2,13 @@
 
 from collections.abc import Callable
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jimpact.tools.compiling import full_precision
 from jimpact.tools.loops import while_loop
@@ -42,7 +43,7 @@ class Neighbours:
 
     @cached_property
     def of_contacts(self) -> np.ndarray:
-        """Neighbours (m, K) of each contact, itself where it has fewer than K."""
+        """Table (m, K) of the neighbours of each contact, itself where it has fewer than K."""
         of_body: list[list[int]] = [[] for _ in range(self.count)]
         for contact, pair in enumerate(self.bodies):
             for body in pair[pair >= 0]:
@@ -58,52 +59,57 @@ class Neighbours:
 
     @cached_property
     def shared(self) -> np.ndarray:
-        """Whether (m, K, 2, 2) body s of a contact is body t of its neighbour."""
+        """Mask (m, K, 2, 2): body s of a contact is body t of its k-th neighbour."""
         own, other = self.bodies[:, None, :, None], self.bodies[self.of_contacts][:, :, None, :]
         real = self.of_contacts != np.arange(len(self.bodies))[:, None]
         return (own == other) & (own >= 0) & real[:, :, None, None]
 
 
 class Sparse(eqx.Module):
-    """Symmetric matrix: `diagonal` (m,), and entries (m, K) at the neighbours of each row."""
+    """Symmetric matrix: its diagonal, and the entries at the K neighbours of each row."""
 
-    diagonal: jax.Array
-    entries: jax.Array
+    diagonal: Float[Array, "m"]
+    entries: Float[Array, "m K"]
     neighbours: Neighbours = eqx.field(static=True)
 
-    def __matmul__(self, vector: jax.Array) -> jax.Array:
-        """Product with a vector (m,)."""
+    def __matmul__(self, vector: Float[ArrayLike, "m"]) -> Float[Array, "m"]:
+        """Product `A x`."""
+        vector = jnp.asarray(vector)
         return self.diagonal * vector + neighbour_sum(self.entries, vector, self.neighbours)
 
     def __abs__(self) -> "Sparse":
         """|A|, entry by entry."""
         return Sparse(jnp.abs(self.diagonal), jnp.abs(self.entries), self.neighbours)
 
-    def as_matrix(self) -> jax.Array:
-        """The dense (m, m) matrix."""
+    def as_matrix(self) -> Float[Array, "m m"]:
+        """The dense matrix."""
         rows = np.arange(len(self.diagonal))
         dense = jnp.diag(self.diagonal)
         return dense.at[rows[:, None], self.neighbours.of_contacts].add(self.entries)
 
-    def scaled(self, scale: jax.Array) -> "Sparse":
+    def scaled(self, scale: Float[Array, "m"]) -> "Sparse":
         """`diag(scale) A diag(scale)`."""
         entries = self.entries * scale[:, None] * scale[self.neighbours.of_contacts]
         return Sparse(self.diagonal * scale**2, entries, self.neighbours)
 
-    def within(self, part: jax.Array) -> "Sparse":
-        """The matrix whose rows and columns outside `part` (m,) hold their diagonal only."""
+    def within(self, part: Bool[Array, "m"]) -> "Sparse":
+        """The matrix whose rows and columns outside the mask `part` hold their diagonal only."""
         both = part[:, None] & part[self.neighbours.of_contacts]
         return Sparse(self.diagonal, jnp.where(both, self.entries, 0.0), self.neighbours)
 
 
-def neighbour_sum(entries: jax.Array, vector: jax.Array, neighbours: Neighbours) -> jax.Array:
-    """`sum_k a_jk x_n(j, k)` (m, ..) of entries (m, K, ..) and a vector (m, ..)."""
+def neighbour_sum(
+    entries: Float[Array, "m K *#B"], vector: Float[Array, "m *#B"], neighbours: Neighbours
+) -> Float[Array, "m *#B"]:
+    """`sum_k a_jk x_n(j, k)` with n(j, k) the k-th neighbour of contact j."""
     return jnp.sum(entries * vector[neighbours.of_contacts], axis=1)
 
 
 @full_precision
-def conjugate_gradients(product: Callable[[jax.Array], jax.Array], right: jax.Array) -> jax.Array:
-    """`A^-1 right` (m,) by products with A symmetric, positive semidefinite, of diagonal 1.
+def conjugate_gradients(
+    product: Callable[[jax.Array], jax.Array], right: Float[Array, "m"]
+) -> Float[Array, "m"]:
+    """`A^-1 right` by products with A symmetric, positive semidefinite, of diagonal 1.
 
     The solution of least norm where A is singular, NaN where there is none. Differentiable.
     Source: Hestenes and Stiefel (1952).
@@ -117,41 +123,52 @@ def conjugate_gradients(product: Callable[[jax.Array], jax.Array], right: jax.Ar
     return jax.lax.custom_linear_solve(product, right, _iterated, symmetric=True)
 
 
-def _iterated(product: Callable[[jax.Array], jax.Array], right: jax.Array) -> jax.Array:
-    """As `conjugate_gradients`, without derivatives."""
+def _iterated(
+    product: Callable[[jax.Array], jax.Array], right: Float[Array, "m"]
+) -> Float[Array, "m"]:
+    """`A^-1 right` as `conjugate_gradients`, from x = 0; NaN where the residual does not vanish."""
     eps = precision(right.dtype).eps
     size = jnp.vdot(right, right)
 
-    def going(state: Any) -> jax.Array:
-        """Whether the residual is too large and iterations are left."""
-        _, _, _, square, done = state
-        return (square > (_CONVERGED * eps) ** 2 * size) & (done < _MOST * len(right) + 10)
+    def going(state: tuple[Iterate, Int[Array, ""]]) -> Bool[Array, ""]:
+        """True while the residual is too large and iterations are left."""
+        at, done = state
+        return (at.square > (_CONVERGED * eps) ** 2 * size) & (done < _MOST * len(right) + 10)
 
-    def iterate(state: Any) -> Any:
-        """One step, counted."""
-        *at, done = state
-        new, curved = conjugate_step(product, jnp.vdot, tuple(at))
+    def iterate(state: tuple[Iterate, Int[Array, ""]]) -> tuple[Iterate, Int[Array, ""]]:
+        """State after one more step, and the number of steps."""
+        at, done = state
+        new, curved = conjugate_step(product, jnp.vdot, at)
         # a direction without curvature: A is singular, and no step reduces what is left
-        return *new, jnp.where(curved, done + 1, _MOST * len(right) + 10)
+        return new, jnp.where(curved, done + 1, _MOST * len(right) + 10)
 
-    start = jnp.zeros_like(right), right, right, size, jnp.int32(0)
-    x, _, _, square, _ = while_loop(going, iterate, start)
-    return jnp.where(square <= eps ** (2 * _NO_SOLUTION) * size, x, jnp.nan)
+    start = Iterate(jnp.zeros_like(right), right, right, size), jnp.int32(0)
+    end, _ = while_loop(going, iterate, start)
+    return jnp.where(end.square <= eps ** (2 * _NO_SOLUTION) * size, end.x, jnp.nan)
+
+
+class Iterate(NamedTuple):
+    """State of conjugate gradients for one system A x = right, or for a batch in the last axis."""
+
+    x: Float[Array, "m *B"]
+    residual: Float[Array, "m *B"]  # r = right - A x
+    direction: Float[Array, "m *B"]  # d
+    square: Float[Array, "..."]  # r^T r, one number for each system
 
 
 def conjugate_step(
     product: Callable[[jax.Array], jax.Array],
     dot: Callable[[jax.Array, jax.Array], jax.Array],
-    at: tuple[jax.Array, ...],
-) -> tuple[tuple[jax.Array, ...], jax.Array]:
-    """One step of conjugate gradients, and whether A has curvature along its direction.
+    at: Iterate,
+) -> tuple[Iterate, Bool[Array, "..."]]:
+    """State after a step of conjugate gradients, and whether A has curvature along its direction.
 
     Equation: `x + a d`, `r - a A d`, `r+ + b d` with `a = r^T r / d^T A d`, `b = r+^T r+ / r^T r`.
 
     Args:
         product: A times a vector.
-        dot: of two vectors.
-        at: x, the residual r, the direction d, and r^T r.
+        dot: scalar product of two vectors.
+        at: the state before it.
     """
     x, residual, direction, square = at
     image = product(direction)
@@ -161,11 +178,14 @@ def conjugate_step(
     x, residual = x + length * direction, residual - length * image
     new = dot(residual, residual)
     ratio = jnp.where(square > 0, new / jnp.where(square > 0, square, 1.0), 0.0)
-    return (x, residual, residual + ratio * direction, new), curved
+    return Iterate(x, residual, residual + ratio * direction, new), curved
 
 
 def components(touches: np.ndarray) -> np.ndarray:
-    """For each column of a boolean matrix the first column of its connected component."""
+    """Labels of the columns of a boolean matrix: the first column of their connected component.
+
+    Columns with a common row are connected.
+    """
     count = touches.shape[1]
     label = np.arange(count)
     while True:

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from jimpact.numerics.dense import regularized
 from jimpact.numerics.discs import in_disc
@@ -36,17 +37,20 @@ RIDGE = 1e-10
 
 
 class StepProblem(NamedTuple):
-    """What the impulses (n, B) of a step have to satisfy, n = m + t."""
+    """Data of the problem above for the impulses q of a step, n = m + t rows."""
 
     coupling: Any  # K (n, n, B), whose `times` multiplies and `dense` writes it out
-    velocity: jax.Array  # b (n, B), the velocities without the impulses
-    load: jax.Array  # F (m, B), the largest normal impulses
-    unloading: jax.Array  # a >= 0 (m, B)
-    friction: jax.Array  # mu (m, B)
-    descent: jax.Array  # (n, B), lengths of the steps of descent, see `descent_lengths`
+    velocity: Float[Array, "n B"]  # b, the velocities without the impulses
+    load: Float[Array, "m B"]  # F, the largest normal impulses
+    unloading: Float[Array, "m B"]  # a >= 0
+    friction: Float[Array, "m B"]  # mu
+    descent: Float[Array, "n B"]  # lengths of the steps of descent, see `descent_lengths`
 
-    def projected(self, tried: jax.Array) -> jax.Array:
-        """The admissible impulses (n, B) next to those that a step of gradient descent tries."""
+    def projected(self, tried: Float[Array, "n B"]) -> Float[Array, "n B"]:
+        """The admissible impulses next to those `tried` by a step of descent of length d.
+
+        Normal: `(a f + d F) / (a + d)` in [0, F], or F where a = 0; tangential: in the disc mu f.
+        """
         m, step = len(self.load), self.descent[: len(self.load)]
         cut = (self.unloading * tried[:m] + step * self.load) / (self.unloading + step)
         normal = jnp.where(self.unloading > 0, jnp.clip(cut, 0.0, self.load), self.load)
@@ -54,12 +58,12 @@ class StepProblem(NamedTuple):
         side = in_disc(side, self.friction * normal)
         return jnp.concatenate([normal, side.reshape(tried[m:].shape)])
 
-    def velocities(self, impulses: jax.Array) -> jax.Array:
-        """w (n, B) after the impulses."""
+    def velocities(self, impulses: Float[Array, "n B"]) -> Float[Array, "n B"]:
+        """`w = b + K q` after the impulses q."""
         return self.velocity + self.coupling.times(impulses)
 
-    def derivative(self, impulses: jax.Array) -> jax.Array:
-        """Of the residual `q - projected(q - d w(q))` in the impulses, (n, n, B).
+    def derivative(self, impulses: Float[Array, "n B"]) -> Float[Array, "n n B"]:
+        """Jacobian in q of the residual `q - projected(q - d w(q))`.
 
         A contact's projection depends on its own rows only: one direction for each kind of row.
         """
@@ -69,21 +73,25 @@ class StepProblem(NamedTuple):
         owner = np.argsort(rows.ravel()) // kinds  # the contact of each row
         tried = impulses - self.descent * self.velocities(impulses)
         one = jnp.eye(n, dtype=tried.dtype)[..., None]
-        moved = one - self.descent[:, None] * self.coupling.dense(n)
+        moved = one - self.descent[:, None] * self.coupling.dense(n)  # d (q - d w) / dq
         matrix = jnp.broadcast_to(one, moved.shape)
-        for kind in range(kinds):
+        for kind in range(kinds):  # the normals, the first tangents, the second ones
             direction = jnp.zeros_like(tried).at[rows[:, kind]].set(1.0)
             _, slope = jax.jvp(self.projected, (tried,), (direction,))
             matrix = matrix - slope[:, None] * moved[rows[owner, kind]]
         return matrix
 
 
-def descent_lengths(coupling: jax.Array, contacts: int, friction_only: bool = False) -> jax.Array:
-    """Lengths d (n, B) with which descent converges: diag(1/d) - K is positive semidefinite.
+def descent_lengths(
+    coupling: Float[Array, "n n B"], contacts: int, friction_only: bool = False
+) -> Float[Array, "n B"]:
+    """Lengths d with which descent converges: diag(1/d) - K is positive semidefinite.
 
     Rows are scaled to a diagonal of at most 1, both tangents of a contact alike; the largest
     eigenvalue is then at most the largest sum of a row, and the fourth root of the Frobenius norm
     of the fourth power. `friction_only`: normal impulses are known, so their rows do not count.
+
+    Equation: `1 / d_i = size_i min(max_j sum_k |S_jk|, |S^4|^(1/4))` with the scaled matrix S.
     """
     n = len(coupling)
     size = coupling[jnp.arange(n), jnp.arange(n)]
@@ -101,28 +109,32 @@ def descent_lengths(coupling: jax.Array, contacts: int, friction_only: bool = Fa
     square = jnp.einsum("ij...,jk...->ik...", scaled, scaled)
     fourth = jnp.einsum("ij...,jk...->ik...", square, square)
     norm = jnp.sum(fourth**2, axis=(0, 1))[None] ** (1 / 8)
-    longest = size * jnp.minimum(row_sum, norm)
-    return 1 / jnp.where(longest > 0, longest, 1.0)
+    bound = size * jnp.minimum(row_sum, norm)  # of the eigenvalues
+    return 1 / jnp.where(bound > 0, bound, 1.0)
 
 
 class Move(NamedTuple):
-    """The impulses (n, B) that a step of descent reaches, and its way to them."""
+    """Impulses that a step of descent reaches, and its way to them: reached minus start."""
 
-    reached: jax.Array
-    way: jax.Array
+    reached: Float[Array, "n B"]
+    way: Float[Array, "n B"]
 
 
-def extrapolated(now: Move, change: Move, before: Move, weight: jax.Array) -> jax.Array:
-    """Impulses (n, B) from which descent would have no way to go, by Anderson's method of depth 2.
+def extrapolated(
+    now: Move, change: Move, before: Move, weight: Float[Array, "n B"]
+) -> Float[Array, "n B"]:
+    """Impulses from which descent would have no way to go, by Anderson's method of depth 2.
 
-    `change`, `before`: by how much moves differed now and a sweep ago. The combination of ways that
-    is least, in a metric with the weights (n, B), is taken for that of the impulses, too.
+    `change`, `before`: by how much moves differed now and a sweep ago. The numbers c that make
+    `way - c_1 change.way - c_2 before.way` least, in a metric with the weights, give the impulses
+    `reached - c_1 change.reached - c_2 before.reached`.
     """
 
-    def dot(a: jax.Array, b: jax.Array) -> jax.Array:
-        """Products (1, B)."""
+    def dot(a: Float[Array, "n B"], b: Float[Array, "n B"]) -> Float[Array, "1 B"]:
+        """Scalar products `sum_i weight_i a_i b_i` over the rows."""
         return jnp.sum(weight * a * b, axis=0, keepdims=True)
 
+    # normal equations [aa ab; ab bb] c = [a; b]; only c_1 where both changes are parallel
     aa, ab, bb = (dot(*x) for x in ((change.way,) * 2, (change.way, before.way), (before.way,) * 2))
     both = aa * bb - ab**2 > precision(weight.dtype).eps * aa * bb
     aa, bb = jnp.where(aa > 0, aa, 1.0), jnp.where(both, bb, 1.0)
@@ -135,34 +147,33 @@ def extrapolated(now: Move, change: Move, before: Move, weight: jax.Array) -> ja
 
 @jax.custom_jvp
 def solve(
-    problem: StepProblem, start: jax.Array, tolerance: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Impulses (n, B) that leave velocities right to `tolerance` (1, B), from a guess.
+    problem: StepProblem, start: Float[Array, "n B"], tolerance: Float[Array, "1 B"]
+) -> tuple[Float[Array, "n B"], Float[Array, "1 B"]]:
+    """Impulses q that leave velocities right to `tolerance`, from a guess `start`.
 
-    And by how much (1, B) the last sweep still changed velocities. Tangents solve the tangent
-    equations of the problem, with one matrix for all directions.
+    And by how much the last sweep still changed velocities. Tangents solve the tangent equations of
+    the problem, with one matrix for all directions.
     """
 
     class Sweep(NamedTuple):
-        """The point that a sweep starts from, velocities there, the last move, its difference from
-        the one before it; impulses, their error, sweeps done."""
+        """State of the iteration."""
 
-        ahead: jax.Array
-        velocities: jax.Array  # kept here, they are computed once: XLA fuses them into each use
-        last: Move
-        change: Move
-        impulses: jax.Array
-        error: jax.Array
-        done: jax.Array
+        ahead: Float[Array, "n B"]  # impulses that the sweep starts from
+        velocities: Float[Array, "n B"]  # there; kept, as XLA would compute them in each use
+        last: Move  # of the sweep before
+        change: Move  # its difference from the move before it
+        impulses: Float[Array, "n B"]  # admissible ones
+        error: Float[Array, "1 B"]  # of their velocities
+        done: Int[Array, ""]  # sweeps
 
     weight = 1 / problem.descent
 
-    def going(s: Sweep) -> jax.Array:
-        """Whether a lane of the batch is not yet right."""
+    def going(s: Sweep) -> Bool[Array, ""]:
+        """True while a lane of the batch is not yet right and sweeps are left."""
         return (s.done < SWEEPS) & jnp.any(s.error > tolerance)
 
     def sweep(s: Sweep) -> Sweep:
-        """One step of descent, and the extrapolation from it and the two before it."""
+        """State after one step of descent, and the extrapolation from it and the two before it."""
         reached = problem.projected(s.ahead - problem.descent * s.velocities)
         now = Move(reached, reached - s.ahead)
         changes = jax.tree.map(lambda a, b: jnp.where(s.done > 0, a - b, 0.0), now, s.last)
@@ -184,12 +195,15 @@ def solve(
 @solve.defjvp
 @full_precision
 def _solve_tangent(primals: Any, tangents: Any) -> tuple[Any, Any]:
-    """The impulses change as the residual, which stays 0, asks for; what is left has no tangent."""
+    """Tangent dq of the impulses, from `R(q) = q - projected(q - d w(q)) = 0`: R_q dq = -dR.
+
+    The error that is left has no tangent.
+    """
     problem, (change, _, _) = primals[0], tangents
     impulses, left = solve(*primals)
 
-    def reached(problem: StepProblem) -> jax.Array:
-        """Where descent from these impulses leads to."""
+    def reached(problem: StepProblem) -> Float[Array, "n B"]:
+        """`projected(q - d w(q))` of the problem at the impulses q of the solution."""
         return problem.projected(impulses - problem.descent * problem.velocities(impulses))
 
     _, right = jax.jvp(reached, (problem,), (change,))

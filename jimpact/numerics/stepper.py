@@ -37,6 +37,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Integer, Num, Shaped
 
 from jimpact.numerics.driver import SLOTS
 from jimpact.numerics.tableaux import DOP853
@@ -84,10 +85,10 @@ _WEIGHTS = np.array([DOP853.b, DOP853.error_high, DOP853.error_low])
 
 
 class Flow(abc.ABC):
-    """What the stepper integrates: a state y and modes whose changes are events."""
+    """A differential equation to be integrated: a state y, and modes that change at events."""
 
-    tolerance: jax.Array  # (1, B) error of a step
-    taking_part: jax.Array | int  # (1, B) contacts, without those that are open for good
+    tolerance: Float[Array, "1 B"]  # error of a step
+    taking_part: Float[Array, "1 B"] | int  # contacts, without those that are open for good
     longest: Any  # the longest step in the flow's own time that is stable, or inf
 
     near: float = 0.0  # share of a step from which landings start, 0: from anywhere
@@ -105,21 +106,30 @@ class Flow(abc.ABC):
 
     @property
     @abc.abstractmethod
-    def zero_margin(self) -> jax.Array:
-        """Margins closer to 0 than this (1, B) count as 0."""
+    def zero_margin(self) -> Float[Array, "1 B"]:
+        """Margins closer to 0 than this count as 0."""
 
     @abc.abstractmethod
-    def field(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
-        """Rates dy (n, B) in the flow's own time."""
+    def field(
+        self, const: Any, modes: Int[Array, "modes B"], y: Float[Array, "driving B"]
+    ) -> Float[Array, "n B"]:
+        """Rates dy in the flow's own time, from the rows of y that drive them."""
 
     @abc.abstractmethod
-    def margins(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
-        """Margins (k, B): each is >= 0 while its mode lasts."""
+    def margins(
+        self, const: Any, modes: Int[Array, "modes B"], y: Float[Array, "driving B"]
+    ) -> Float[Array, "k B"]:
+        """Margins: each is >= 0 while its mode lasts."""
 
     def margins_with_rates(
-        self, const: Any, modes: jax.Array, y: jax.Array, dy: jax.Array, target: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """Margins and their rates (k, B) while y changes at the rates dy.
+        self,
+        const: Any,
+        modes: Int[Array, "modes B"],
+        y: Float[Array, "driving B"],
+        dy: Float[Array, "driving B"],
+        target: Bool[Array, "k B"],
+    ) -> tuple[Float[Array, "k B"], Float[Array, "k B"]]:
+        """Margins c(y) and their rates (dc/dy) dy while y changes at the rates dy.
 
         Those of the `target` of a landing have to be exact, others are looked at to predict events.
         """
@@ -127,59 +137,74 @@ class Flow(abc.ABC):
 
     @abc.abstractmethod
     def switch(
-        self, modes: jax.Array, y: jax.Array, which: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """Modes and state after the events `which` (k, B), one-hot."""
+        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"], which: Bool[Array, "k B"]
+    ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
+        """Modes and state after the events `which`, one-hot."""
 
     @abc.abstractmethod
-    def over(self, modes: jax.Array, y: jax.Array, passes: jax.Array) -> jax.Array:
-        """Whether (1, B) nothing is left to integrate."""
+    def over(
+        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"], passes: Float[Array, "1 B"]
+    ) -> Bool[Array, "1 B"]:
+        """Mask of the impacts in which nothing is left to integrate."""
 
-    def constants(self, modes: jax.Array) -> Any:
+    def constants(self, modes: Int[Array, "modes B"]) -> Any:
         """The parts of the field that do not change while the modes last."""
         return None
 
-    def allowance(self, modes: jax.Array, y: jax.Array) -> jax.Array | float:
-        """Allowed error (n, B) of each row, in tolerances."""
+    def allowance(
+        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]
+    ) -> Float[Array, "#n #B"] | float:
+        """Allowed error of each row, in tolerances."""
         return 1.0
 
-    def rooted(self, modes: jax.Array) -> jax.Array:
-        """Margins (k, B) whose root is the variable of a landing: by default none."""
+    def rooted(self, modes: Int[Array, "modes B"]) -> Bool[Array, "#k #B"]:
+        """Mask of the margins whose root is the variable of a landing: by default none."""
         return jnp.zeros((1, 1), bool)
 
-    def begins(self, before: jax.Array, after: jax.Array) -> jax.Array:
-        """Whether (1, B) forces start as a power of time: steps then advance in its root."""
+    def begins(
+        self, before: Int[Array, "modes B"], after: Int[Array, "modes B"]
+    ) -> Bool[Array, "1 #B"]:
+        """Mask: forces start as a power of time, so that steps advance in its root."""
         return jnp.zeros((1, 1), bool)
 
-    def coasts(self, modes: jax.Array) -> jax.Array | None:
-        """Whether (1, B) the field is constant, so that steps of any length are exact; None: no."""
+    def coasts(self, modes: Int[Array, "modes B"]) -> Bool[Array, "1 B"] | None:
+        """Mask: the field is constant, so that steps of any length are exact; None: it never is."""
         return None
 
-    def pauses(self, before: jax.Array, after: jax.Array, passes: jax.Array) -> jax.Array | None:
-        """Whether (1, B) the caller has to inspect the state after this pass; None: never."""
+    def pauses(
+        self,
+        before: Int[Array, "modes B"],
+        after: Int[Array, "modes B"],
+        passes: Float[Array, "1 B"],
+    ) -> Bool[Array, "1 B"] | None:
+        """Mask of the impacts that the caller has to inspect after this pass; None: none, ever."""
         return None
 
-    def finish(self, modes: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def finish(
+        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]
+    ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
         """Modes and state at the end of the impact, where `over` is True."""
         return modes, y
 
 
-def total(x: jax.Array) -> jax.Array:
-    """Sum over the rows."""
+def total(x: Num[Array, "k *B"]) -> Num[Array, "1 *B"]:
+    """Sum over the rows, as one row."""
     return jnp.sum(x, axis=0, keepdims=True)
 
 
-def any_of(x: jax.Array) -> jax.Array:
-    """Whether any row."""
+def any_of(x: Bool[Array, "k *B"]) -> Bool[Array, "1 *B"]:
+    """True, in one row, where any row is True."""
     return jnp.any(x, axis=0, keepdims=True)
 
 
-def _rows(x: jax.Array) -> list[jax.Array]:
-    """The rows (1, B) of an array."""
+def _rows(x: Float[Array, "k B"]) -> list[Float[Array, "1 B"]]:
+    """The rows of an array, as arrays of one row."""
     return [x[i : i + 1] for i in range(len(x))]
 
 
-def put(buffer: jax.Array, value: jax.Array, index: jax.Array) -> jax.Array:
+def put(
+    buffer: Shaped[Array, "count *rows"], value: Shaped[Array, "*rows"], index: Integer[Array, ""]
+) -> Shaped[Array, "count *rows"]:
     """The buffer with `value` in the row `index`."""
     return jax.lax.dynamic_update_slice_in_dim(
         buffer, value[None], index, 0, allow_negative_indices=False
@@ -189,9 +214,9 @@ def put(buffer: jax.Array, value: jax.Array, index: jax.Array) -> jax.Array:
 class Step(NamedTuple):
     """A step without its state: enough to repeat it."""
 
-    modes: jax.Array  # (m, B)
-    target: jax.Array  # (k, B) one-hot: the margin it lands on; none: a step in time
-    clock: jax.Array  # (4, B): xi at the beginning, length, whether xi is a root, whether it lands
+    modes: Int[Array, "modes B"]
+    target: Bool[Array, "k B"]  # one-hot: the margin it lands on; none: a step in time
+    clock: Float[Array, "4 B"]  # xi at the beginning, length, 1 if xi is a root, 1 if it lands
 
 
 class _StepVariable(NamedTuple):
@@ -199,12 +224,18 @@ class _StepVariable(NamedTuple):
 
     start: Any  # xi at the beginning
     length: Any  # of the step in xi
-    rooted: Any  # whether xi is a root
-    zero_length: Any  # whether it is a landing on a margin that is 0
+    rooted: Any  # 1 where xi is a root, 0 elsewhere
+    zero_length: Any  # mask of landings on a margin that is 0
 
 
-def _frame(flow: Flow, s: Step, y: jax.Array) -> tuple[Any, jax.Array, _StepVariable]:
-    """Constants of the flow, margins (k, B) at the beginning, and the variable of the step."""
+def _frame(
+    flow: Flow, s: Step, y: Float[Array, "n B"]
+) -> tuple[Any, Float[Array, "k B"], _StepVariable]:
+    """Constants of the flow, margins at the beginning, and the variable xi of the step.
+
+    In time xi runs from the `start` of the clock for its length h; on a landing from c, the margin
+    at the beginning, or its root, to 0.
+    """
     variable_at_start, h, in_root, lands = _rows(s.clock)
     const = flow.constants(s.modes)
     c0 = flow.margins(const, s.modes, y)
@@ -220,18 +251,28 @@ def _frame(flow: Flow, s: Step, y: jax.Array) -> tuple[Any, jax.Array, _StepVari
     return const, jax.lax.stop_gradient(c0), _StepVariable(start, length, rooted, zero_length)
 
 
+class _StepResult(NamedTuple):
+    """Change over a step, its error, and the margins c with their rates dc/dt at both ends."""
+
+    change: Any  # of y and of time (n + 1, B)
+    errors: Float[Array, "2 n B"]  # both estimates of the error of y
+    margins: tuple[Float[Array, "k B"], Float[Array, "k B"]]
+    rates: tuple[Float[Array, "k B"], Float[Array, "k B"]]
+
+
 def _slopes(
     flow: Flow,
     const: Any,
     frame: _StepVariable,
     s: Step,
-    y: jax.Array,
+    y: Float[Array, "n B"],
     stage: Any,
     ends: np.ndarray,
-) -> tuple[list[jax.Array], tuple[jax.Array, jax.Array]]:
-    """dy/dxi in blocks of rows that end at `ends`, dt/dxi, margins and their rates, in a stage.
+) -> tuple[list[Float[Array, "_ B"]], tuple[Float[Array, "k B"], Float[Array, "k B"]]]:
+    """Slopes in a stage: `dy/dxi = dy dt/dxi` in blocks of rows that end at `ends`, then dt/dxi.
 
-    The stage is its number, its node, and the sum of slopes that leads to its state.
+    And the margins and their rates in the flow's own time. The stage is its number, its node c_i,
+    and the sum `sum_j a_ij k_j` of slopes that leads to its state.
     """
     i, node, change = stage
     lands = s.clock[3:4]
@@ -239,7 +280,7 @@ def _slopes(
     now = y[: len(change)] + frame.length * change
     dy = flow.field(const, s.modes, now)
 
-    def rates_of_margins() -> tuple[jax.Array, jax.Array]:
+    def rates_of_margins() -> tuple[Float[Array, "k B"], Float[Array, "k B"]]:
         """Margins and their rates in the flow's own time."""
         return flow.margins_with_rates(const, s.modes, now, dy[: len(now)], s.target)
 
@@ -249,6 +290,7 @@ def _slopes(
         value, dc = cond(needed, rates_of_margins, lambda: (none, none))
     else:
         value, dc = rates_of_margins()
+    # dt/dxi = N / R: N = 2 xi of a root, else 1; R = dc_k/dt of a landing, else 1
     rate = total(jnp.where(s.target, dc, 0.0)) + (1 - lands)
     rate = jnp.where(frame.zero_length & (rate == 0), jnp.inf, rate)
     dt = (1 + frame.rooted * (2 * xi - 1)) / rate
@@ -256,9 +298,8 @@ def _slopes(
     return [*rows, dt], jax.lax.stop_gradient((value, dc))
 
 
-def _stages(flow: Any, s: Step, y: Any, ends: bool) -> tuple[Any, ...]:
-    """Change of y and of time (n + 1, B); both estimates of its error (2, n, B); margins (k, B) at
-    the beginning, and where it `ends`: rates at the beginning, margins and rates at the end.
+def _stages(flow: Any, s: Step, y: Any, ends: bool) -> _StepResult:
+    """One step of the Runge-Kutta method; rates and margins at the end only where it `ends`.
 
     Where `flow` or y has tangents (see `tangents.py`) the change has some, too.
     """
@@ -270,8 +311,8 @@ def _stages(flow: Any, s: Step, y: Any, ends: bool) -> tuple[Any, ...]:
     blocks = plain.driving or (n - adds,)
     ends_of = np.cumsum([0, *blocks, *plain.adding])
 
-    def evaluate(i: jax.Array, node: jax.Array, change: Any) -> Any:
-        """New rows of both tables of slopes; margins and their rates."""
+    def evaluate(i: Integer[Array, ""], node: Float[Array, ""], change: Any) -> Any:
+        """Slopes of a stage as new rows of both tables; margins and their rates."""
         new, margins = pushforward(
             lambda flow, const, frame, y, change: _slopes(
                 flow, const, frame, s, y, (i, node, change), ends_of
@@ -282,23 +323,25 @@ def _stages(flow: Any, s: Step, y: Any, ends: bool) -> tuple[Any, ...]:
 
     row = [dual_like((flow, y), jnp.zeros((1, k, *batch), dtype)) for k in (n - adds, adds + 1)]
     stages = _scanned if jax.default_backend() == "cpu" else _written_out
-    tables, margins = stages(evaluate, row, count, jnp.zeros_like(s.target, dtype))
+    tables, (d0, c1, d1) = stages(evaluate, row, count, jnp.zeros_like(s.target, dtype))
     weights = jnp.asarray(np.pad(_WEIGHTS, ((0, 0), (0, count - STAGES))), dtype)
     change, errors = _weighted(tables, weights, frame.length)
-    return change, errors[:, :n], c0, margins
+    return _StepResult(change, errors[:, :n], (c0, c1), (d0, d1))
 
 
-def _scanned(evaluate: Any, row: list[Any], count: int, none: jax.Array) -> tuple[Any, Any]:
-    """Slopes of all stages (count, k, B), two tables, from empty rows (1, k, B) of them; rates of
-    margins (k, B) in the first stage, margins and rates in the last, from `none`.
+def _scanned(
+    evaluate: Any, row: list[Any], count: int, none: Float[Array, "k B"]
+) -> tuple[Any, Any]:
+    """Slopes of all stages in two tables (count, rows, B), and margins at both ends, by a scan.
 
-    One kernel for all stages: it compiles quickly.
+    `row` has an empty row (1, rows, B) of each table. Of the margins: rates in the first stage,
+    values and rates in the last, from `none`. One kernel for all stages: it compiles quickly.
     """
     dtype = none.dtype
     table = jnp.asarray(np.pad(_TABLE[:count], ((0, 0), (0, count - STAGES))), dtype)
 
     def stage(carry: Any, at: Any) -> tuple[Any, None]:
-        """One evaluation of the field."""
+        """Tables with the slopes of stage i, whose state follows from those of earlier stages."""
         slopes, added, first, *_ = carry
         i, weights, node = at
         change = jax.tree.map(lambda k: jnp.tensordot(weights, k, axes=1), slopes)
@@ -312,8 +355,10 @@ def _scanned(evaluate: Any, row: list[Any], count: int, none: jax.Array) -> tupl
     return [slopes, added], margins
 
 
-def _written_out(evaluate: Any, row: list[Any], count: int, none: jax.Array) -> tuple[Any, Any]:
-    """As `_scanned`, each stage with kernels of its own.
+def _written_out(
+    evaluate: Any, row: list[Any], count: int, none: Float[Array, "k B"]
+) -> tuple[Any, Any]:
+    """Slopes and margins as `_scanned`, each stage with kernels of its own.
 
     On a GPU the tables that a scan carries pass through memory in every stage, for twice the time
     of an impact. On a CPU this is no faster, and compiles for two to four times as long.
@@ -337,8 +382,13 @@ def _written_out(evaluate: Any, row: list[Any], count: int, none: jax.Array) -> 
     return whole, (margins[0][1], *margins[-1])
 
 
-def _weighted(tables: list[Any], weights: jax.Array, length: Any) -> tuple[Any, jax.Array]:
-    """Change over a step (n + 1, B), and estimates of its error (2, n + 1, B), from all slopes."""
+def _weighted(
+    tables: list[Any], weights: Float[Array, "3 count"], length: Any
+) -> tuple[Any, Float[Array, "2 _ B"]]:
+    """Change over a step (n + 1, B), and two estimates of its error, from all slopes.
+
+    Equation: `h sum_i b_i k_i`, with the weights b of the method, then of both estimates.
+    """
     sums = [jnp.tensordot(weights, value_of(k), axes=1) for k in tables]
     inner, outer = (
         Dual(x[0], jnp.tensordot(weights[0], k.tangents, axes=1)) if is_dual(k) else x[0]
@@ -348,8 +398,8 @@ def _weighted(tables: list[Any], weights: jax.Array, length: Any) -> tuple[Any, 
     return change, value_of(length)[None] * jnp.concatenate([x[1:] for x in sums], axis=1)
 
 
-def _with_row(table: Any, new: list[Any], i: jax.Array) -> Any:
-    """The table with a new row of slopes, in blocks.
+def _with_row(table: Any, new: list[Any], i: Integer[Array, ""]) -> Any:
+    """The table of slopes (count, rows, B) with `new`, a list of blocks of rows, as its row i.
 
     Each block of tangents is a kernel: one for all would compute them entry by entry.
     """
@@ -377,7 +427,7 @@ class Mark(enum.IntEnum):
 
 
 class Intention(enum.IntEnum):
-    """What the next step does about a margin, the most urgent first, and what its distance means.
+    """Purpose of the next step for a margin, the most urgent first; the meaning of its distance.
 
     The numbers leave a gap for distances from 0 to 1 between them: their sum is the order of
     urgency.
@@ -395,26 +445,26 @@ class StepperState(NamedTuple):
     step: Step  # the one to try
     # (4, B): time it is expected to take; whether a landing already had to aim at another event;
     # `Mark`; number of passes
-    progress: jax.Array
+    progress: Float[Array, "4 B"]
 
     @property
-    def mark(self) -> jax.Array:
-        """`Mark` (1, B) of each impact."""
+    def mark(self) -> Int[Array, "1 B"]:
+        """`Mark` of each impact."""
         return self.progress[2:3].astype(jnp.int32)
 
     @property
-    def passes(self) -> jax.Array:
-        """Number of passes (1, B) so far, a whole floating-point number."""
+    def passes(self) -> Float[Array, "1 B"]:
+        """Number of passes so far, a whole floating-point number."""
         return self.progress[3:4]
 
-    def marked(self, which: jax.Array, mark: Any) -> "StepperState":
-        """With this `Mark` where `which` (1, B)."""
+    def marked(self, which: Bool[Array, "1 B"], mark: Any) -> "StepperState":
+        """The state with this `Mark` where `which` is True."""
         old = self.progress[2:3]
         new = jnp.where(which, jnp.asarray(mark, old.dtype), old)
         return self._replace(progress=self.progress.at[2:3].set(jax.lax.stop_gradient(new)))
 
 
-def begin(flow: Any, modes: jax.Array, start: Any) -> StepperState:
+def begin(flow: Any, modes: Int[Array, "modes B"], start: Any) -> StepperState:
     """The state before the first pass.
 
     The first step is short and advances in the root of time, as forces start as a power of it.
@@ -422,36 +472,37 @@ def begin(flow: Any, modes: jax.Array, start: Any) -> StepperState:
     start = dual_like((flow, start), start)
     flow, y = value_of((flow, start))
     one = jnp.ones_like(y[:1])
+    # xi = 0, a length in the root of time, no landing
     clock = jnp.concatenate([0 * one, FIRST**0.5 * one, one, 0 * one])
     targets = jax.eval_shape(lambda: flow.margins(flow.constants(modes), modes, y)).shape
     step = Step(modes, jnp.zeros(targets, bool), clock)
     over = flow.over(modes, y, 0 * one)
-    state = jnp.where(over, Mark.OVER, Mark.GOES_ON).astype(y.dtype)
-    return StepperState(start, step, jnp.concatenate([FIRST * one, 0 * one, state, 0 * one]))
+    mark = jnp.where(over, Mark.OVER, Mark.GOES_ON).astype(y.dtype)
+    return StepperState(start, step, jnp.concatenate([FIRST * one, 0 * one, mark, 0 * one]))
 
 
-def goes_on(carry: StepperState, most: int) -> jax.Array:
-    """Impacts (1, B) that are neither over nor given up nor paused."""
+def goes_on(carry: StepperState, most: int) -> Bool[Array, "1 B"]:
+    """Mask of the impacts that are neither over nor given up nor paused."""
     return (carry.mark == Mark.GOES_ON) & (carry.passes < most)
 
 
-def advance(flow: Flow, state: StepperState, most: int) -> tuple[StepperState, jax.Array]:
+def advance(flow: Flow, state: StepperState, most: int) -> tuple[StepperState, Bool[Array, "1 B"]]:
     """Try one step; accept it, or shorten it, or repeat it so that it ends at an event.
 
-    Returns the state for the next pass, and whether (1, B) the step was accepted.
+    Returns the state for the next pass, and a mask of the impacts that accept the step.
     """
     duals, start, s = flow, state.y, state.step
-    flow, y = value_of((flow, start))
+    flow, y = value_of((flow, start))  # without tangents
     n = y.shape[0]
     expected, aimed_twice, mark, passes = _rows(state.progress)
     _, h, _, lands = _rows(s.clock)
-    change, errors, c0, (d0, c1, d1) = _stages(duals, s, start, ends=True)
+    change, errors, margins, rates = _stages(duals, s, start, ends=True)
     error2 = _squared_error(flow, s, y, errors, passes)
     ok = error2 <= 1
     elapsed = value_of(change)[n:]  # the last row is time
     duration = jnp.where(ok & (elapsed > 0), elapsed, expected)
-    slopes = d0 * duration, d1 * duration
-    urgent = _most_urgent(*_intentions(flow, s, aimed_twice, (c0, c1), slopes))
+    slopes = rates[0] * duration, rates[1] * duration
+    urgent = _most_urgent(*_intentions(flow, s, aimed_twice, margins, slopes))
     active = goes_on(state, most)
     accept = ok & (urgent.intention == Intention.AHEAD) & active
     landed = accept & (lands > 0)
@@ -459,8 +510,10 @@ def advance(flow: Flow, state: StepperState, most: int) -> tuple[StepperState, j
     # the field has no value, however short the step: given up, and the status reports it
     broken = active & ~(lands > 0) & ~(error2 < jnp.inf) & (h < SHORTEST)
 
-    def after(flow: Flow, y: jax.Array, change: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Modes and state after the step, where it is accepted."""
+    def after(
+        flow: Flow, y: Float[Array, "n B"], change: Float[Array, "_ B"]
+    ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
+        """Modes and state after an accepted step; else the state before, or NaN if `broken`."""
         modes, end = flow.switch(s.modes, y + change[:n], events)
         return modes, jnp.where(accept, end, jnp.where(broken, jnp.nan, y))
 
@@ -478,9 +531,16 @@ def advance(flow: Flow, state: StepperState, most: int) -> tuple[StepperState, j
 
 
 def _squared_error(
-    flow: Flow, s: Step, y: jax.Array, errors: jax.Array, passes: jax.Array
-) -> jax.Array:
-    """Hairer's error (1, B) of a step, squared, in tolerances."""
+    flow: Flow,
+    s: Step,
+    y: Float[Array, "n B"],
+    errors: Float[Array, "2 n B"],
+    passes: Float[Array, "1 B"],
+) -> Float[Array, "1 B"]:
+    """Hairer's error of a step, squared, in tolerances.
+
+    Equation: `e5^4 / (e5^2 + 0.01 e3^2)` of the largest scaled errors e5 and e3 of both estimates.
+    """
     zero = precision(y.dtype)
     full = FULL * flow.taking_part
     local = jnp.maximum(flow.tolerance * (full / jnp.maximum(passes, full)), zero.noise)
@@ -495,11 +555,11 @@ def _squared_error(
 def _intentions(
     flow: Flow,
     s: Step,
-    aimed_twice: jax.Array,
-    values: tuple[jax.Array, jax.Array],
-    slopes: tuple[jax.Array, jax.Array],
-) -> tuple[jax.Array, jax.Array]:
-    """Intention and distance of each margin (k, B), from values and slopes at both ends of a step.
+    aimed_twice: Float[Array, "1 B"],
+    values: tuple[Float[Array, "k B"], Float[Array, "k B"]],
+    slopes: tuple[Float[Array, "k B"], Float[Array, "k B"]],
+) -> tuple[Int[Array, "k B"], Float[Array, "k B"]]:
+    """Intention and distance of each margin, from values and slopes at both ends of a step.
 
     In units of the step, with v = 1 - u, a margin within the step is Hermite's cubic
 
@@ -531,11 +591,11 @@ def _intentions(
 
 def _place_within(
     flow: Flow,
-    crossed: jax.Array,
-    values: tuple[jax.Array, jax.Array],
-    slopes: tuple[jax.Array, jax.Array],
-) -> jax.Array:
-    """Where u (k, B) in a step margins vanish if they have `crossed` 0, otherwise turn."""
+    crossed: Bool[Array, "k B"],
+    values: tuple[Float[Array, "k B"], Float[Array, "k B"]],
+    slopes: tuple[Float[Array, "k B"], Float[Array, "k B"]],
+) -> Float[Array, "k B"]:
+    """Places u in a step at which margins vanish if they have `crossed` 0, otherwise turn."""
     (c0, c1), (d0, d1) = values, slopes
     # the root of the chord c0 + (c1 - c0) u, or of the slope d0 + (d1 - d0) u
     above = jnp.maximum(c0, 0.0)
@@ -556,13 +616,14 @@ def _place_within(
 class _Urgent(NamedTuple):
     """The margin that decides about the next step."""
 
-    intention: jax.Array  # (1, B)
-    distance: jax.Array  # (1, B)
-    target: jax.Array  # (k, B) one-hot
+    intention: Int[Array, "1 B"]  # (1, B)
+    distance: Float[Array, "1 B"]  # (1, B)
+    target: Bool[Array, "k B"]  # one-hot
 
 
-def _most_urgent(intention: jax.Array, distance: jax.Array) -> _Urgent:
-    """The least intention and, of equal ones, the least distance; ties go by the row."""
+def _most_urgent(intention: Int[Array, "k B"], distance: Float[Array, "k B"]) -> _Urgent:
+    """The margin of least intention and, of equal ones, of least distance; ties go by the row."""
+    # below 0: SHORTEN; from 0 to 1: LAND at this part of the step; above: AHEAD
     order = intention + distance + TIE * jnp.arange(len(distance), dtype=distance.dtype)[:, None]
     first = jnp.min(order, axis=0, keepdims=True)
     not_before = jnp.where(first <= Intention.AHEAD, Intention.LAND, Intention.AHEAD)
@@ -573,20 +634,22 @@ def _most_urgent(intention: jax.Array, distance: jax.Array) -> _Urgent:
 def _next_step(
     flow: Flow,
     s: Step,
-    modes: jax.Array,
+    modes: Int[Array, "modes B"],
     urgent: _Urgent,
-    accept: jax.Array,
-    error2: jax.Array,
-    duration: jax.Array,
-) -> tuple[Step, jax.Array]:
-    """The step to try after `s`, and the time it is expected to take (1, B).
+    accept: Bool[Array, "1 B"],
+    error2: Float[Array, "1 B"],
+    duration: Float[Array, "1 B"],
+) -> tuple[Step, Float[Array, "1 B"]]:
+    """The step to try after `s`, and the time it is expected to take.
 
     `duration` is the time that `s` takes, `error2` its error in tolerances, squared.
     """
     start, length, in_root, lands = _rows(s.clock)
     ok, event, lands = error2 <= 1, urgent.intention < Intention.AHEAD, lands > 0
+    # xi goes on from the end of an accepted step
     in_root = (in_root > 0) & ~lands
     start = jnp.where(in_root, start + jnp.where(accept, length, 0.0), 0.0)
+    # the length: shorter before an event or after a failed landing, else by the error
     shorter = _shorter_length(flow, s, in_root, urgent, ok, duration)
     at_event = jnp.where(urgent.intention == Intention.SHORTEN, shorter, length)
     after_landing = jnp.where(ok, length, shorter)
@@ -598,6 +661,7 @@ def _next_step(
     proposed = jnp.where(in_root, proposed, jnp.minimum(proposed, flow.longest))
     # xi is the root of time: from `start` on a step takes this long
     expected = jnp.where(in_root, (start + proposed) ** 2 - start**2, proposed)
+    # the next step is a landing, in time, if one is due now or ahead
     reached = _reaches_event(flow, s.modes, urgent.distance, duration, expected)
     aim = ok & jnp.where(event, urgent.intention == Intention.LAND, ~lands & reached)
     proposed = jnp.where(aim & in_root, expected, proposed)
@@ -607,8 +671,10 @@ def _next_step(
     return step, jnp.where(aim, urgent.distance * duration, expected)
 
 
-def _length_from_error(length: jax.Array, error2: jax.Array) -> jax.Array:
-    """The length (1, B) at which the error would be SAFETY^8 tolerances, as error ~ length^8."""
+def _length_from_error(
+    length: Float[Array, "1 B"], error2: Float[Array, "1 B"]
+) -> Float[Array, "1 B"]:
+    """The length at which the error would be SAFETY^8 tolerances, as error ~ length^8."""
     # four roots: error^(1/8) = error2^(1/16); 1e-20 keeps it from 0, far beyond GROWTH
     eighth_root = jnp.sqrt(jnp.sqrt(jnp.sqrt(jnp.sqrt(error2 + 1e-20))))
     factor = jnp.clip(SAFETY / eighth_root, SHRINK, GROWTH)
@@ -616,9 +682,14 @@ def _length_from_error(length: jax.Array, error2: jax.Array) -> jax.Array:
 
 
 def _shorter_length(
-    flow: Flow, s: Step, in_root: jax.Array, urgent: _Urgent, ok: jax.Array, duration: jax.Array
-) -> jax.Array:
-    """The length (1, B) that ends before an event, or half of the time of a failed landing."""
+    flow: Flow,
+    s: Step,
+    in_root: Bool[Array, "1 B"],
+    urgent: _Urgent,
+    ok: Bool[Array, "1 B"],
+    duration: Float[Array, "1 B"],
+) -> Float[Array, "1 B"]:
+    """The length that ends before an event, or half of the time of a failed landing."""
     part = 1 - flow.near if flow.near else CUT
     cut = jnp.where(ok & (urgent.intention == Intention.SHORTEN), part * urgent.distance, 0.5)
     length, lands = s.clock[1:2], s.clock[3:4] > 0
@@ -626,16 +697,22 @@ def _shorter_length(
     return jnp.where(in_root, jnp.sqrt(cut) * length, cut * jnp.where(lands, duration, length))
 
 
-def _restart_in_root(closed: jax.Array, duration: jax.Array, length: jax.Array) -> jax.Array:
-    """The length (1, B), but of the first step after a contact has `closed` in the root of time."""
+def _restart_in_root(
+    closed: Bool[Array, "1 B"], duration: Float[Array, "1 B"], length: Float[Array, "1 B"]
+) -> Float[Array, "1 B"]:
+    """The length, but of the first step after a contact has `closed` in the root of time."""
     restart = jnp.sqrt(jnp.minimum(RESTART * duration, FIRST))
     return jnp.where(closed & (restart > 0), restart, length)
 
 
 def _reaches_event(
-    flow: Flow, modes: jax.Array, distance: jax.Array, duration: jax.Array, expected: jax.Array
-) -> jax.Array:
-    """Whether (1, B) the next step, of this expected time, shall land on the event ahead."""
+    flow: Flow,
+    modes: Int[Array, "modes B"],
+    distance: Float[Array, "1 B"],
+    duration: Float[Array, "1 B"],
+    expected: Float[Array, "1 B"],
+) -> Bool[Array, "1 B"]:
+    """Mask: the next step, of this expected time, shall land on the event ahead."""
     reached = distance * duration < expected
     coasts = flow.coasts(modes)
     if coasts is not None:
@@ -644,9 +721,17 @@ def _reaches_event(
 
 
 def _root_of_cubic(
-    u: jax.Array, c0: jax.Array, d0: jax.Array, c1: jax.Array, d1: jax.Array
-) -> jax.Array:
-    """The root in [0, 1] near u of the cubic with values c and slopes d at 0 and 1."""
+    u: Float[Array, "k B"],
+    c0: Float[Array, "k B"],
+    d0: Float[Array, "k B"],
+    c1: Float[Array, "k B"],
+    d1: Float[Array, "k B"],
+) -> Float[Array, "k B"]:
+    """The root in [0, 1] near u of the cubic with values c and slopes d at 0 and 1.
+
+    By Newton's method on `c0 v + c1 u + u v (v a + u b)`, v = 1 - u, a = d0 - (c1 - c0),
+    b = (c1 - c0) - d1.
+    """
     rise = c1 - c0
     a, b = d0 - rise, rise - d1
     for _ in range(POLISH):
@@ -658,8 +743,13 @@ def _root_of_cubic(
     return u
 
 
-def between(flow: Flow, s: Step, y: jax.Array, ahead: jax.Array) -> jax.Array:
-    """The state within the step from y at `ahead` (1, B) after it, in the flow's own time."""
+def between(
+    flow: Flow, s: Step, y: Float[Array, "n B"], ahead: Float[Array, "1 B"]
+) -> Float[Array, "n B"]:
+    """The state within the step from y at the time `ahead` after it, in the flow's own time.
+
+    In the root xi of time, `xi^2 = xi_0^2 + ahead`.
+    """
     variable_at_start, in_root, lands = s.clock[:1], s.clock[2:3], s.clock[3:4]
     in_root = in_root * (1 - lands)
     variable_at_start = variable_at_start * in_root
@@ -671,7 +761,6 @@ def between(flow: Flow, s: Step, y: jax.Array, ahead: jax.Array) -> jax.Array:
     return step_again(flow, Step(s.modes, jnp.zeros_like(s.target), clock), y)
 
 
-def step_again(flow: Flow, s: Step, y: jax.Array) -> jax.Array:
+def step_again(flow: Flow, s: Step, y: Float[Array, "n B"]) -> Float[Array, "n B"]:
     """The state after an accepted step, as a smooth function of `flow` and `y`."""
-    change, *_ = _stages(flow, s, y, ends=False)
-    return y + change[:-1]
+    return y + _stages(flow, s, y, ends=False).change[:-1]

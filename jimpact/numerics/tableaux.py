@@ -10,7 +10,10 @@ from typing import NamedTuple
 
 
 class Tableau(NamedTuple):
-    """An explicit Runge-Kutta method: strictly lower triangular a, weights b, nodes c."""
+    """An explicit Runge-Kutta method: strictly lower triangular a, weights b, nodes c.
+
+    Stage i is at `y + h sum_j a_ij k_j` and the time `t + c_i h`, the end at `y + h sum_i b_i k_i`.
+    """
 
     order: int
     a: tuple[tuple[float, ...], ...]

@@ -2,22 +2,24 @@
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, Shaped
 
 
 class TangentialBlock(NamedTuple):
-    """What the t tangents add to m contacts: `u+ = u- + W_tn p + W_tt p_t`.
+    """Blocks of the Delassus matrix of m contacts with t tangents: `u+ = u- + W_nt^T p + W_tt p_t`.
 
-    t = m in the plane, 2 m in space, contact by contact.
+    t = m in the plane, 2 m in space, contact by contact; of N groups with an axis in front.
     """
 
-    normal_tangent: jax.Array  # W_nt (m, t) [1/kg]
-    tangent: jax.Array  # W_tt (t, t) [1/kg]
-    slip: jax.Array  # u- (t,) [m/s]
+    normal_tangent: Float[Array, "*N m t"]  # W_nt [1/kg]
+    tangent: Float[Array, "*N t t"]  # W_tt [1/kg]
+    slip: Float[Array, "*N t"]  # u- [m/s]
 
-    def scaled(self, root: jax.Array, speed: jax.Array | float = 1.0) -> "TangentialBlock":
-        """The block where contact j is divided by `root` (m,), and slip by `speed` () as well."""
+    def scaled(
+        self, root: Float[Array, "m"], speed: Float[Array, ""] | float = 1.0
+    ) -> "TangentialBlock":
+        """The block where contact j is divided by `root`, and slip by `speed` as well."""
         of_tangents = per_tangent(root, self.slip)
         return TangentialBlock(
             self.normal_tangent / (root[:, None] * of_tangents[None]),
@@ -26,6 +28,6 @@ class TangentialBlock(NamedTuple):
         )
 
 
-def per_tangent(values: jax.Array, tangential: jax.Array) -> jax.Array:
-    """Values (m,) of contacts repeated for each of their tangents, as many as in (t,)."""
+def per_tangent(values: Float[Array, "m"], tangential: Shaped[Array, "t *B"]) -> Float[Array, "t"]:
+    """Values of contacts repeated for each of their tangents, as many as in rows t."""
     return jnp.repeat(values, len(tangential) // len(values))

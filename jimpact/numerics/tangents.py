@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, Shaped
 
 from jimpact.tools.loops import varying_like
 
@@ -18,14 +19,14 @@ TANGENT_AXIS = -2  # the axis of the directions
 
 
 class Dual(NamedTuple):
-    """A value (.., B) with its tangents (.., D, B)."""
+    """A value (.., B) with its tangents (.., D, B) in D directions."""
 
-    value: jax.Array
-    tangents: jax.Array
+    value: Shaped[Array, "*rows B"]
+    tangents: Shaped[Array, "*rows D B"]
 
 
 def is_dual(x: Any) -> bool:
-    """Whether x has tangents."""
+    """True if x has tangents."""
     return isinstance(x, Dual)
 
 
@@ -49,7 +50,10 @@ def pushforward(function: Callable[..., Any], *args: Any) -> Any:
         return results
 
     def note(results: Any, tangents: Any) -> tuple[Any, Any]:
-        """A tangent that is known to be 0 is symbolic."""
+        """Results and tangents as they are; notes in `depends` which results have tangents.
+
+        A tangent that is known to be 0 is symbolic.
+        """
         depends[:] = [
             is_smooth(x) and not isinstance(t, SymbolicZero)
             for x, t in zip(results[0], tangents[0])
@@ -59,7 +63,7 @@ def pushforward(function: Callable[..., Any], *args: Any) -> Any:
     observed.defjvp(note, symbolic_zeros=True)
 
     def of_values(*values: jax.Array) -> list[Any]:
-        """Leaves of the results, from the values of the duals."""
+        """Leaves of the results, as a function of the values of the duals alone."""
         replaced = dict(zip(duals, values))
         args = jax.tree.unflatten(tree, [replaced.get(i, x) for i, x in enumerate(leaves)])
         results, result_tree = jax.tree.flatten(function(*args))
@@ -70,7 +74,7 @@ def pushforward(function: Callable[..., Any], *args: Any) -> Any:
     values = tuple(leaves[i].value for i in duals)
 
     def push(*tangents: jax.Array) -> tuple[list[jax.Array], list[jax.Array]]:
-        """Results, and tangents of those that depend on a dual, in one direction."""
+        """Results, and tangents `sum_i (df / dx_i) dx_i` of those that depend on a dual."""
         results, rates = jax.jvp(of_values, values, tangents)
         return results, [rate for rate, needed in zip(rates, depends) if needed]
 
@@ -83,12 +87,12 @@ def pushforward(function: Callable[..., Any], *args: Any) -> Any:
 
 
 def is_smooth(x: Any) -> bool:
-    """Whether x is an array, or a shape, of floating-point numbers: it may have tangents."""
+    """True if x is an array, or a shape, of floating-point numbers: it may have tangents."""
     return bool(jnp.issubdtype(x.dtype, jnp.floating))
 
 
 def dual_like(tree: Any, x: jax.Array | Dual) -> Any:
-    """x with tangents of 0 if a leaf of the tree is a `Dual`, otherwise x."""
+    """x as a `Dual` with tangents of 0 if a leaf of the tree is a `Dual`, otherwise x."""
     duals = [leaf for leaf in jax.tree.leaves(tree, is_leaf=is_dual) if is_dual(leaf)]
     if not duals or isinstance(x, Dual):
         return x

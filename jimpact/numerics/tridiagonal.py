@@ -5,16 +5,20 @@ from typing import Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
 
 from jimpact.numerics.sparse import Neighbours, Sparse
 
+# of one row: diagonal entry, right side, off-diagonal entry to the next row
 Triple = tuple[jax.Array, jax.Array, jax.Array]
 
 
 def tridiagonal_product(
-    on_diagonal: jax.Array, off_diagonal: jax.Array, vector: jax.Array
-) -> jax.Array:
-    """`A vector` (m, ..) of a symmetric tridiagonal A, given what its diagonal makes of it."""
+    on_diagonal: Float[Array, "m *#B"],
+    off_diagonal: Float[Array, "m-1 *#B"],
+    vector: Float[Array, "m *#B"],
+) -> Float[Array, "m *#B"]:
+    """`(A x)_j = d_j x_j + o_j-1 x_j-1 + o_j x_j+1`, given d_j x_j: symmetric tridiagonal A."""
     none = jnp.zeros_like(vector[:1])
     lower = jnp.concatenate([none, off_diagonal * vector[:-1]])
     upper = jnp.concatenate([off_diagonal * vector[1:], none])
@@ -22,26 +26,30 @@ def tridiagonal_product(
 
 
 class Tridiagonal(eqx.Module):
-    """Symmetric tridiagonal matrix: `diagonal` (m,), `off_diagonal` (m - 1,).
+    """Symmetric tridiagonal matrix.
 
     `regular`: known to be regular whatever its values (a chain with no more contacts than bodies).
     """
 
-    diagonal: jax.Array
-    off_diagonal: jax.Array
+    diagonal: Float[Array, "m *B"]
+    off_diagonal: Float[Array, "m-1 *B"]
     regular: bool = eqx.field(static=True, default=False)
 
-    def __matmul__(self, vector: jax.Array) -> jax.Array:
-        """Matrix-vector product in O(m); batches in further axes of all three."""
+    def __matmul__(self, vector: Float[ArrayLike, "m *B"]) -> Float[Array, "m *B"]:
+        """Product `A x` in O(m); batches in further axes of all three."""
+        vector = jnp.asarray(vector)
         return tridiagonal_product(self.diagonal * vector, self.off_diagonal, vector)
 
-    def solve(self, vector: jax.Array) -> jax.Array:
-        """`A^-1 vector` for a positive definite matrix, in O(m)."""
+    def solve(self, vector: Float[Array, "m"]) -> Float[Array, "m"]:
+        """`A^-1 vector` for a positive definite matrix, in O(m), by elimination without pivots."""
         none = jnp.zeros_like(vector[:1])
         first = jnp.ones_like(none), none, none
 
         def eliminate(row: Triple, entries: Triple) -> tuple[Triple, Triple]:
-            """A row of the bidiagonal system, from the row above."""
+            """Row j of the bidiagonal system from row j - 1, f = o_j-1 / d_j-1, twice.
+
+            Equation: `d_j - f o_j-1` on the diagonal, right side `r_j - f r_j-1`.
+            """
             pivot, right, before = row  # of the row above, and its off-diagonal entry
             diagonal, known, after = entries[0][None], entries[1][None], entries[2][None]
             factor = before / pivot
@@ -51,8 +59,10 @@ class Tridiagonal(eqx.Module):
         after = jnp.concatenate([self.off_diagonal, none])
         _, (pivot, right, after) = jax.lax.scan(eliminate, first, (self.diagonal, vector, after))
 
-        def substitute(x: jax.Array, row: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
-            """An unknown, from the one below."""
+        def substitute(
+            x: Float[Array, "1"], row: Triple
+        ) -> tuple[Float[Array, "1"], Float[Array, "1"]]:
+            """Unknown `x_j = (r_j - o_j x_j+1) / d_j` of the bidiagonal system, twice."""
             pivot, right, after = row
             x = (right - after * x) / pivot
             return x, x
@@ -64,8 +74,8 @@ class Tridiagonal(eqx.Module):
         """|A|, entry by entry."""
         return Tridiagonal(jnp.abs(self.diagonal), jnp.abs(self.off_diagonal), self.regular)
 
-    def as_matrix(self) -> jax.Array:
-        """The dense (m, m) matrix."""
+    def as_matrix(self) -> Float[Array, "m m *B"]:
+        """The dense matrix."""
         m = self.diagonal.shape[0]
         i = jnp.arange(m)
         dense = jnp.zeros((m, m, *self.diagonal.shape[1:]), self.diagonal.dtype)
@@ -73,7 +83,7 @@ class Tridiagonal(eqx.Module):
         dense = dense.at[i[:-1], i[1:]].set(self.off_diagonal)
         return dense.at[i[1:], i[:-1]].set(self.off_diagonal)
 
-    def scaled(self, scale: jax.Array) -> "Tridiagonal":
+    def scaled(self, scale: Float[Array, "m"]) -> "Tridiagonal":
         """`diag(scale) A diag(scale)`."""
         off = self.off_diagonal * scale[:-1] * scale[1:]
         return Tridiagonal(self.diagonal * scale**2, off, self.regular)
@@ -92,8 +102,8 @@ def structure_of(matrix: Symmetric) -> Structure:
     return "chain" if isinstance(matrix, Tridiagonal) else None
 
 
-def off_diagonal(matrix: Symmetric) -> jax.Array:
-    """Entries off the diagonal: (m, K) of neighbours, (m - 1,) of a chain, the upper triangle."""
+def off_diagonal(matrix: Symmetric) -> Float[Array, "..."]:
+    """Entries off the diagonal: (m, K) of neighbours, (m - 1,) of a chain, upper triangle else."""
     if isinstance(matrix, Sparse):
         return matrix.entries
     if isinstance(matrix, Tridiagonal):
@@ -101,22 +111,22 @@ def off_diagonal(matrix: Symmetric) -> jax.Array:
     return matrix[jnp.triu_indices(len(matrix), 1)]
 
 
-def as_matrix(matrix: Symmetric) -> jax.Array:
+def as_matrix(matrix: Symmetric) -> Float[Array, "m m *B"]:
     """Dense form of a matrix."""
     return matrix.as_matrix() if isinstance(matrix, (Tridiagonal, Sparse)) else matrix
 
 
-def diagonal(matrix: Symmetric) -> jax.Array:
+def diagonal(matrix: Symmetric) -> Float[Array, "m *B"]:
     """Diagonal of a matrix."""
     return matrix.diagonal if isinstance(matrix, (Tridiagonal, Sparse)) else jnp.diagonal(matrix)
 
 
 def is_regular(matrix: Symmetric) -> bool:
-    """Whether the matrix is known to be regular without looking at its values."""
+    """True if the matrix is known to be regular without looking at its values."""
     return isinstance(matrix, Tridiagonal) and matrix.regular
 
 
-def scaled(matrix: Symmetric, scale: jax.Array) -> Symmetric:
+def scaled(matrix: Symmetric, scale: Float[Array, "m"]) -> Symmetric:
     """`diag(scale) A diag(scale)` in the form `matrix` has."""
     if isinstance(matrix, (Tridiagonal, Sparse)):
         return matrix.scaled(scale)
