@@ -223,7 +223,7 @@ class Bodies(RigidBodies):
         return jnp.concatenate([self.of_bodies(q), self.places.astype(q.dtype)])
 
     def contacts(self, q: jax.Array) -> ContactPoints:
-        """Gaps, points and normals (m,) at q; `between` holds the bodies of each contact."""
+        """Gaps (m,), points and normals (m, ..) at q, and the bodies of each contact."""
         placed, rims = self.placed(q), self.rims
         points, parts = placed.points, [self.on_planes(placed.points)]
         discs, mixed, faces = self._kinds
@@ -235,9 +235,11 @@ class Bodies(RigidBodies):
         if len(faces):
             i, j = faces.T
             a, b = points[i], points[j]
-            facing = facing_sides(*jax.lax.stop_gradient((a, b)))  # numbers have no derivative
+            facing = facing_sides(*jax.lax.stop_gradient((a, b)))  # indices of sides
             counts, angles = self._counts, self.all_bodies(q)[:, 2]
             at, sizes = (angles[i], angles[j]), (counts[i], counts[j])
+            # which of the two contacts of a pair comes first, so that one keeps its place where a
+            # body rolls over a corner and another side faces the other body
             swapped = changed_places((a, b), at, sizes, facing)
             two_each = polygon_on_polygon(a, b, facing, swapped)  # (g, 2, ..)
             parts.append(ContactPoints(*(x.reshape(-1, *x.shape[2:]) for x in two_each)))

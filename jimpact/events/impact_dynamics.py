@@ -319,12 +319,18 @@ class ImplicitProgram(ImpulseProgram):
         return flow, flow.start(first_indentation(problem, self.exponent), velocity)
 
     def __call__(self, *leaves: Any) -> tuple[Any, ...]:
-        """The results from the leaves of a problem; see `ImpulseProgram`."""
+        """Normal and tangential impulses (m, B), (t, B), time, status and passes (1, B).
+
+        The leaves are those of a `Problem`. Tangents that they carry pass, and `only_first` marks
+        the values beside them, so that a second derivative raises; the reverse mode of kept
+        checkpoints runs the steps again and needs them plain.
+        """
         values = value_of(leaves) if self.checkpoints else self.only_first(value_of(leaves))
         first_only = [Dual(v, x.tangents) if is_dual(x) else v for x, v in zip(leaves, values)]
         flow, start = pushforward(self.steps, jax.tree.unflatten(self.tree, first_only))
         run = implicit_steps.run(flow, start, self.most, self.checkpoints)
         m = len(value_of(start.indentation))
+        # rows of the impulse: m normal ones, then the tangential ones
         impulses = pushforward(lambda p: (p[:m], p[m:]), run.state.impulse)
         return *impulses, run.state.time, self.code(flow, run), run.passes
 

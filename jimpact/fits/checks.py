@@ -165,8 +165,10 @@ def _conserved(problem: FitProblem) -> list[np.ndarray]:
 def _pure_error(judged: Judged) -> tuple[float, int]:
     """Pure error: the sum of squared residuals that no law can change, and its degrees of freedom.
 
-    Equation: over groups of g shots with equal v-, of residuals r_k, their mean m, and the momentum
-    directions B (n, c) of `_conserved`: `sum |r_k - m|^2 + g |B^T m|^2`, `(g - 1) n + c` degrees.
+    Equation: over groups of g shots of n values with equal v-, of residuals r_k in units of sigma,
+    their mean m, and the momentum directions B (n, c) of `_conserved`, orthonormal in these units:
+    `sum |r_k - m|^2 + g |B^T m|^2` with `(g - 1) n + c` degrees, less g c where the momentum of
+    every shot has been corrected (its residuals are 0). Readings that are all equal count as one.
     """
     problem, experiments = judged.problem, judged.problem.experiments
     assert experiments is not None
@@ -174,20 +176,20 @@ def _pure_error(judged: Judged) -> tuple[float, int]:
     for k, pre in enumerate(np.asarray(experiments.pre)):
         # shots in scenes of their own are not repetitions
         groups.setdefault((0 if experiments.scenes is None else k, pre.tobytes()), []).append(k)
-    conserved, bodies = _conserved(problem), problem.measured.shape[1]
+    conserved, n = _conserved(problem), problem.measured.shape[1]
     squares, count = 0.0, 0
     for shots in groups.values():
         blocks = [judged.residual[judged.shot == k] for k in shots]
-        complete = np.array([block for block in blocks if len(block) == bodies])
+        complete = np.array([block for block in blocks if len(block) == n])
         if len(complete) == 0:
             continue
-        if (complete == complete[0]).all():  # readings repeat to the last digit: noise is hidden
+        if (complete == complete[0]).all():  # equal to the last digit: their noise is hidden
             complete = complete[:1]
         mean, basis = complete.mean(axis=0), conserved[shots[0]]
         squares += float(np.sum((complete - mean) ** 2))
         squares += len(complete) * float(np.sum((basis.T @ mean) ** 2))
-        count += (len(complete) - 1) * bodies + basis.shape[1]
-        if experiments.lost_freedom:  # a correction took the momentum of every shot
+        count += (len(complete) - 1) * n + basis.shape[1]
+        if experiments.lost_freedom:  # the momentum of every shot has been corrected
             count -= len(complete) * basis.shape[1]
     return squares, count
 

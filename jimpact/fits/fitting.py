@@ -62,7 +62,8 @@ def fit(
     """Fit parameters of a law to measured velocities by weighted least squares.
 
     Equation: minimize `sum ((v+(law) - v+ measured) / sigma)^2` over the measured values, and, with
-    priors, `+ sum ((x - mean) / std)^2`.
+    priors, `+ sum ((x - mean) / std)^2`. With `sigma_pre` the errors of v- are added to those of v+
+    by `dv+/dv-` at the first minimum; `search.loss` may take the place of the square.
 
     Args:
         law: the law to fit; its parameters are the start values. All contacts share one value of
@@ -147,7 +148,7 @@ def fit(
             problem = _without(problem, lost)
             solution = find_minima(problem, starts, seed, solver)
         _check_derivatives(problem, solution)
-        if solution.slopes is not None:
+        if solution.slopes is not None:  # dv+/dv-: errors of v- count, and all minima move a little
             values = np.array([minimum.value for minimum in solution.starts])
             points = problem.variables.point(values)
             problem = problem.with_errors_before(solution.slopes)

@@ -75,9 +75,10 @@ def with_parts_of_motion(
 
     Args:
         law: to fit.
-        system: that moves.
-        q0, v0: start (n,), or starts (K, n).
-        free: names, of the law's parameters or of `OF_A_MOTION`.
+        system: the moving bodies.
+        q0, v0: start (n,), or starts (K, n); gravity is read at the first one.
+        free: names, of the law's parameters or of `OF_A_MOTION`: start q0, velocity v0, `gravity`
+            g >= 0 [m/s^2], `floor`: its height () [m] in the coordinates that were measured.
 
     Raises:
         ValueError: parts that the motion does not have.
@@ -89,7 +90,7 @@ def with_parts_of_motion(
         raise ValueError(
             "Argument `free` must not name `q0` or `floor` of bodies whose poses are quaternions."
         )
-    directions = system.body.base_directions
+    directions = system.body.base_directions  # of q where the base moves, None: it has no floor
     if "floor" in wanted and (directions is None or system.base is not None):
         where = " on a moving base" if system.base is not None else ""
         raise ValueError(

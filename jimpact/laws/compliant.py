@@ -79,20 +79,21 @@ class Compliant(Law):
     adjoint: str = option("jacobian", ADJOINTS)
 
     def __check_init__(self) -> None:
-        """Raise a TypeError for a `force` that is none, a ValueError for what it does not allow.
+        """Raise a TypeError unless `force` is a `Force`, a ValueError for what it does not allow.
 
-        A viscous or yielding force allows no `initial_energy`, a yielding one no friction and no
-        method 'implicit'.
+        A viscous force, F(x, x'), and one that yields (`bound`) allow no `initial_energy`: their
+        energy is no function of x alone. One that yields allows no friction, no method 'implicit'.
         """
         if not isinstance(self.force, Force):
             raise TypeError(
                 "Argument `force` must be a contact force such as Hertz(k), "
                 f"but has value {self.force!r}."
             )
-        bounded = self.force.bound is not None
-        if self.force.bistiffness is None or bounded:  # energy is not a function of x alone
+        yields = self.force.bound is not None
+        viscous = self.force.bistiffness is None  # no pair of F(x), to load and to unload
+        if viscous or yields:
             check_values("initial_energy", self.initial_energy, low=0.0, high=0.0)
-        if bounded and (self.friction is not None or self.method == "implicit"):
+        if yields and (self.friction is not None or self.method == "implicit"):
             raise ValueError(
                 "Argument `force` must not yield with friction or method 'implicit', but has value "
                 f"{self.force!r}."

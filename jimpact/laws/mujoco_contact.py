@@ -103,7 +103,8 @@ def mujoco_solref(
     """The `solref` that gives a coefficient of restitution in MuJoCo at a time step.
 
     Equation: `solref = (-K, -B)` with `K = (pi / duration)^2`, and B so that the mean of
-    `mujoco_restitution` is `restitution`. Give it to one geom with a higher `priority`, or to a
+    `mujoco_restitution` over the instants in a step at which contact begins is `restitution` (for
+    e = 1 none, where the steps themselves lose energy). Give it to one geom with a higher `priority`, or to a
     `<pair>`: MuJoCo mixes the values of both geoms otherwise. It holds for one contact; in a chain
     of bodies that touch, MuJoCo has no stiffness ratio, and e does not determine the outcome.
 
@@ -140,7 +141,7 @@ def mujoco_solref(
         return float(e.mean()) - restitution
 
     ends = 0.0, 1.0 / timestep  # beyond, a step reverses the velocity
-    if excess(ends[0]) <= 0.0:
+    if excess(ends[0]) <= 0.0:  # e = 1, of which the steps lose less than 1e-6 without damping
         return -stiffness, 0.0
     if excess(ends[1]) > 0.0:
         raise ValueError(

@@ -20,8 +20,8 @@ Result = TypeVar("Result")
 SHORT = 2e-3  # [s]: calls that are faster are run several times for one measurement, so that the
 MOST_RUNS = 20  # clock's resolution does not count, but no more often than this
 UNCOUNTED = -1  # evaluations of a method that does not count them
-BUDGET = 2.0  # [s] for one call, after which it is not repeated
-LEAST_REPEATS = 3  # more often than this
+LEAST_REPEATS = 3  # measurements of each run; ..
+BUDGET = 2.0  # .. more of them only within so many seconds of calls
 
 
 class Solution(NamedTuple):
@@ -189,10 +189,10 @@ def seconds(run: Callable[[], Any], count: int = 1) -> float:
 def in_turns(
     runs: Sequence[Callable[[], Any]], repeats: int, advance: Callable[[], Any] = lambda: None
 ) -> list[np.ndarray]:
-    """Times [s] of `repeats` calls of each of `runs`, of fewer if they are slow.
+    """Times a call [s] of each of `runs`, from `repeats` measurements, or fewer of slow ones.
 
     In turns, one measurement of each run after the other: a busy machine slows all alike. Fast runs
-    are called several times for one measurement. `advance` is called after each.
+    are called several times in one measurement. `advance` is called after each measurement.
     """
     warm = [min(seconds(run), seconds(run)) for run in runs]  # the first call may compile
     counts = [int(np.clip(SHORT / max(t, 1e-9), 1, MOST_RUNS)) for t in warm]

@@ -69,6 +69,9 @@ def _met(
 ) -> tuple[Arcs, list[Turning], np.ndarray, np.ndarray]:
     """Arcs and rotations whose orientations meet at impacts, their covariance, p-values (K,).
 
+    K impacts lie between K + 1 flights. The values x are those of the arcs, then of each flight its
+    turn and angular velocity (3 + 3), as `Turning.moved` takes their changes.
+
     Equation: with the values x_0 of the fits, their covariance C and the turns g(x) between the
     flights of each impact, the least `(x - x_0)^T C^-1 (x - x_0)` with g = 0:
     `x - x_0 = C H^T S^-1 (H (x - x_0) - g)`, H = dg/dx, `S = H C H^T`, repeated; covariance

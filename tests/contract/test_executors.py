@@ -221,7 +221,8 @@ IN_SPACE = ji.Scene(
 IN_PLANE = ji.Scene(
     np.array([1.0, 1.0, 0.1]),
     np.array([[0, 0], [1, 1], [-0.5, 0.6]]),
-    np.array([[1, 1], [0, 0], [0.1, 0.1]]),
+    # contacts that stick redundantly have derivatives with the rounding of a square root
+    np.array([[1, 1], [0, 0], [0.1, 0.13]]),
 )
 
 

@@ -81,7 +81,7 @@ PLATE = ji.System(ji.Column([2.0]), gravity=True, base=ji.HarmonicBase(A_BASE, 1
 def test_gaps_are_seen_from_the_base():
     """f = q - y_b, f' = v - y_b', and f'' = -y_b'' where q'' = 0."""
     t = 0.1
-    gap = kinematics(PLATE, jnp.array([0.5]), jnp.array([-1.0]), jnp.asarray(t))
+    gap, _ = kinematics(PLATE, jnp.array([0.5]), jnp.array([-1.0]), jnp.asarray(t))
     sine, cosine = A_BASE * np.sin(W_BASE * t), A_BASE * np.cos(W_BASE * t)
     np.testing.assert_allclose(gap.value, [0.5 - sine], rtol=1e-14)
     np.testing.assert_allclose(gap.rate, [-1.0 - W_BASE * cosine], rtol=1e-14)
