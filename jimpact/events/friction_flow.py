@@ -151,8 +151,19 @@ class FrictionFlow(ContactFlow):
             drag=drag,
             pull=jnp.swapaxes(self.normal_tangent, 0, 1) + self.tangent * drag[None],
             tangent=k,
-            ridge=jnp.where(stick, ridge(k.dtype), 1.0),
+            ridge=jnp.where(stick, self.ridges(), 1.0),
         )
+
+    def ridges(self) -> Float[Array, "m B"]:
+        """`ridge sqrt(K_tt jj)`: forces of contacts that move alike are then in proportion to mu F.
+
+        Each contact has units of its own (`dimensionless`), in which the rows of K_tt of such
+        contacts are multiples of each other.
+        """
+        rows = np.arange(self.contacts)
+        own = self.tangent[rows, rows]
+        movable = own > 0
+        return ridge(own.dtype) * jnp.where(movable, jnp.sqrt(jnp.where(movable, own, 1.0)), 1.0)
 
     def forces(self, const: FrictionConstants, y: Float[Array, "driving B"]) -> FrictionForces:
         """Forces F and lambda in a state, rates u' of slip, and margins of sticking.

@@ -1,8 +1,7 @@
 """Parameters where a search has ended, with the errors of a linearized law."""
 
 from dataclasses import dataclass
-from operator import attrgetter
-from typing import Generic
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from scipy.special import ndtri, stdtrit
@@ -11,12 +10,34 @@ from jimpact.core.law import AnyLaw
 from jimpact.fits.data import Experiments
 from jimpact.fits.intervals import check_level, joined
 from jimpact.fits.problem import FitProblem
-from jimpact.fits.search import Solution
+from jimpact.fits.search import FitMinimum, Solution
 from jimpact.fits.uncertainty import Uncertainty
 
 # Relative standard error of a stiffness beyond which its linearized interval is not believed.
 HARDLY_SEEN = 0.2
 LEVEL = 0.95  # of confidence intervals, where none is asked for
+
+
+Value = TypeVar("Value")
+
+
+class OfField(Generic[Value]):
+    """An attribute of a class that is that of the same name of one of its fields."""
+
+    def __init__(self, field: str):
+        """`field` holds the attribute."""
+        self.field = field
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        """`name` is the one that the class body gives it."""
+        self.name = name
+
+    def __get__(self, instance: Any, owner: type) -> Value:
+        """The attribute of the field; of a class the descriptor itself."""
+        if instance is None:
+            return self  # type: ignore[return-value]
+        value: Value = getattr(getattr(instance, self.field), self.name)
+        return value
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -34,26 +55,24 @@ class Estimate(Generic[AnyLaw]):
     loss: str = "squares"
     seed: int = 0
 
-    # of the search
-    value = property(attrgetter("search.value"))
-    starts = property(attrgetter("search.starts"))
-    predicted = property(attrgetter("search.predicted"))
-    status = property(attrgetter("search.status"))
-    slopes = property(attrgetter("search.slopes"))
-    converged = property(attrgetter("search.converged"))
-    stuck = property(attrgetter("search.stuck"))
-    at_bound = property(attrgetter("search.at_bound"))
-    steps = property(attrgetter("search.steps"))
-    lost_starts = property(attrgetter("search.lost_starts"))
-    # of the errors
-    rank = property(attrgetter("errors.rank"))
-    singular_values = property(attrgetter("errors.singular_values"))
-    degrees_of_freedom = property(attrgetter("errors.degrees_of_freedom"))
-    noise = property(attrgetter("errors.noise"))
-    covariance = property(attrgetter("errors.covariance"))
-    correlation = property(attrgetter("errors.correlation"))
-    standard_error = property(attrgetter("errors.standard_error"))
-    identifiability = property(attrgetter("errors.identifiability"))
+    value = OfField[np.ndarray]("search")
+    starts = OfField[tuple[FitMinimum, ...]]("search")
+    predicted = OfField[np.ndarray]("search")
+    status = OfField[np.ndarray]("search")
+    slopes = OfField[np.ndarray | None]("search")
+    converged = OfField[bool]("search")
+    stuck = OfField[bool]("search")
+    at_bound = OfField[np.ndarray]("search")
+    steps = OfField[int]("search")
+    lost_starts = OfField[int]("search")
+    rank = OfField[int]("errors")
+    singular_values = OfField[np.ndarray]("errors")
+    degrees_of_freedom = OfField[int]("errors")
+    noise = OfField[float]("errors")
+    covariance = OfField[np.ndarray]("errors")
+    correlation = OfField[np.ndarray]("errors")
+    standard_error = OfField[np.ndarray]("errors")
+    identifiability = OfField[tuple[str, ...]]("errors")
 
     @property
     def residual(self) -> np.ndarray:

@@ -306,9 +306,10 @@ class FitProblem:
 
     # ------------------------------------------------------------------ functions of x
 
-    names = property(
-        attrgetter("parameters.names"), doc="Of the parameters x; contacts are numbered from 1."
-    )
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters x; contacts are numbered from 1."""
+        return self.parameters.names
 
     @property
     def start(self) -> np.ndarray:

@@ -104,9 +104,10 @@ def mujoco_solref(
 
     Equation: `solref = (-K, -B)` with `K = (pi / duration)^2`, and B so that the mean of
     `mujoco_restitution` over the instants in a step at which contact begins is `restitution` (for
-    e = 1 none, where the steps themselves lose energy). Give it to one geom with a higher `priority`, or to a
-    `<pair>`: MuJoCo mixes the values of both geoms otherwise. It holds for one contact; in a chain
-    of bodies that touch, MuJoCo has no stiffness ratio, and e does not determine the outcome.
+    e = 1 none, where the steps themselves lose energy). Give it to one geom with a higher
+    `priority`, or to a `<pair>`: MuJoCo mixes the values of both geoms otherwise. It holds for one
+    contact; in a chain of bodies that touch, MuJoCo has no stiffness ratio, and e does not
+    determine the outcome.
 
     Args:
         restitution: 0 < e <= 1.

@@ -43,19 +43,19 @@ class Events(eqx.Module):
     tangentially.
     """
 
-    count: Int[AnyArray, "*B"]
-    time: Float[AnyArray, "*B E"]
-    kind: Int[AnyArray, "*B E"]
-    contacts: Bool[AnyArray, "*B E m"]  # that take part
-    q: Float[AnyArray, "*B E nq"]
-    velocity_before: Float[AnyArray, "*B E n"]
-    velocity_after: Float[AnyArray, "*B E n"]
-    impulse: Float[AnyArray, "*B E m"]
-    tangential_impulse: Float[AnyArray, "*B E t"]  # t = m, in space 2 m
-    energy: Float[AnyArray, "*B E 2 m"]
-    status: Int[AnyArray, "*B E"]  # of the law, see `jimpact.STATUS`
-    accumulation_end: Float[AnyArray, "*B E"]
-    accumulation_gap: Float[AnyArray, "*B E"]
+    count: Int[AnyArray, "..."]
+    time: Float[AnyArray, "... E"]
+    kind: Int[AnyArray, "... E"]
+    contacts: Bool[AnyArray, "... E m"]  # that take part
+    q: Float[AnyArray, "... E nq"]
+    velocity_before: Float[AnyArray, "... E n"]
+    velocity_after: Float[AnyArray, "... E n"]
+    impulse: Float[AnyArray, "... E m"]
+    tangential_impulse: Float[AnyArray, "... E t"]  # t = m, in space 2 m
+    energy: Float[AnyArray, "... E 2 m"]
+    status: Int[AnyArray, "... E"]  # of the law, see `jimpact.STATUS`
+    accumulation_end: Float[AnyArray, "... E"]
+    accumulation_gap: Float[AnyArray, "... E"]
 
 
 def no_events(size: int, q: jax.Array, v: jax.Array, m: int, tangents: int | None = None) -> Events:
@@ -126,26 +126,26 @@ class Motion(eqx.Module):
         status: () code, 0 = ok; see `raise_on_failure`.
     """
 
-    time: Float[Array, "*B S"]
-    q: Float[Array, "*B S nq"]
-    velocity: Float[Array, "*B S n"]
-    kinetic_energy: Float[Array, "*B S"]
-    potential_energy: Float[Array, "*B S"]
-    force_work: Float[Array, "*B S"]
-    base_work: Float[Array, "*B S"]
-    contact_work: Float[Array, "*B S 2 M"]  # normal, tangential; of a pile M = 1, else m
-    gaps: Float[Array, "*B S M"]
+    time: Float[Array, "... S"]
+    q: Float[Array, "... S nq"]
+    velocity: Float[Array, "... S n"]
+    kinetic_energy: Float[Array, "... S"]
+    potential_energy: Float[Array, "... S"]
+    force_work: Float[Array, "... S"]
+    base_work: Float[Array, "... S"]
+    contact_work: Float[Array, "... S 2 M"]  # normal, tangential; of a pile M = 1, else m
+    gaps: Float[Array, "... S M"]
     events: Events
-    steps: Int[Array, "*B"]
-    status: Int[Array, "*B"]
+    steps: Int[Array, "..."]
+    status: Int[Array, "..."]
 
     @property
-    def energy(self) -> Float[Array, "*B S"]:
+    def energy(self) -> Float[Array, "... S"]:
         """T + V [J]."""
         return self.kinetic_energy + self.potential_energy
 
     @property
-    def ledger_residual(self) -> Float[Array, "*B S"]:
+    def ledger_residual(self) -> Float[Array, "... S"]:
         """Error of the ledger [J]: `T + V - (T + V)(t_0)` without all works."""
         work = self.force_work + self.base_work + jnp.sum(self.contact_work, axis=(-2, -1))
         return self.energy - self.energy[..., :1] - work

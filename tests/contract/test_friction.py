@@ -520,6 +520,17 @@ def test_lzb_of_a_flat_block():
         close(out.velocity[i], found, atol=1e-3)
 
 
+def test_contacts_that_stick_together_share_friction_in_proportion_to_mu_f():
+    """lambda_j / (mu_j F_j) are equal where tangents are, whatever the arms of the normals."""
+    tangents = [[1, 1], [0, 0], [0.1, 0.1]]
+    uneven = ji.Scene([1.0, 1.0, 0.1], [[0, 0], [1, 1], [-0.5, 0.6]], tangents=tangents)
+    course = ji.history(ji.LZB(0.5, friction=[0.4, 0.3]), uneven, [0.0, -1.0, 0.0], samples=5)
+    used = np.array(course.tangential_force / course.force)[1:-1] / [0.4, 0.3]
+    assert (np.abs(used) > 0.01).all()
+    assert (np.abs(used) < 1).all()
+    close(used[:, 0], used[:, 1], rtol=1e-6)
+
+
 @pytest.mark.release
 def test_a_flat_block_at_a_fine_tolerance():
     """How the corners share what they hold is known to 1e-8 only: no step need be short for it."""
