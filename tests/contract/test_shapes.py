@@ -30,7 +30,7 @@ def checked(*cases, package=PACKAGE):
     )
 
 
-@pytest.mark.parametrize("cases", [USUAL, pytest.param((), marks=pytest.mark.slow)], ids=len)
+@pytest.mark.parametrize("cases", [USUAL, pytest.param((), marks=pytest.mark.release)], ids=len)
 def test_arrays_have_the_shapes_that_signatures_state(cases):
     done = checked(*cases)
     assert done.returncode == 0, done.stdout + done.stderr
