@@ -132,7 +132,9 @@ class Viscous(NamedTuple):
     ) -> Float[Array, "m B"]:
         """Method `name` of the model at x [m] and -V gamma [m/s]; it knows one impact, no batch."""
 
-        def of_one(model: Any, x: Float[Array, "m"], rate: Float[Array, "m"]) -> Float[Array, "m"]:
+        def of_one(
+            model: Any, x: Float[Array, " m"], rate: Float[Array, " m"]
+        ) -> Float[Array, " m"]:
             """The method's values in the contacts of one impact."""
             return getattr(model, name)(x, rate)
 

@@ -243,8 +243,8 @@ class FrictionFlow(ContactFlow):
     ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
         """Modes and state once it is decided which contacts stick, and where others slide to.
 
-        This is asked anew where slip has `stopped`, or a contact has `closed` without slip: from
-        the forces of a moment later, by `distribute`.
+        `distribute` decides anew where slip has `stopped`, or a contact has `closed` without slip,
+        from the forces of a moment later.
         """
         m = self.contacts
         u, slip, loaded = self.slip(y), modes[2 * m :], self.loaded(modes)

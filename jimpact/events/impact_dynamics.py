@@ -98,26 +98,26 @@ class ImpactUnits(NamedTuple):
 
     velocity: Float[Array, ""]  # Q [m/s sqrt(kg)]
     time: Float[Array, ""]  # T [s]
-    root: Float[Array, "m"]  # sqrt(W_jj) [1/sqrt(kg)]
-    indentation: Float[Array, "m"]  # x_ref [m]
+    root: Float[Array, " m"]  # sqrt(W_jj) [1/sqrt(kg)]
+    indentation: Float[Array, " m"]  # x_ref [m]
     error: Float[Array, ""]  # [m/s] that `rtol` allows
 
     @property
-    def momentum(self) -> Float[Array, "m"]:
+    def momentum(self) -> Float[Array, " m"]:
         """Unit `Q / sqrt(W_jj)` of the impulses [N s]."""
         return self.velocity / self.root
 
 
 def dimensionless(
     delassus: Symmetric,
-    gamma: Float[Array, "m"],
-    restitution: Float[Array, ""] | Float[Array, "m"],
-    stiffness: Float[Array, ""] | Float[Array, "m"],
+    gamma: Float[Array, " m"],
+    restitution: Float[Array, ""] | Float[Array, " m"],
+    stiffness: Float[Array, ""] | Float[Array, " m"],
     exponent: Exponent,
-    stored: Float[Array, "m"],
+    stored: Float[Array, " m"],
     rtol: Float[Array, ""] | float,
-    gaps: Float[Array, "m"] | None = None,
-    closed: Bool[Array, "m"] | None = None,
+    gaps: Float[Array, " m"] | None = None,
+    closed: Bool[Array, " m"] | None = None,
 ) -> tuple[Problem, ImpactUnits]:
     """The dimensionless problem and its units; `stored` energies [J], `closed`: who takes part."""
     m, dtype = gamma.shape[0], gamma.dtype
@@ -157,7 +157,7 @@ def dimensionless(
 
 
 def tangential_of(
-    contact: Contact, friction: Float[Array, ""] | Float[Array, "m"], units: ImpactUnits
+    contact: Contact, friction: Float[Array, ""] | Float[Array, " m"], units: ImpactUnits
 ) -> Tangential:
     """The tangential block of the contacts in the units of the normal one, and mu."""
     assert contact.tangential_block is not None  # see `check_law`
@@ -383,7 +383,7 @@ class Dynamics(NamedTuple):
 
 def solve(
     dynamics: Dynamics, condition_check: Contact | None = None
-) -> tuple[Float[Array, "m"], Float[Array, "t"] | None, Int[Array, ""]]:
+) -> tuple[Float[Array, " m"], Float[Array, " t"] | None, Int[Array, ""]]:
     """Impulses p and p_t [N s] (None without friction) and the status.
 
     `condition_check`: the contacts, if a second run is to show whether the outcome is
@@ -438,8 +438,8 @@ def perturbed(problem: Problem) -> Problem:
 
 
 def velocity_changes(
-    contact: Contact, p: Float[Array, "m"], p_t: Float[Array, "t"] | None
-) -> Float[Array, "n"]:
+    contact: Contact, p: Float[Array, " m"], p_t: Float[Array, " t"] | None
+) -> Float[Array, " n"]:
     """Changes of gap velocities, `W p + W_nt p_t`, then of slip, `W_nt^T p + W_tt p_t` [m/s]."""
     if p_t is None:
         return contact.delassus @ p

@@ -51,7 +51,7 @@ class HistoryProgram:
         """x, once for each sample."""
         return jnp.broadcast_to(x, (self.samples, *x.shape))
 
-    def fractions(self, dtype: Any) -> Float[Array, "s"]:
+    def fractions(self, dtype: Any) -> Float[Array, " s"]:
         """Times of the samples over the duration, from 0 to 1."""
         return jnp.linspace(0.0, 1.0, self.samples, dtype=dtype)
 

@@ -97,8 +97,8 @@ def fit(
         profiles: whether intervals are those of `profile`; None: where standard errors cannot be
             trusted (at a bound, in a valley, with several minima, or for weakly determined
             parameters) and the law fits, of up to 3 parameters and 256 shots (64 with one start);
-            else the report says how to get them. True computes them at once, None when the fit
-            is printed or asked for intervals.
+            else the report says how to get them. True computes them at once, None on first
+            access, as by `print`, `warnings` or `intervals`.
         search: method, loss, limits and progress, see `Search`.
 
     Returns:

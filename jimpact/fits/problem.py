@@ -46,7 +46,6 @@ from jimpact.fits.parameters import (
 )
 from jimpact.fits.solve import EXACT, Ends, LeastSquares, Solver, minimize
 from jimpact.fits.variables import Variables
-from jimpact.laws.kinematic import RestitutionMatrix
 from jimpact.tools.checks import (
     as_float_array,
     check_concrete,
@@ -516,12 +515,8 @@ def of_shots(
         notes=(*problem.notes, *note_on_rtol),
         experiments=experiments,
         scene=scene,
+        matrix=matrix_region(problem.law, alike, problem.variables, problem.start, problem.ties),
     )
-    if isinstance(problem.law, RestitutionMatrix):
-        parts = problem.variables, problem.start, problem.ties
-        problem = replace(problem, matrix=matrix_region(problem.law, alike, *parts))
-    if experiments.sigma_pre is None:
-        return problem
     count, n = experiments.pre.shape
     return problem.with_errors_before(np.tile(np.eye(n), (count, 1, 1)))
 

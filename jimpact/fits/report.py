@@ -502,8 +502,8 @@ class Fit(FitResult[AnyLaw], Generic[AnyLaw]):
         lost_starts: how many were given up far above the best, or did not converge.
         stuck: whether no step lowers the sum of squares, although derivatives promise it.
         slopes: `dv+/dv-` (K, n, n) of the shots, where errors of v- are passed on, else None.
-        findings: what is wrong with data or fit, by kind, shots and numbers; computed when it is
-            asked for, as profiles are.
+        findings: what is wrong with data or fit, by kind, shots and numbers; computed on first
+            access, as profiles are.
         warnings: the same in words.
         problem: what was solved.
         jacobian: derivatives of what was measured in the parameters (K, n, P), NaN where no
@@ -517,8 +517,8 @@ class Fit(FitResult[AnyLaw], Generic[AnyLaw]):
         judged: what the tests behind `findings` need; None of a fit that was read from a file.
         wants_profiles: the argument `profiles` of `fit`.
         progress: of profiles, see `Search`.
-        known_findings: those that a file holds; None: computed when asked for.
-        known_profiles: those that a file holds; None: computed when asked for.
+        known_findings: those that a file holds; None: computed on first access.
+        known_profiles: those that a file holds; None: computed on first access.
     """
 
     def __str__(self) -> str:

@@ -84,7 +84,7 @@ class Predicted(NamedTuple):
 class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
     """The result of `fit` in numbers; see `Fit`, which can be printed and saved.
 
-    Findings and profiles are computed when they are asked for.
+    Findings and profiles are computed on first access.
     """
 
     judged: Judged | None = field(default=None, repr=False, metadata=NOT_SAVED)
@@ -104,8 +104,6 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
     @cached_property
     def _findings_of_search(self) -> tuple[Finding, ...]:
         """The findings without those of profiles, which need these first."""
-        if self.known_findings is not None:
-            return self.known_findings
         assert self.judged is not None
         return tuple(fit_findings(self.judged))
 

@@ -169,7 +169,7 @@ def simplest_scene(
     labels = ("",) * scene.contacts if names is None else tuple(map(str, names))
     check_shape("names", np.empty(len(labels)), (scene.contacts,), "one per contact")
     norm = EnergyNorm.of(scene, np.asarray(v), watched)
-    trial = _Trial(law, scene, v, norm)
+    trial = _ReducedImpact(law, scene, v, norm)
     reference = trial.run([()])
     reference.check_first("The law fails on the whole scene")
     friction, trial = _simplest_friction(trial, reference, tolerance)
@@ -195,7 +195,7 @@ def simplest_scene(
     )
 
 
-class _Trial(NamedTuple):
+class _ReducedImpact(NamedTuple):
     """A law on a scene of which contacts are left out, at v- (n,), with the norm of errors."""
 
     law: Law
@@ -230,8 +230,8 @@ class _Trial(NamedTuple):
 
 
 def _simplest_friction(
-    trial: _Trial, reference: Outcomes, tolerance: float
-) -> tuple[dict[str, float], _Trial]:
+    trial: _ReducedImpact, reference: Outcomes, tolerance: float
+) -> tuple[dict[str, float], _ReducedImpact]:
     """Errors of v+ by way to treat friction, and the simplest way that is within tolerance.
 
     Ways are 'none', and 'one direction' of the tangents at each contact in space.
@@ -271,7 +271,9 @@ def _tangents_along_impulses(scene: Scene, reference: Outcomes) -> jax.Array:
     return jnp.asarray(np.sum(tangents * direction[None], axis=2).astype(tangents.dtype))
 
 
-def _effect_of_each_contact(trial: _Trial, runs: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _effect_of_each_contact(
+    trial: _ReducedImpact, runs: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Effect of leaving out each contact by itself.
 
     Returns the indices of contacts with an impulse, and for all m contacts the error of v+ in the
@@ -294,7 +296,7 @@ def _effect_of_each_contact(trial: _Trial, runs: int) -> tuple[np.ndarray, np.nd
 
 
 def _sufficient_contacts(
-    trial: _Trial,
+    trial: _ReducedImpact,
     reference: Outcomes,
     working: np.ndarray,
     errors: np.ndarray,

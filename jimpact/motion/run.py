@@ -27,7 +27,7 @@ AHEAD = 1e-13  # of the duration: some hundred times the least step of a flight
 
 
 @runtime_checkable
-class Run(Protocol):
+class MotionRun(Protocol):
     """A motion up to now; by events and by contact forces it remembers other things besides."""
 
     @property
@@ -47,7 +47,7 @@ class Run(Protocol):
         """Status code; `ok` while the motion goes on."""
 
 
-def goes_on(problem: MotionProblem, run: Run) -> Bool[Array, ""]:
+def goes_on(problem: MotionProblem, run: MotionRun) -> Bool[Array, ""]:
     """True while the status is ok, steps do not vanish, and a sample is left."""
     flight = run.flight
     reached = flight.sample >= problem.times.shape[0]
@@ -56,7 +56,7 @@ def goes_on(problem: MotionProblem, run: Run) -> Bool[Array, ""]:
 
 def end_of(
     problem: MotionProblem,
-    run: Run,
+    run: MotionRun,
     smooth: Int[Array, "2"],
     more: Float[Array, " size"] | None = None,
 ) -> MotionEnd:

@@ -169,7 +169,7 @@ def solve_definite(g: Float[Array, "m m"], right: Float[Array, "m *c"]) -> Float
 
 @jax.jit
 def solve_mass_matrix(
-    mass: Float[Array, "n"] | Float[Array, "n n"], right: Float[Array, "n *c"]
+    mass: Float[Array, " n"] | Float[Array, "n n"], right: Float[Array, "n *c"]
 ) -> Float[Array, "n *c"]:
     """`M^-1 right` of a mass matrix M, or of its diagonal, for one or several right sides.
 
@@ -245,7 +245,7 @@ def _small_inverse(block: Float[Array, "b b N"], perturbation: float) -> Float[A
     return _cofactors(block) / jnp.where(determinant == 0, 1.0, determinant)[None, None]
 
 
-def _small_determinant(a: Float[Array, "b b N"]) -> Float[Array, "N"]:
+def _small_determinant(a: Float[Array, "b b N"]) -> Float[Array, " N"]:
     """Determinants of blocks, b = 2 or 3: the first row times its cofactors."""
     return jnp.sum(a[0] * _cofactors(a)[:, 0], axis=0)
 
@@ -293,7 +293,7 @@ def solve_by_pivots(
     return rows[:, n:], determinant
 
 
-def determinants(k: Float[Array, "N n n"]) -> Float[Array, "N"]:
+def determinants(k: Float[Array, "N n n"]) -> Float[Array, " N"]:
     """Determinants of N matrices.
 
     Those of four rows are sums of products of minors of two rows (Laplace), quicker to compile.
@@ -444,7 +444,7 @@ def _batch_of_singular_values(
 
 
 @jax.custom_batching.custom_vmap
-def eigenvectors(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n"], Float[Array, "n n"]]:
+def eigenvectors(matrix: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
     """Eigenvalues and, in columns, eigenvectors of one positive semidefinite matrix, without
     derivatives."""
     values, vectors = jnp.linalg.eigh(matrix)
@@ -541,8 +541,8 @@ def null_projector(g: Float[Array, "m m"]) -> tuple[Float[Array, "m m"], Bool[Ar
 
 
 def solve_symmetric(
-    g: Float[Array, "m m"], right: Float[Array, "m"], *, regular: bool = False
-) -> tuple[Float[Array, "m"], Bool[Array, ""], Bool[Array, ""]]:
+    g: Float[Array, "m m"], right: Float[Array, " m"], *, regular: bool = False
+) -> tuple[Float[Array, " m"], Bool[Array, ""], Bool[Array, ""]]:
     """x of least norm with `G x = right`, whether G is singular, and whether no x solves it.
 
     G is symmetric positive semidefinite with a diagonal of order 1; `regular` if that is known

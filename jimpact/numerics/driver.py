@@ -28,7 +28,7 @@ Carry = TypeVar("Carry")
 class _Slots(NamedTuple):
     """Impacts that are being computed, one in each slot, and those that are over."""
 
-    impact: Int[Array, "slots"]  # the impact that is in each slot
+    impact: Int[Array, " slots"]  # the impact that is in each slot
     following: Int[Array, ""]  # the first impact that still waits
     flow: Any  # parameters of the impacts in the slots
     carry: Any  # their states
@@ -84,7 +84,7 @@ def _in_slots(
     count = jax.tree.leaves(carry)[0].shape[-1]
     most_free = max(1, round(FREE * size))
 
-    def picked(tree: Any, impact: Int[Array, "slots"]) -> Any:
+    def picked(tree: Any, impact: Int[Array, " slots"]) -> Any:
         """The columns of these impacts in all arrays (.., B) of the tree."""
         return jax.tree.map(lambda x: jnp.take(x, impact, axis=-1, mode="clip"), tree)
 

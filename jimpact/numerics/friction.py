@@ -60,8 +60,8 @@ class FrictionImpulses(NamedTuple):
     least and the most p of each contact.
     """
 
-    normal: Float[Array, "m"]  # p
-    tangential: Float[Array, "t"]  # p_t, t = m or 2 m
+    normal: Float[Array, " m"]  # p
+    tangential: Float[Array, " t"]  # p_t, t = m or 2 m
     status: Int[Array, ""]  # a code of `tools/status.py`
     free: Float[Array, "n n"]  # columns in which they are free, p first; 0: they are unique
     shares: Float[Array, "s n"] | None
@@ -72,8 +72,8 @@ class _FrictionProblem(NamedTuple):
 
     matrix: Float[Array, "m b m b"]  # A
     rate: Float[Array, "m b"]  # (a, b)
-    friction: Float[Array, "m"]  # mu
-    load: Float[Array, "m"] | None
+    friction: Float[Array, " m"]  # mu
+    load: Float[Array, " m"] | None
     complementary: bool
 
     @property
@@ -94,13 +94,13 @@ class _Modes(NamedTuple):
 @full_precision
 def solve(
     matrix: Float[Array, "n n"],
-    normal: Float[Array, "m"],
-    slip: Float[Array, "t"],
-    friction: Float[Array, "m"],
+    normal: Float[Array, " m"],
+    slip: Float[Array, " t"],
+    friction: Float[Array, " m"],
     *,
     complementary: bool,
-    load: Float[Array, "m"] | None = None,
-    sliding: Float[Array, "t"] | None = None,
+    load: Float[Array, " m"] | None = None,
+    sliding: Float[Array, " t"] | None = None,
 ) -> FrictionImpulses:
     """Impulses `x = (p, p_t)` of contacts with Coulomb friction.
 
@@ -247,8 +247,8 @@ def _size(x: Float[Array, "m b *N"]) -> Float[Array, "*N"]:
 
 
 def _misfit(
-    problem: _FrictionProblem, x: Float[Array, "m b N"], size: Float[Array, "N"] | None = None
-) -> Float[Array, "N"]:
+    problem: _FrictionProblem, x: Float[Array, "m b N"], size: Float[Array, " N"] | None = None
+) -> Float[Array, " N"]:
     """Largest violation of the law by x, as a part of the size of x.
 
     Normal: |min(p, r)|, or |r| where r = 0 is prescribed; tangential: the distance of p_t from the
@@ -508,7 +508,7 @@ def _on_modes(
     weight = inverted.weight.reshape(n)
     start = x.reshape(n) / weight
 
-    def step(_: Any, y: Float[Array, "n"]) -> Float[Array, "n"]:
+    def step(_: Any, y: Float[Array, " n"]) -> Float[Array, " n"]:
         """One chord step `y - inverse (E x - f + U_0 V_0^T D W D y)`, x = D y."""
         x = (weight * y).reshape(shape)
         matrix, right = _equations(problem, _turned(problem, modes, x[..., None]))

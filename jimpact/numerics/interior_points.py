@@ -54,7 +54,7 @@ class Cones(NamedTuple):
     coupling: Float[Array, "m b m b"]  # (m, b, m, b)
     constant: Float[Array, "m b"]  # (m, b)
     scale: Float[Array, "m b"]  # (m, b)
-    load: Float[Array, "m"]  # (m,)
+    load: Float[Array, " m"]  # (m,)
     complementary: bool
 
 
@@ -81,8 +81,8 @@ class Best(NamedTuple):
 def cones_of(
     matrix: Float[Array, "m b m b"],
     rate: Float[Array, "m b"],
-    friction: Float[Array, "m"],
-    load: Float[Array, "m"] | None,
+    friction: Float[Array, " m"],
+    load: Float[Array, " m"] | None,
     complementary: bool,
 ) -> Cones:
     """The problem in impulses `(p, p_t) = (g a, h y)`, g = 1 / max(mu, 1) and h = mu g."""
@@ -144,7 +144,7 @@ def _impulse(cones: Cones, at: _Inside) -> Float[Array, "m b"]:
     return cones.scale * jnp.concatenate([_normal(cones, at)[:, None], at.side], axis=1)
 
 
-def _normal(cones: Cones, at: _Inside) -> Float[Array, "m"]:
+def _normal(cones: Cones, at: _Inside) -> Float[Array, " m"]:
     """Normal impulses a, or a - nu, which may pull, where rates are prescribed."""
     return at.push if cones.complementary else at.push - at.normal
 

@@ -36,8 +36,8 @@ _DESCENTS = 100_000  # steps of descent at most; packings of 3000 spheres take s
 class LCP(NamedTuple):
     """Solution z and `w = A z + q`; `code`: ok, impulse_not_unique, infeasible, max_steps."""
 
-    z: Float[Array, "m"]
-    w: Float[Array, "m"]
+    z: Float[Array, " m"]
+    w: Float[Array, " m"]
     code: Int[Array, ""]
 
 
@@ -45,7 +45,7 @@ class _Tableau(NamedTuple):
     """Tableau of Lemke's method for `w - A z - z_0 1 = q`, and the number of pivots."""
 
     rows: Float[Array, "m w"]  # w = 2 m + 2 columns: w, z, the artificial variable, right-hand side
-    basis: Int[Array, "m"]  # number of the variable that each row stands for
+    basis: Int[Array, " m"]  # number of the variable that each row stands for
     entering: Int[Array, ""]  # number of the variable that enters the basis next
     ray: Bool[Array, ""]  # no row limits the entering variable: there is no solution
     pivots: Int[Array, ""]  # so far
@@ -53,7 +53,7 @@ class _Tableau(NamedTuple):
 
 @full_precision
 def solve_lcp(
-    matrix: Symmetric, q: Float[Array, "m"], *, symmetric: bool = True, regular: bool | None = None
+    matrix: Symmetric, q: Float[Array, " m"], *, symmetric: bool = True, regular: bool | None = None
 ) -> LCP:
     """Solve `0 <= z _|_ A z + q >= 0`.
 
@@ -98,7 +98,7 @@ def solve_lcp(
     return LCP(z * scale * size, w / scale * size, code)
 
 
-def _solve_sparse(matrix: Sparse, q: Float[Array, "m"]) -> LCP:
+def _solve_sparse(matrix: Sparse, q: Float[Array, " m"]) -> LCP:
     """Solve `0 <= z _|_ A z + q >= 0` by products `A z` only, A symmetric positive semidefinite.
 
     Which of several z is returned is left to the descent. Values are those of the descent, and
@@ -142,11 +142,11 @@ def gathered_rounding(unknowns: int, dtype: Any) -> float:
 
 
 def _solve_on(
-    support: Bool[Array, "m"],
+    support: Bool[Array, " m"],
     a: Float[Array, "m m"],
-    right: Float[Array, "m"],
+    right: Float[Array, " m"],
     symmetric: bool = True,
-) -> Float[Array, "m"]:
+) -> Float[Array, " m"]:
     """z with `A_SS z_S = right_S` on the support S, z = 0 elsewhere."""
     both = support[:, None] & support[None, :]
     masked = jnp.where(both, a, jnp.eye(a.shape[0], dtype=a.dtype))
@@ -157,8 +157,8 @@ def _solve_on(
 
 
 def _least_norm(
-    a: Float[Array, "m m"], b: Float[Array, "m"], z: Float[Array, "m"]
-) -> tuple[Float[Array, "m"], Bool[Array, ""]]:
+    a: Float[Array, "m m"], b: Float[Array, " m"], z: Float[Array, " m"]
+) -> tuple[Float[Array, " m"], Bool[Array, ""]]:
     """Solution of least norm among those with the w of `z`, and whether there are several.
 
     With P the projector on the null space of A where w = 0, they are `r + P y >= 0`, r = z - P z;
@@ -183,7 +183,7 @@ def _rounding(unknowns: int, dtype: Any) -> float:
 
 
 def _wrong(
-    a: Float[Array, "m m"], b: Float[Array, "m"], support: Bool[Array, "m"], z: Float[Array, "m"]
+    a: Float[Array, "m m"], b: Float[Array, " m"], support: Bool[Array, " m"], z: Float[Array, " m"]
 ) -> Bool[Array, ""]:
     """True if z or w has a wrong sign, or z is so large that the rounding of A z hides b."""
     size, gathered = jnp.max(jnp.abs(z)), gathered_rounding(len(b), b.dtype)
@@ -194,8 +194,8 @@ def _wrong(
 
 
 def _support(
-    a: Float[Array, "m m"], b: Float[Array, "m"]
-) -> tuple[Bool[Array, "m"], Int[Array, ""]]:
+    a: Float[Array, "m m"], b: Float[Array, " m"]
+) -> tuple[Bool[Array, " m"], Int[Array, ""]]:
     """Mask of the positive z in `0 <= z _|_ A z + b >= 0`, and the code: Lemke's method."""
     m, dtype = b.shape[0], b.dtype
     tolerance = _rounding(m, dtype)

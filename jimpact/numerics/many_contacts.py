@@ -60,12 +60,12 @@ def solve_many(
     product: Callable[[jax.Array], jax.Array],
     diagonal: Float[Array, "m b"],
     rate: Float[Array, "m b"],
-    friction: Float[Array, ""] | Float[Array, "m"],
+    friction: Float[Array, ""] | Float[Array, " m"],
     start: Float[Array, "m b"],
     inverse_step_size: Float[Array, ""],
     tolerance: float,
     most: Any,
-    load: Float[Array, "m"] | None = None,
+    load: Float[Array, " m"] | None = None,
 ) -> Many:
     """Impulses x of contacts with Coulomb friction, normals first (b = 1, 2, 3).
 
@@ -132,7 +132,7 @@ def _scale(diagonal: Float[Array, "m b"]) -> Float[Array, "m b"]:
 
 
 def _projected(
-    x: Float[Array, "m b"], slope: Float[Array, "m"], load: Float[Array, "m"] | None
+    x: Float[Array, "m b"], slope: Float[Array, " m"], load: Float[Array, " m"] | None
 ) -> Float[Array, "m b"]:
     """Nearest impulses with `p >= 0`, then with `|p_t| <= slope (p + load)`, slope: scaled mu."""
     p = jnp.maximum(x[:, :1], 0.0)

@@ -68,11 +68,11 @@ class Neighbours:
 class Sparse(eqx.Module):
     """Symmetric matrix: its diagonal, and the entries at the K neighbours of each row."""
 
-    diagonal: Float[Array, "m"]
+    diagonal: Float[Array, " m"]
     entries: Float[Array, "m K"]
     neighbours: Neighbours = eqx.field(static=True)
 
-    def __matmul__(self, vector: Float[ArrayLike, "m"]) -> Float[Array, "m"]:
+    def __matmul__(self, vector: Float[ArrayLike, " m"]) -> Float[Array, " m"]:
         """Product `A x`."""
         vector = jnp.asarray(vector)
         return self.diagonal * vector + neighbour_sum(self.entries, vector, self.neighbours)
@@ -87,12 +87,12 @@ class Sparse(eqx.Module):
         dense = jnp.diag(self.diagonal)
         return dense.at[rows[:, None], self.neighbours.of_contacts].add(self.entries)
 
-    def scaled(self, scale: Float[Array, "m"]) -> "Sparse":
+    def scaled(self, scale: Float[Array, " m"]) -> "Sparse":
         """`diag(scale) A diag(scale)`."""
         entries = self.entries * scale[:, None] * scale[self.neighbours.of_contacts]
         return Sparse(self.diagonal * scale**2, entries, self.neighbours)
 
-    def within(self, part: Bool[Array, "m"]) -> "Sparse":
+    def within(self, part: Bool[Array, " m"]) -> "Sparse":
         """The matrix whose rows and columns outside the mask `part` hold their diagonal only."""
         both = part[:, None] & part[self.neighbours.of_contacts]
         return Sparse(self.diagonal, jnp.where(both, self.entries, 0.0), self.neighbours)
@@ -107,8 +107,8 @@ def neighbour_sum(
 
 @full_precision
 def conjugate_gradients(
-    product: Callable[[jax.Array], jax.Array], right: Float[Array, "m"]
-) -> Float[Array, "m"]:
+    product: Callable[[jax.Array], jax.Array], right: Float[Array, " m"]
+) -> Float[Array, " m"]:
     """`A^-1 right` by products with A symmetric, positive semidefinite, of diagonal 1.
 
     The solution of least norm where A is singular, NaN where there is none. Differentiable.
@@ -124,8 +124,8 @@ def conjugate_gradients(
 
 
 def _iterated(
-    product: Callable[[jax.Array], jax.Array], right: Float[Array, "m"]
-) -> Float[Array, "m"]:
+    product: Callable[[jax.Array], jax.Array], right: Float[Array, " m"]
+) -> Float[Array, " m"]:
     """`A^-1 right` as `conjugate_gradients`, from x = 0; NaN where the residual does not vanish."""
     eps = precision(right.dtype).eps
     size = jnp.vdot(right, right)

@@ -17,7 +17,7 @@ class TangentialBlock(NamedTuple):
     slip: Float[Array, "*N t"]  # u- [m/s]
 
     def scaled(
-        self, root: Float[Array, "m"], speed: Float[Array, ""] | float = 1.0
+        self, root: Float[Array, " m"], speed: Float[Array, ""] | float = 1.0
     ) -> "TangentialBlock":
         """The block where contact j is divided by `root`, and slip by `speed` as well."""
         of_tangents = per_tangent(root, self.slip)
@@ -28,6 +28,8 @@ class TangentialBlock(NamedTuple):
         )
 
 
-def per_tangent(values: Float[Array, "m"], tangential: Shaped[Array, "t *B"]) -> Float[Array, "t"]:
+def per_tangent(
+    values: Float[Array, " m"], tangential: Shaped[Array, "t *B"]
+) -> Float[Array, " t"]:
     """Values of contacts repeated for each of their tangents, as many as in rows t."""
     return jnp.repeat(values, len(tangential) // len(values))

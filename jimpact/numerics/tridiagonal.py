@@ -40,7 +40,7 @@ class Tridiagonal(eqx.Module):
         vector = jnp.asarray(vector)
         return tridiagonal_product(self.diagonal * vector, self.off_diagonal, vector)
 
-    def solve(self, vector: Float[Array, "m"]) -> Float[Array, "m"]:
+    def solve(self, vector: Float[Array, " m"]) -> Float[Array, " m"]:
         """`A^-1 vector` for a positive definite matrix, in O(m), by elimination without pivots."""
         none = jnp.zeros_like(vector[:1])
         first = jnp.ones_like(none), none, none
@@ -83,7 +83,7 @@ class Tridiagonal(eqx.Module):
         dense = dense.at[i[:-1], i[1:]].set(self.off_diagonal)
         return dense.at[i[1:], i[:-1]].set(self.off_diagonal)
 
-    def scaled(self, scale: Float[Array, "m"]) -> "Tridiagonal":
+    def scaled(self, scale: Float[Array, " m"]) -> "Tridiagonal":
         """`diag(scale) A diag(scale)`."""
         off = self.off_diagonal * scale[:-1] * scale[1:]
         return Tridiagonal(self.diagonal * scale**2, off, self.regular)
@@ -126,7 +126,7 @@ def is_regular(matrix: Symmetric) -> bool:
     return isinstance(matrix, Tridiagonal) and matrix.regular
 
 
-def scaled(matrix: Symmetric, scale: Float[Array, "m"]) -> Symmetric:
+def scaled(matrix: Symmetric, scale: Float[Array, " m"]) -> Symmetric:
     """`diag(scale) A diag(scale)` in the form `matrix` has."""
     if isinstance(matrix, (Tridiagonal, Sparse)):
         return matrix.scaled(scale)
