@@ -99,7 +99,7 @@ def test_signs_units_and_gravity_that_are_wrong_are_told():
     for sigma in (1e-3, None):
         for bad, words in (
             (dict(q=-y), "curves the other way"),
-            (dict(acceleration=0.0), "may be none"),
+            (dict(acceleration=0.0), "not ballistic"),
             (dict(q=np.degrees(angle), acceleration=0.0, units="rad"), "degrees"),
         ):
             arguments = {"t": t, "q": y, "sigma": sigma, "acceleration": -G} | bad
@@ -289,7 +289,7 @@ def test_a_body_that_is_held_in_the_middle_of_a_track_has_no_shots_there():
     track = ji.tracks.find_impacts(
         t, q, [3e-4, 3e-4, 3e-3], acceleration=[0, -G, 0], units=["m", "m", "rad"]
     )
-    assert len(track.impacts) > 4
+    assert len(track.impacts) > 1
     shots = track.experiments(ji.Disc(0.05))
     assert shots.shots == ("1",)
     np.testing.assert_allclose(
