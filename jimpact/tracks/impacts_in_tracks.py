@@ -237,6 +237,9 @@ def _checked(t: Any, q: Any, shortest: int, units: Any) -> tuple[np.ndarray, np.
             f"Argument `q` must be seen in each coordinate, but coordinate "
             f"{int(lost.argmax()) + 1} is NaN in all frames."
         )
+    seen = int(np.isfinite(q).all(axis=1).sum())
+    if np.isfinite(q).any(axis=1).sum() < shortest:
+        raise ValueError(f"Argument `q` was seen in {seen} frames: {shortest} make a flight.")
     n = q.shape[1]
     names = ("m",) * n if units is None else (units,) * n if isinstance(units, str) else units
     if len(names) != n or not set(names) <= set(VELOCITY_OF):

@@ -69,8 +69,8 @@ class Track:
     frame was not used; `units` are those of the velocities; `acceleration` (n,) that of all
     flights. Of poses q is (T, 7), the quaternion's scalar first, whatever the `order` of the file;
     residuals and sigma are those of places and of turns about the axes of the body, and `inertia`
-    is as given, None as of a sphere. `candidates` say how many impacts there is no evidence for, and
-    why; `name` is the label of its shots.
+    is as given, None as of a sphere. `candidates` say how many impacts there is no evidence for,
+    and why; `name` is the label of its shots.
     """
 
     impacts: tuple[TrackImpact, ...]
@@ -172,7 +172,8 @@ class Track:
             doubtful: take those impacts, too, that a flight of another acceleration explains.
 
         Raises:
-            ValueError: no impact, or only doubtful ones, or none that the contacts can have made; a body in space without
+            ValueError: no impact, or only doubtful ones, or none that the contacts can have made; a
+            body in space without
                 poses (`quaternion`), or of another inertia than `find_impacts` was given, or whose
                 contacts can have made more of the impacts in the other order of quaternions; as
                 `Body.scenes`.

@@ -491,7 +491,7 @@ def test_tables_of_trackers_loggers_and_capture_systems(tmp_path):
     t, q = ji.tracks.read(path, ["X", "Y"], rate=100, unit="mm")
     np.testing.assert_allclose(t, [0, 0.01, 0.02])
     np.testing.assert_allclose(q[0], [1.5, 2.0])
-    with pytest.raises(TypeError):
+    with pytest.raises(ValueError, match="`unit`"):
         ji.tracks.read(path, ["X"], rate=100)
     for arguments, words in (
         ({"columns": ["Z"]}, "`Z` is missing"),
