@@ -250,9 +250,9 @@ def chart_of_a_box(contacts: int, turned: list[float], title: str) -> Figure:
     closed = ji.Scene(scene.mass, scene.normals[:, at], tangents=tangents)
     velocity, mu = [1.0, 0.3, -1.0, 0.5, -0.4, 0.2], 0.3
     result = ji.work_precision(
+        ji.LZB(0.3, friction=mu),
         closed,
         velocity,
-        ji.LZB(0.3, friction=mu),
         laws={"moreau": ji.Moreau(0.3, friction=mu)},
         batch=64,
         repeats=3,

@@ -60,7 +60,7 @@ def broken(make):
     def outcome(mass, normals, v, e, k):
         scene = ji.Scene(mass, normals)
         out = ji.impact(make(e, k), scene, v)
-        return out, ji.audit(scene, v, out)
+        return out, ji.audit(out, scene, v)
 
     rng = np.random.default_rng(2016)
     counts, silent = np.zeros(len(COLUMNS), int), 0

@@ -30,7 +30,7 @@ assert_type(out.status, jax.Array)
 assert_type(ji.raise_on_failure(out), ji.Impact)
 assert_type(ji.summary(out, cradle, [1.0, 0.0, 0.0]), str)
 assert_type(ji.history(law, cradle, [1.0, 0.0, 0.0], samples=50).force, jax.Array)
-assert_type(bool(ji.audit(cradle, [1.0, 0.0, 0.0], out).energetic), bool)
+assert_type(bool(ji.audit(out, cradle, [1.0, 0.0, 0.0]).energetic), bool)
 
 # what goes into a fit as LZB comes out as LZB
 shots = ji.Experiments(pre=[[1.0, 0.0, 0.0]], post=[[-0.06, 0.1, 1.0]])

@@ -79,7 +79,7 @@ def work_precision(result: WorkPrecision, title: str = "") -> Figure:
     >>> import jimpact as ji
     >>> pair, law, ladder = ji.chain([1.0, 2.0]), ji.LZB(0.5), {"verlet": [0.1, 0.01]}
     >>> options = {"laws": {}, "batch": 4, "gradients": False}
-    >>> result = ji.work_precision(pair, [1.0, 0.0], law, ["verlet"], ladder, **options)
+    >>> result = ji.work_precision(law, pair, [1.0, 0.0], ["verlet"], ladder, **options)
     >>> len(ji.plot.work_precision(result).axes)
     2
     """

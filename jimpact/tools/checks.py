@@ -215,12 +215,14 @@ def in_numbers(values: Any) -> str:
     return f"({', '.join(numbers)})"
 
 
-def check_kind(name: str, value: Any, kind: type) -> None:
-    """Raise a TypeError unless `value` is an instance of `kind`."""
+def check_kind(name: str, value: Any, kind: type, call: str = "") -> None:
+    """Raise a TypeError unless `value` is an instance of `kind`; it shows the `call`, if given."""
     if isinstance(value, kind):
         return
     hint = ""
-    if kind is Mapping:
+    if call:
+        hint = f" The call is {call}."
+    elif kind is Mapping:
         hint = " Give each a name, as in {'a': ...}."
     elif isinstance(value, type) and issubclass(value, kind):
         hint = f" That is the class; {value.__name__}(...) makes an object of it."

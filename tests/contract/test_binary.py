@@ -222,7 +222,7 @@ def test_extreme_masses_and_speeds_are_right_or_flagged():
     def run(masses, e, v):
         scene = ji.chain(masses)
         out = ji.impact(ji.Binary(e), scene, v)
-        return out, ji.audit(scene, v, out), ji.kinetic_energy(scene, v)
+        return out, ji.audit(out, scene, v), ji.kinetic_energy(scene, v)
 
     out, found, energy = jax.tree.map(np.asarray, run(masses, e, v))
     fine = np.array([not row.failure for row in ji.STATUS])[out.status]

@@ -245,6 +245,44 @@ def test_restitution_of_a_pair():
     assert float(ji.calibrate(ji.Hertz(1.0), 0.4, 1.0, 1.0).restitution) == 0.4
 
 
+def test_damping_of_a_users_own_force_is_calibrated():
+    """The same force as Hunt and Crossley's, whose damping is known: value and slope in e."""
+
+    def force(x, rate, parameters):
+        return parameters["stiffness"] * x**1.5 * (1 + parameters["damping"] * rate)
+
+    def own(e):
+        start = ji.UserForce(force, {"stiffness": 3.0, "damping": 0.1})
+        return ji.calibrate(start, e, 0.2, 1.3).parameters["damping"]
+
+    def known(e):
+        return ji.calibrate(ji.HuntCrossley(3.0, 0.0), e, 0.2, 1.3).damping
+
+    np.testing.assert_allclose(own(0.65), known(0.65), rtol=1e-8)
+    slopes = [jax.jacfwd(own)(0.65), jax.grad(own)(0.65), jax.grad(known)(0.65)]
+    np.testing.assert_allclose(slopes[:2], [slopes[2]] * 2, rtol=1e-6)
+
+
+def test_restitution_of_a_force_that_only_a_coarser_tolerance_follows():
+    """The power .25 of x, guarded by 1e-30, ends `max_steps` at 1e-11: `impact` has the answer."""
+
+    def force(x, rate, damping):
+        x = jnp.maximum(x, 1e-30)
+        return 1e9 * x**1.5 + damping * x**0.25 * jnp.maximum(rate, 0.0)
+
+    guarded = ji.UserForce(force, 2.0e6)
+    out = ji.impact(ji.Compliant(guarded), ji.chain([1e4], wall=True), [0.7])
+    assert int(out.status) == 0
+    measured = ji.measured_restitution(guarded, 1e4, 0.7)
+    np.testing.assert_allclose(measured, -out.velocity[0] / 0.7, rtol=1e-7)
+
+
+def test_an_impact_of_a_pair_without_an_end_says_why():
+    pulls = ji.UserForce(lambda x, rate, p: jnp.zeros_like(x), None)
+    with pytest.warns(UserWarning, match="ends with"):
+        assert np.isnan(ji.measured_restitution(pulls, 1.0, 1.0))
+
+
 @pytest.mark.slow
 def test_calibration_is_differentiable():
     def damping(x):

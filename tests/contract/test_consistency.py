@@ -245,7 +245,7 @@ def test_stored_energy_is_not_an_energy_gain():
     for stored, gain in ((0.25, 0.0), (0.2, 0.05)):
         number = jnp.asarray(stored)
         out = ji.Impact(jnp.array([-0.5, 0.5]), half, half[:0], 0.25 + 0 * number, number, 0)
-        audit = ji.audit(scene, v, out)
+        audit = ji.audit(out, scene, v)
         close(audit.energy_gain, gain / (2 * stored))
         assert audit.broken == (["energetic"] if gain else [])
 
@@ -256,7 +256,7 @@ def test_friction_is_part_of_the_momentum():
     v, after, p, zero = [1.0, -1.0], jnp.array([0.7, 0.5]), jnp.array([1.5]), jnp.zeros(())
     for friction, broken in ((-0.3, []), (0.3, ["momentum"])):
         out = ji.Impact(after, p, jnp.array([friction]), zero - 0.63, zero, jnp.int32(0))
-        assert ji.audit(scene, v, out).broken == broken
+        assert ji.audit(out, scene, v).broken == broken
 
 
 def test_open_contacts_may_approach():
@@ -265,7 +265,7 @@ def test_open_contacts_may_approach():
     out = ji.Impact(
         *(jnp.array(x) for x in ([0.0, 1.0, 0.0], [1.0, 0.0], [0.0][:0], 0.0, 0.0)), jnp.int32(0)
     )
-    assert ji.audit(scene, v, out).broken == []
+    assert ji.audit(out, scene, v).broken == []
 
 
 def test_audit_in_words_and_in_float32():

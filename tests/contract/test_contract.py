@@ -372,7 +372,7 @@ def wrong():
         after = v + ji.velocity_change(scene, p)
         energy = ji.kinetic_energy(scene, after) - ji.kinetic_energy(scene, v)
         wrong = dataclasses.replace(out, velocity=after, impulse=p, energy_change=energy)
-        return wrong, ji.audit(scene, v, wrong)
+        return wrong, ji.audit(wrong, scene, v)
 
     def of(kind):
         def run(states):

@@ -1,7 +1,10 @@
 """Shots with a covariance of (v-, v+): one mechanism with sigma and sigma_pre, and bad input."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 
 import jimpact as ji
 
@@ -27,33 +30,78 @@ def test_independent_errors_are_a_covariance():
         np.testing.assert_allclose(result.standard_error, stated.standard_error, rtol=1e-9)
 
 
-def test_fit_is_that_of_generalized_least_squares():
-    # e by itself: residual of the relative velocity and of the momentum, whose errors G C G^T has
-    whole = np.kron(np.eye(COUNT) + 0.3 * np.eye(COUNT, k=1) + 0.3 * np.eye(COUNT, k=-1), ONE)
+def law(e: float) -> np.ndarray:
+    """v+ = law v- of the pair, by Newton's law."""
+    common = np.outer([1.0, 1.0], [0.4, 0.6])
+    return common + e * np.outer([-0.6, 0.4], [1.0, -1.0])
+
+
+def errors_in_both(data: ji.Experiments, covariance: np.ndarray, shots: list[int]) -> np.ndarray:
+    """(e, standard error, chi^2) of the least joint misfit, over e and all true velocities."""
+    pre, post = np.asarray(data.pre), np.asarray(data.post)
+    measured = np.concatenate([pre, post], axis=1)[shots].ravel()
+    rows = (4 * np.array(shots)[:, None] + np.arange(4)).ravel()
+    factor = np.linalg.cholesky(covariance[np.ix_(rows, rows)])
+
+    def misfit(unknown: np.ndarray) -> np.ndarray:
+        e, true = unknown[0], unknown[1:].reshape(-1, 2)
+        expected = np.concatenate([true, true @ law(e).T], axis=1).ravel()
+        return np.linalg.solve(factor, measured - expected)
+
+    start = np.append(0.5, pre[shots].ravel())
+    end = least_squares(misfit, start, x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    error = np.sqrt(np.linalg.inv(end.jac.T @ end.jac)[0, 0])
+    return np.array([end.x[0], error, 2 * end.cost])
+
+
+def test_fit_is_that_of_errors_in_both_variables():
+    neighbours = 0.3 * np.eye(COUNT, k=1) + 0.3 * np.eye(COUNT, k=-1)
+    whole = np.kron(np.eye(COUNT) + neighbours, ONE)
     data = shots(covariance=whole)
     result = ji.fit(ji.Newton(0.8), PAIR, data)
-    e, masses = float(result.law.restitution), np.array([1.0, 1.5])
-    direction = np.array([-0.6, 0.4])  # of v+ from the common velocity, for e and v1 - v2 = 1
-    common = np.outer([1.0, 1.0], masses / masses.sum())
-    before = np.asarray(data.pre)
-    slope = common + e * np.outer(direction, [1.0, -1.0])
-    gain = np.kron(np.eye(COUNT), np.hstack([-slope, np.eye(2)]))
-    inverse = np.linalg.inv(gain @ whole @ gain.T)
-    derivative = ((before[:, :1] - before[:, 1:]) * direction).ravel()
-    rest = (np.asarray(data.post) - before @ common.T).ravel()
-    expected = derivative @ inverse @ rest / (derivative @ inverse @ derivative)
-    np.testing.assert_allclose(e, expected, rtol=1e-6)
-    error = (derivative @ inverse @ derivative) ** -0.5
-    np.testing.assert_allclose(result.standard_error, [error], rtol=1e-6)
-    left = rest - derivative * e
-    np.testing.assert_allclose(result.chi_squared, left @ inverse @ left, rtol=1e-6)
+    expected = errors_in_both(data, whole, [0, 1, 2, 3])
+    found = [result.value[0], result.standard_error[0], result.chi_squared]
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
     # the same without shot 2: its errors leave the covariance
-    keep = np.repeat(np.arange(COUNT) != 1, 2)
-    some = np.linalg.inv((gain @ whole @ gain.T)[np.ix_(keep, keep)])
-    d, r = derivative[keep], rest[keep]
     without = ji.leave_one_out(result).value[1, 0]
-    np.testing.assert_allclose(without, d @ some @ r / (d @ some @ d), rtol=1e-4)
+    np.testing.assert_allclose(without, errors_in_both(data, whole, [0, 2, 3])[0], rtol=1e-4)
     assert 0.5 < ji.bootstrap(result, 60).value.std() / result.standard_error[0] < 1.5
+    # one bracket of the profile, where the misfit is larger by 3.84
+    ((low, _),) = ji.profile(result)[0].intervals
+    problem = ji.FitProblem.from_shots(ji.Newton(float(low)), PAIR, data)
+    more = float(np.sum(np.asarray(problem.residual([low])) ** 2)) - result.chi_squared
+    np.testing.assert_allclose(more, 3.8415, rtol=1e-2)
+
+
+def test_errors_before_do_not_draw_e_down():
+    """200 shots, errors of a tenth: without the true v- e would be too low by .8 of its errors."""
+    rng = np.random.default_rng(3)
+    sets = []
+    for _ in range(40):
+        before = -rng.uniform(0.5, 1.5, 200)
+        x = before + 0.1 * rng.normal(size=200)
+        y = -0.7 * before + 0.1 * rng.normal(size=200)
+        sets.append(ji.Experiments(x[:, None], y[:, None], sigma=0.1, sigma_pre=0.1))
+    fits = ji.fit_many(ji.Newton(0.5), ji.chain([1.0], "left"), sets)
+    for data, e in zip(sets, fits.value[:, 0]):
+        x, y = np.asarray(data.pre)[:, 0], np.asarray(data.post)[:, 0]
+        # the least of sum (y + e x)^2 / (1 + e^2) in closed form
+        xx, yy, xy = x @ x, y @ y, x @ y
+        expected = (yy - xx + np.hypot(yy - xx, 2 * xy)) / (-2 * xy)
+        np.testing.assert_allclose(e, expected, rtol=1e-6)
+    mean = fits.value.mean() - 0.7
+    assert abs(mean) < 3 * fits.value.std() / np.sqrt(40)
+
+
+def test_derivatives_of_a_problem_with_errors_before():
+    """The gradient is exact beside differences; a second derivative is refused."""
+    problem = ji.FitProblem.from_shots(ji.Newton(0.8), PAIR, shots(sigma=0.2, sigma_pre=0.3))
+    at = jnp.array([0.55])
+    slope = jax.grad(problem.log_density)(at)[0]
+    density = [float(problem.log_density(at + h)) for h in (-1e-5, 1e-5)]
+    np.testing.assert_allclose(slope, np.diff(density)[0] / 2e-5, rtol=1e-6)
+    with pytest.raises(NotImplementedError, match="once only"):
+        jax.hessian(problem.log_density)(at)
 
 
 def test_correlated_shots_join_part_save_and_show(tmp_path):

@@ -254,6 +254,17 @@ CALLS = [
     (lambda: ji.calibrate(ji.KelvinVoigt(1.0, 0.0), 0.01, 1.0, 1.0), r"`restitution`"),
     (lambda: ji.calibrate(ji.KelvinVoigt(1.0, 0.0), 0.5, -1.0, 1.0), r"`mass`"),
     (lambda: ji.calibrate(ji.UserForce(lambda x, rate, p: x), 0.5, 1.0, 1.0), r"`force`"),
+    (
+        lambda: ji.audit(BALLS, V, ji.impact(ji.Newton(0.5), BALLS, V)),
+        r"audit\(out, scene, velocity\)",
+    ),
+    (lambda: ji.work_precision(BALLS, V, ji.LZB(0.5)), r"work_precision\(law, scene, velocity"),
+    (
+        lambda: ji.calibrate(
+            ji.UserForce(lambda x, rate, p: x + p["damping"] * rate, {"damping": 1e-6}), 0.5, 1, 1
+        ),
+        r"`restitution` must be one that the force reaches",
+    ),
     (lambda: ji.measured_restitution(ji.Hertz(1.0), 1.0, 0.0), r"`speed`"),
     (lambda: ji.theory.hertz_stiffness(-1.0, 0.3, 1.0), r"`modulus"),
     (lambda: ji.theory.hertz_stiffness(1.0, 0.6, 1.0), r"`poisson"),

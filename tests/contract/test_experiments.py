@@ -347,11 +347,19 @@ def test_a_report_counts_what_was_not_measured():
 
 @pytest.mark.slow
 def test_a_fit_passes_errors_on_by_the_law_it_finds():
-    """Generalized least squares with the covariance of the minimum itself; the start's is another."""
+    """The covariance, and the true v-, of the minimum itself; the start's are others."""
     m1, m2, before = 1.0, 2.0, np.array([0.05, 0.02])
 
     def jacobian(e):
         return np.array([[m1 - e * m2, (1 + e) * m2], [(1 + e) * m1, m2 - e * m1]]) / (m1 + m2)
+
+    def at_true_velocities(e):
+        """The inverse of C, the residual, and the slope of v+ in e at the true v-."""
+        spread = np.diag(before**2)
+        inverse = np.linalg.inv(0.02**2 * np.eye(2) + jacobian(e) @ spread @ jacobian(e).T)
+        left = pre @ jacobian(e).T - post
+        true = pre - left @ inverse @ jacobian(e) @ spread
+        return inverse, left, true @ (jacobian(1.0) - jacobian(0.0)).T
 
     rng = np.random.default_rng(4)
     exact = np.array([[1.0, 0.0], [2.0, -1.0], [1.5, 0.5]])
@@ -359,16 +367,14 @@ def test_a_fit_passes_errors_on_by_the_law_it_finds():
     pre = exact + before * rng.normal(size=(3, 2))
     data = ji.Experiments(pre, post, 0.02, sigma_pre=np.tile(before, (3, 1)))
     found = ji.fit(ji.Newton(0.1), ji.chain([m1, m2]), data, starts=1)
-    (e,) = found.value
-    covariance = 0.02**2 * np.eye(2) + jacobian(e) @ np.diag(before**2) @ jacobian(e).T
-    slope, left = pre @ (jacobian(1.0) - jacobian(0.0)).T, pre @ jacobian(e).T - post
-    information = np.einsum("ki,ij,kj->", slope, np.linalg.inv(covariance), slope)
-    step = np.einsum("ki,ij,kj->", slope, np.linalg.inv(covariance), left) / information
+    inverse, left, slope = at_true_velocities(found.value[0])
+    information = np.einsum("ki,ij,kj->", slope, inverse, slope)
+    step = np.einsum("ki,ij,kj->", slope, inverse, left) / information
     assert abs(step) < 1e-6
     np.testing.assert_allclose(
         found.standard_error / max(found.noise, 1), information**-0.5, rtol=1e-4
     )
-    assert "those of the velocities before, passed on by the law" in str(found)
+    assert "those of the velocities before, whose true values are searched for" in str(found)
     (many,) = ji.fit_many(ji.Newton(0.1), ji.chain([m1, m2]), [data])
     np.testing.assert_allclose(many.value, found.value, rtol=1e-6)
     np.testing.assert_allclose(many.standard_error, found.standard_error, rtol=1e-4)
@@ -379,11 +385,11 @@ def test_a_fit_passes_errors_on_by_the_law_it_finds():
     robust = ji.fit(
         ji.Newton(0.1), ji.chain([m1, m2]), data, starts=1, search=ji.Search(loss="student")
     )
-    covariance = 0.02**2 * np.eye(2)
-    covariance += jacobian(robust.value[0]) @ np.diag(before**2) @ jacobian(robust.value[0]).T
+    inverse, left, slope = at_true_velocities(robust.value[0])
+    covariance = np.linalg.inv(inverse)
     size = np.sqrt(np.diag(covariance))
     whiten = np.linalg.inv(np.linalg.cholesky(covariance / np.outer(size, size))) / size
-    u = (post - pre @ jacobian(robust.value[0]).T) @ whiten.T
+    u = -left @ whiten.T
     psi = u / (4 + u**2)  # of Student's t with 4 degrees of freedom, but for a factor
     gradient = np.sum(psi * (slope @ whiten.T))
     assert abs(gradient) * robust.standard_error[0] < 1e-4

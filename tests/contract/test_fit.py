@@ -606,6 +606,28 @@ def test_further_shots_are_predicted_with_errors():
             fit.predict(shots, scene)
 
 
+@pytest.mark.parametrize("double", [True, False])
+def test_findings_belong_to_the_precision_of_the_fit(double, tmp_path):
+    """What is computed on first access does not depend on JAX's precision of then."""
+    rng = np.random.default_rng(11)
+    pre = np.array([[1.0, 0.0], [1.7, 0.0], [1.4, 0.2]])
+    noise = 0.02 * rng.normal(size=(3, 2))
+    with jax.enable_x64(double):
+        pair = ji.chain([1.0, 3.0])
+        after = np.array([ji.impact(ji.Newton(0.985), pair, v).velocity for v in pre])
+        noisy = after + noise
+        data = ji.Experiments(pre, noisy, sigma=0.02)
+        early, late, saved = (ji.fit(ji.Newton(0.9), pair, data) for _ in range(3))
+        expected = str(early), early.intervals(), early.predict(data).standard_error
+        path = saved.save(tmp_path / "fit.json")
+    with jax.enable_x64(not double):
+        for fit in (late, ji.load(path)):
+            assert str(fit) == expected[0]
+            assert fit.intervals() == expected[1]
+            np.testing.assert_array_equal(fit.predict(data).standard_error, expected[2])
+    assert late.problem.precision == ("float64" if double else "float32")
+
+
 @pytest.mark.parametrize("options", [{}, {"sigma_pre": 0.01}])
 def test_a_saved_fit_is_the_same_fit(tmp_path, options):
     post = simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.02)

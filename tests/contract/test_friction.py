@@ -46,7 +46,7 @@ def program(name):
     def one(mass, normals, tangents, gaps, v, e, mu, e_t, k):
         scene = ji.Scene(mass, normals, tangents=tangents, gaps=gaps)
         out = ji.impact(LAWS[name](e, mu, e_t, k), scene, v)
-        return out, ji.audit(scene, v, out)
+        return out, ji.audit(out, scene, v)
 
     # long runs: what compiling well takes is saved
     options = OPTIMIZED if name in ("lzb", "compliant") else None

@@ -57,7 +57,7 @@ def test_what_rtol_allows_is_no_gain_of_energy():
     gained = ji.Impact(
         out.velocity * 1.001, out.impulse, out.tangential_impulse, 1e-3, 0.0, 0, out.accuracy
     )
-    assert not ji.audit(scene, v, gained).energetic
+    assert not ji.audit(gained, scene, v).energetic
 
 
 def test_parameters_of_a_force_of_ones_own_may_be_one_array():

@@ -43,7 +43,7 @@ def chart():
     ladder = {name: list(map(float, row[0])) for name, row in ORDERS.items()}
     laws = {"binary": ji.Binary(0.9)}
     return ji.work_precision(
-        BALLS, STRIKE, HERTZ, list(ladder), ladder, laws, batch=8, repeats=2, gradients=False
+        HERTZ, BALLS, STRIKE, list(ladder), ladder, laws, batch=8, repeats=2, gradients=False
     )
 
 
@@ -84,7 +84,7 @@ def test_chart_in_words_and_picture(chart):
 def test_gradients_and_the_other_methods():
     linear = ji.LZB([0.9, 0.9], [1.0, 1.0], 1.0)
     others = ("verlet", "tsit5", "scipy_lsoda")  # and one of each kind
-    result = ji.work_precision(BALLS, STRIKE, linear, others, laws={}, batch=8, repeats=1)
+    result = ji.work_precision(linear, BALLS, STRIKE, others, laws={}, batch=8, repeats=1)
     assert not result.left_out
     assert result.reference.uncertainty["velocity"] < 1e-11  # two independent integrators
     for name, row in result.points.items():
@@ -124,7 +124,7 @@ def test_chart_of_a_box_on_a_corner():
     ladder = {"time": [1e-4, 1e-7], "verlet": [0.03, 0.003], "scipy_radau": [1e-6]}
     laws = {"moreau": ji.Moreau(0.3, friction=0.3)}
     sizes = {"batch": 4, "repeats": 1}
-    chart = ji.work_precision(scene, velocity, law, list(ladder), ladder, laws, **sizes)
+    chart = ji.work_precision(law, scene, velocity, list(ladder), ladder, laws, **sizes)
     error = {n: [x.error["velocity"] for x in row] for n, row in chart.points.items()}
     assert error["time"][0] < 1e-3
     assert error["time"][1] < 1e-6
@@ -212,7 +212,7 @@ def hypercube(n, steps):
     def run(mass, k, e, eta):
         scene, v = ji.chain(mass), jnp.eye(n)[0]
         out = ji.impact(ji.LZB(e, k, eta, max_steps=steps), scene, v)
-        return out, ji.audit(scene, v, out).consistent
+        return out, ji.audit(out, scene, v).consistent
 
     out, consistent = jax.tree.map(np.asarray, run(mass, k, e, eta))
     return at, out, consistent, np.abs(out.velocity - HELD["velocity"][at, :n]).max(axis=1)

@@ -106,7 +106,7 @@ def test_welded_bodies_are_one(name):
     def out(v, e, k):
         law = make(e, k, jnp.full(2, 1.5), jnp.zeros(2))
         scene = ji.Scene(jnp.array([1.0, 2.0, 0.5, 0.7]), normals, constraints=welded)
-        return ji.impact(law, scene, v), ji.audit(scene, v, ji.impact(law, scene, v)).momentum
+        return ji.impact(law, scene, v), ji.audit(ji.impact(law, scene, v), scene, v).momentum
 
     e, k = np.array([0.9, 0.6]), np.array([1.0, 2.5])
     got, momentum = out(np.array([1.0, 0.1, 0.1, -0.4]), e, k)
@@ -384,7 +384,7 @@ def test_audit_reads_measured_outcomes(three):
 
     scene, v, out = three
     measured = dataclasses.replace(out, velocity=jnp.array([-0.0605, 0.1049, 0.9978]))
-    audit = jax.jit(lambda out: (a := ji.audit(scene, v, out), a.consistent))
+    audit = jax.jit(lambda out: (a := ji.audit(out, scene, v), a.consistent))
     found, consistent = audit(measured)
     assert not bool(found.momentum)
     assert not bool(found.energetic)
