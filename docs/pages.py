@@ -319,9 +319,10 @@ def constants_page() -> dict[str, str]:
 
 ROOMS = (  # from above: (name, task); a room imports from rows below its own, and from itself
     (("cli", "commands"), ("saved", "saved results")),
-    (("plot", "pictures"), ("data", "measured impacts"), ("tracks", "tracks to shots")),
+    (("data", "measured impacts"), ("tracks", "tracks to shots")),
     (("fits", "shots, fits, verdicts"), ("methods", "comparison, charts")),
     (("motion", "whole motions"), ("theory", "outcomes, bounds"), ("montecarlo", "random gaps")),
+    (("plot", "pictures"),),
     (("laws", "one file for each law"),),
     (("events", "impact dynamics"), ("bodies", "gaps, tangents, mass")),
     (("core", "scene, contact, law, impact, audit, registry"),),

@@ -22,9 +22,9 @@ from jimpact.fits.profiles import Contour
 from jimpact.methods.advice_report import Advice, Candidate
 from jimpact.methods.chart import Point, Reference, Timing, WorkPrecision
 from jimpact.methods.comparison import Comparison, Entry
+from jimpact.methods.pictures import _styles
 from jimpact.methods.stability import Confirmation, Slice, StabilityMap
 from jimpact.methods.validity import ValidityMap
-from jimpact.plot.charts import _styles
 from jimpact.plot.style import SMALL, WIDTH
 
 pytestmark = pytest.mark.release

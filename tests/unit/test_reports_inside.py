@@ -20,8 +20,8 @@ from jimpact.fits.findings import Finding
 from jimpact.fits.intervals import Profile
 from jimpact.fits.report import _correlations
 from jimpact.fits.selection import LawFit, LawFits
+from jimpact.motion.films import positions
 from jimpact.motion.record import KIND_CODE, Motion, no_events
-from jimpact.plot.films import positions
 from jimpact.tools.progress import wrapped
 
 

@@ -11,8 +11,8 @@ from matplotlib.patches import Circle, Rectangle
 from jimpact.bodies.assembly import Bodies
 from jimpact.bodies.base import Body, projected
 from jimpact.core.scene import PairNormals, Scene, as_velocity
+from jimpact.motion.pictures import draw_body
 from jimpact.motion.system import System
-from jimpact.plot.motions import draw_body
 from jimpact.plot.style import COLOURS, GREY, colour_of, new_figure, styled, write
 from jimpact.tools.checks import check_kind, check_shape, check_values
 

@@ -14,9 +14,7 @@ from matplotlib.figure import Figure
 
 from jimpact.bodies.base import Body, projected
 from jimpact.motion.dynamics import seen_from_base
-from jimpact.motion.record import Motion
-from jimpact.motion.system import System
-from jimpact.plot.motions import (
+from jimpact.motion.pictures import (
     POINT,
     base_path,
     colours_of,
@@ -25,6 +23,8 @@ from jimpact.plot.motions import (
     plane_of,
     set_limits,
 )
+from jimpact.motion.record import Motion
+from jimpact.motion.system import System
 from jimpact.plot.style import GREY
 from jimpact.tools.checks import check_values
 from jimpact.tools.progress import counting_bar
@@ -117,7 +117,7 @@ def readable_speed(duration: float) -> float:
 
     `duration` [s] is that of the motion, `duration / speed` that of the film.
 
-    >>> from jimpact.plot.films import readable_speed
+    >>> from jimpact.motion.films import readable_speed
     >>> [readable_speed(x) for x in (8.0, 1.0, 0.03, 0.0)]
     [1.0, 0.5, 0.01, 1.0]
     """
@@ -208,7 +208,7 @@ def positions(at: np.ndarray, q: np.ndarray, slopes: np.ndarray, time: np.ndarra
     before and after an event.
 
     >>> import numpy as np
-    >>> from jimpact.plot.films import positions
+    >>> from jimpact.motion.films import positions
     >>> at, q, slopes = np.array([0.0, 1.0]), np.array([[0.0], [1.0]]), np.array([[0.0], [2.0]])
     >>> positions(at, q, slopes, np.array([0.5]))  # t^2
     array([[0.25]])

@@ -1,29 +1,14 @@
 """Pictures: a track with its flights and impacts, and what is left of it."""
 
-from collections.abc import Sequence
-from typing import Any, Protocol, runtime_checkable
-
 import numpy as np
 from matplotlib.figure import Figure
 
 from jimpact.plot.style import COLOURS, GREY, new_figure, styled
 from jimpact.tools.records import counted
+from jimpact.tracks.track import Track
 
 _HEIGHT = 2.8  # of a row [in]
 _BEYOND = 5.0  # sigmas that the panel of residuals shows, unless flights leave more
-
-
-@runtime_checkable
-class Track(Protocol):
-    """Members of `ji.tracks.Track` that its picture shows."""
-
-    t: np.ndarray
-    coordinates: np.ndarray
-    sigma: np.ndarray
-    residual: np.ndarray
-    flights: Sequence[Any]
-    impacts: Sequence[Any]
-    units: Sequence[str]
 
 
 @styled(Track)
