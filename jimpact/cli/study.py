@@ -25,12 +25,12 @@ from jimpact.cli.study_track import shots_of_bounces, shots_of_track, track_of
 from jimpact.core.distributions import Distribution, RandomLaw
 from jimpact.core.law import Law, free_parameters_of
 from jimpact.core.scene import Scene, chain
-from jimpact.fits.data import Experiments, read_experiments
 from jimpact.fits.fitting import fit
 from jimpact.fits.parameters import OF_SPEED, default_free
 from jimpact.fits.problem import FitProblem, of_shots
 from jimpact.fits.report import Fit
 from jimpact.fits.search import Search
+from jimpact.shots.data import Experiments, read_experiments
 
 if TYPE_CHECKING:
     from jimpact.tracks.track import Track

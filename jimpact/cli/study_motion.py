@@ -20,11 +20,11 @@ from jimpact.core.law import Law
 from jimpact.fits.fitting_motion import MOTION_SEARCH, fit_motion
 from jimpact.fits.parameters import default_free
 from jimpact.fits.report import Fit
-from jimpact.fits.shots_file import UNEVEN_STEPS, Positions, read_positions
 from jimpact.motion.methods import METHODS, Method, as_method
 from jimpact.motion.record import Motion
 from jimpact.motion.simulate import simulate
 from jimpact.motion.system import HarmonicBase, System, gravity
+from jimpact.shots.shots_file import UNEVEN_STEPS, Positions, read_positions
 from jimpact.tools.checks import check_choice
 
 GRAVITY = "gravity_m_per_s2"

@@ -8,7 +8,7 @@ import jimpact as ji
 from jimpact.bodies.base import Body
 from jimpact.cli.study_file import check_keys, check_kind
 from jimpact.core.scene import Scene
-from jimpact.fits.data import Experiments
+from jimpact.shots.data import Experiments
 
 if TYPE_CHECKING:
     from jimpact.tracks.track import Track

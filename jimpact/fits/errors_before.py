@@ -4,8 +4,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jimpact.core.scene import Scene
-from jimpact.fits.covariances import diagonal_blocks, moved_covariance
-from jimpact.fits.data import Experiments, kept_by_corrections
+from jimpact.shots.covariances import diagonal_blocks, moved_covariance
+from jimpact.shots.data import Experiments, kept_by_corrections
 
 
 def covariance_after(

@@ -18,7 +18,6 @@ import numpy as np
 
 from jimpact.core.law import Law, entries, forward_only, with_entries
 from jimpact.core.scene import Scene, dense_mass, stackable
-from jimpact.fits.data import Experiments
 from jimpact.fits.errors_before import covariance_after
 from jimpact.fits.matrices import AdmissibleMatrices, matrix_region
 from jimpact.fits.measurement import Measurement
@@ -46,6 +45,7 @@ from jimpact.fits.parameters import (
 )
 from jimpact.fits.solve import EXACT, Ends, LeastSquares, Solver, minimize
 from jimpact.fits.variables import Variables
+from jimpact.shots.data import Experiments
 from jimpact.tools.checks import (
     as_float_array,
     check_concrete,

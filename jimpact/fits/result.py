@@ -13,7 +13,6 @@ import numpy as np
 from jimpact.core.law import AnyLaw, parameters_of
 from jimpact.core.scene import Scene
 from jimpact.fits.checks import Judged, fit_findings
-from jimpact.fits.data import Experiments
 from jimpact.fits.deviances import PROFILE_STARTS, lower_minimum, profiles_of
 from jimpact.fits.estimate import LEVEL, Estimate
 from jimpact.fits.findings import Finding
@@ -21,6 +20,7 @@ from jimpact.fits.intervals import Profile
 from jimpact.fits.parameters import LawInScene, tied_names, tied_value
 from jimpact.fits.problem import outcome_at
 from jimpact.fits.search import solution_of
+from jimpact.shots.data import Experiments
 from jimpact.tools.checks import check_choice, check_kind, check_values
 from jimpact.tools.records import Column, Table, Tabular, counted, plain
 from jimpact.tools.status import STATUS

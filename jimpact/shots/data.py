@@ -13,13 +13,13 @@ import numpy as np
 
 from jimpact.bodies.base import CLOSED_BELOW, Body
 from jimpact.core.scene import WALLS, Scene, chain, dense_mass, stackable, with_gaps
-from jimpact.fits.covariances import (
+from jimpact.shots.covariances import (
     as_covariance,
     covariance_of,
     diagonal_blocks,
     joined_covariance,
 )
-from jimpact.fits.shots_file import ANGULAR, LINEAR, read_shots
+from jimpact.shots.shots_file import ANGULAR, LINEAR, read_shots
 from jimpact.tools.checks import (
     as_float_array,
     check_concrete,
