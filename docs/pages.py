@@ -60,8 +60,6 @@ def public_names() -> dict[str, list[str]]:
         for line in ast.parse(stub.read_text(encoding="utf-8")).body:
             if isinstance(line, ast.ImportFrom) and line.module:
                 module, names = line.module, [alias.name for alias in line.names]
-            elif isinstance(line, ast.Assign):  # names of another room
-                module, names = package, [ast.unparse(target) for target in line.targets]
             else:
                 continue
             for name in names:

@@ -25,14 +25,11 @@ def names_in_stub(package):
     found = {}
     for node in stub.body:
         if isinstance(node, ast.ImportFrom):
-            assert node.level == 1 or package is ji.plot, "pictures are in their rooms"
+            assert node.level == 1 or package in (ji.plot, ji.theory), "names of other rooms"
             base = [package.__name__] * node.level
             for alias in node.names:
                 assert alias.asname == alias.name, "without `as` a name of a stub is private"
                 found[alias.name] = ".".join([*base, node.module] if node.module else base)
-        elif isinstance(node, ast.Assign):  # names of another room, by its module
-            module = next(x for x in stub.body if isinstance(x, ast.Import)).names[0].name
-            found[ast.unparse(node.targets[0])] = module
     return found
 
 
