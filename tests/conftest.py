@@ -231,8 +231,8 @@ def each_test(request):
     optimize(request.node.get_closest_marker("long_run") is not None)
     coarse.clear()
     yield
-    # what tests in unit/ call is not public: it need not ask for the precision by itself
-    asked = "tests/contract/" not in request.node.nodeid or not coarse
+    # what tests of files X_inside call is not public: it need not ask for the precision by itself
+    asked = "_inside.py::" in request.node.nodeid or not coarse
     assert asked, f"products without `full_precision`: {sorted(set(coarse))}"
     maps = Path("/proc/self/maps")
     if uncounted[0] < COUNT_MAPS_AFTER or not maps.exists():

@@ -6,7 +6,7 @@
 Each mutation replaces one expression or statement of one function, both named by their syntax, so
 that formatting, comments and moves between files leave it alone. The package and its tests are
 copied, the mutation is applied to the copy, and the contract tests that should notice it run there.
-`tests/unit/test_mutations.py` checks that every mutation has exactly one place.
+`tests/rules/test_mutations.py` checks that every mutation has exactly one place.
 """
 
 import argparse
@@ -37,7 +37,7 @@ class Mutation:
     """A mistake: `expression`, which occurs once in `function`, replaced by `replacement`.
 
     `function` is a qualified name (`Class.method`), a class, or "" for the statements of a module.
-    One of the `tests` (files, or node ids, in tests/contract/) should fail with it.
+    One of the `tests` (files, or node ids, named by file) should fail with it.
     """
 
     name: str
@@ -91,8 +91,8 @@ MUTATIONS = [
     Mutation("an asymmetric mass passes inside jit", "is_allowed", "_is_symmetric(scene.mass)", "jnp.asarray(True)", ("test_contract.py::test_what_the_host_refuses_has_a_status_inside_jit[moreau]",)),
     Mutation("constraints may be broken inside jit", "Traced._refusal", """if self.constrained:
     allowed.append(jnp.all(_keeps_constraints(scene.constraints, v)))""", """if self.constrained:
-    pass""", ("test_errors.py::test_what_the_host_refuses_has_a_status_inside_jit",)),
-    Mutation("negative noise passes inside jit", "Traced._refusal", "(x >= 0) & (x < jnp.inf)", "x < jnp.inf", ("test_errors.py::test_what_the_host_refuses_has_a_status_inside_jit",)),
+    pass""", ("test_errors_of_core.py::test_what_the_host_refuses_has_a_status_inside_jit",)),
+    Mutation("negative noise passes inside jit", "Traced._refusal", "(x >= 0) & (x < jnp.inf)", "x < jnp.inf", ("test_errors_of_core.py::test_what_the_host_refuses_has_a_status_inside_jit",)),
     Mutation("freedom counted with parameters, not rank", "uncertainty", "problem.values - rank", "problem.values - len(scale)", ("test_fit.py::test_one_shot_of_three_balls_determines_two_of_three",)),
     Mutation("rank tolerance too coarse", "", "{'float64': 1e-06, 'float32': 0.001}", "{'float64': 0.1, 'float32': 0.001}", ("test_fit.py::test_one_shot_of_three_balls_determines_two_of_three", "test_fit.py::test_what_is_seen_weakly_is_seen",)),
     Mutation("standard errors without noise", "uncertainty", "noise ** 2", "noise", ("test_fit.py::test_errors_from_the_residual_are_those_of_linear_regression",)),
@@ -123,10 +123,10 @@ MUTATIONS = [
     Mutation("time of a hop halved", "_passed", "2 * jnp.abs(p)", "jnp.abs(p)", ("test_motion.py::test_finite_accumulation_is_passed",)),
     Mutation("plastic expansion with e for its square", "_unloading", "e ** 2", "e", ("test_contact_forces.py::test_a_plastic_contact_returns_its_share",)),
     Mutation("contacts of contact forces that always stick", "_with_friction.decided", "left >= jnp.where(let_go, within, 0.0)", "left >= left", ("test_contact_forces.py::test_friction_on_a_slope",)),
-    Mutation("contacts stick together that no forces hold", "_with_friction.decided", "growth <= within", "growth >= 0", ("test_known_faults.py::test_a_block_on_springs_passes_the_flat_position",)),
+    Mutation("contacts stick together that no forces hold", "_with_friction.decided", "growth <= within", "growth >= 0", ("test_known_faults_of_motion.py::test_a_block_on_springs_passes_the_flat_position",)),
     Mutation("a redundant contact does not come to rest with others", "_brought_slow_to_rest.resting", "jnp.abs(left) <= strike.rest", "stopped", ("test_motion_in_space.py::test_derivatives_of_a_thrown_brick_agree_with_differences",)),
     Mutation("sides that overhang do not touch", "polygon_on_polygon", "jnp.where(first, gaps[0], gaps[1])", "gaps[0]", ("test_bodies.py::test_gaps_are_distances",)),
-    Mutation("normals that jump are no events", "MechanicalFlow.projected", "const.active & (jnp.abs(rate) > most * speed)", "const.active & False", ("test_known_faults.py::test_a_corner_that_slides_over_an_edge_takes_no_energy",)),
+    Mutation("normals that jump are no events", "MechanicalFlow.projected", "const.active & (jnp.abs(rate) > most * speed)", "const.active & False", ("test_known_faults_of_motion.py::test_a_corner_that_slides_over_an_edge_takes_no_energy",)),
     Mutation("friction of contact forces pulls", "with_normal_forces", "-size", "size", ("test_contact_forces.py::test_friction_on_a_slope",)),
     Mutation("off-diagonal of a chain's Delassus matrix shifted", "tridiagonal_product", "vector[1:]", "vector[:-1]", ("test_scenes.py::test_chain_is_the_dense_scene",)),
     Mutation("an expansion as slow as a compression", "ImplicitSteps.moved", "jnp.where(expands, square, 1.0)", "1.0", ("test_implicit.py",)),
@@ -222,6 +222,12 @@ def places(mutation, folder=ROOT / "jimpact"):
     ]
 
 
+def node_of(test):
+    """The node id of 'file.py::test': the folder is that of the one file of this name."""
+    (path,) = (ROOT / "tests").glob(f"*/{test.partition('::')[0]}")
+    return f"{path.parent.relative_to(ROOT)}/{test}"
+
+
 def run(mutation):
     """Run the tests on a mutated copy: (verdict, seconds, what noticed it)."""
     at = places(mutation)
@@ -239,7 +245,7 @@ def run(mutation):
         (folder / path.relative_to(ROOT)).write_text(text, encoding="utf-8")
         command = [sys.executable, "-m", "pytest", "-p", "no:xdist", "-x", "-q", "--no-header"]
         command += ["-o", "addopts=--import-mode=importlib", "--tb=no", "-rfE"]
-        command += [f"tests/contract/{test}" for test in mutation.tests]
+        command += [node_of(test) for test in mutation.tests]
         environment = os.environ | {"PYTHONPATH": name, "JAX_PLATFORMS": "cpu"}
         options = {"cwd": folder, "env": environment, "capture_output": True, "text": True}
         try:
