@@ -1,8 +1,8 @@
 """Products of matrices have the precision of their numbers, whatever JAX's default is.
 
 On accelerators JAX multiplies float32 matrices with 10 bits by default. Without one, the lowered
-program still says which precision a product asks for. `conftest.py` asks the same of every larger
-program that the suite compiles; here are laws and motions in both modes, and small functions.
+program still says which precision a product asks for: of laws and motions in both modes and of small
+functions here, of fits, batches, Monte Carlo, comparisons and tracks in test_programs.py.
 """
 
 import jax
