@@ -11,10 +11,12 @@ from commands_cases import BODIES, SHOTS, STUDY, call, written
 
 import jimpact as ji
 from jimpact import HarmonicBase
-from jimpact.cli import study, study_file, study_motion
+from jimpact.bodies.study import body_of
+from jimpact.cli import study, study_file
 from jimpact.cli.commands import _per_contact
 from jimpact.cli.main import keep_programs
-from jimpact.cli.study_file import body_of
+from jimpact.montecarlo.study import SAMPLING
+from jimpact.motion import study as motion_keys
 
 
 @pytest.fixture(autouse=True)
@@ -92,10 +94,10 @@ def test_unwritable_places_are_refused_before_anything_is_computed(
     [
         (study.CHAIN.values(), ji.chain),
         (study.CONFIGURATION.values(), ji.Body.scene),
-        (study.SAMPLING.values(), ji.monte_carlo),
-        (study_motion.MOTION.values(), ji.simulate),
-        (set(study_motion.METHOD.values()) - {"step"}, ji.EventDriven),
-        (study_motion.BASE.values(), HarmonicBase),
+        (SAMPLING.values(), ji.monte_carlo),
+        (motion_keys.MOTION.values(), ji.simulate),
+        (set(motion_keys.METHOD.values()) - {"step"}, ji.EventDriven),
+        (motion_keys.BASE.values(), HarmonicBase),
         (set(study_file.FIT) - inspect.signature(ji.Search).parameters.keys(), ji.fit),
     ],
 )

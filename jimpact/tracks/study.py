@@ -2,16 +2,14 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jimpact as ji
 from jimpact.bodies.base import Body
-from jimpact.cli.study_file import check_keys, check_kind
 from jimpact.core.scene import Scene
 from jimpact.shots.data import Experiments
-
-if TYPE_CHECKING:
-    from jimpact.tracks.track import Track
+from jimpact.tools.study_tables import check_keys, check_kind
+from jimpact.tracks.track import Track
 
 # Keys of [track]: the arguments of `ji.tracks.read` and of `find_impacts`, by their names, and that
 # of `Track.experiments`; of [bounces]: the arguments of `ji.tracks.bounce_times`.
@@ -30,7 +28,7 @@ _KINDS = {
 }
 
 
-def track_of(table: Mapping[str, Any], study: Path) -> "Track":
+def track_of(table: Mapping[str, Any], study: Path) -> Track:
     """Track in the file of the table [track], with its impacts; `study` is the path of the study.
 
     Angles are in rad, whatever their unit in the file.
@@ -51,7 +49,7 @@ def track_of(table: Mapping[str, Any], study: Path) -> "Track":
         raise ValueError(f"[track]: {error}") from None
 
 
-def shots_of_track(track: "Track", table: Mapping[str, Any], owner: Scene | Body) -> Experiments:
+def shots_of_track(track: Track, table: Mapping[str, Any], owner: Scene | Body) -> Experiments:
     """Shots of a track's impacts in the study's scene `owner`, or in those of the body's poses."""
     if isinstance(owner, Scene):
         if "near_m" in table:
