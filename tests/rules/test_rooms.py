@@ -3,6 +3,7 @@
 import ast
 import importlib.util
 import re
+import shutil
 import subprocess
 import sys
 from collections import defaultdict
@@ -206,3 +207,73 @@ def test_impacts_need_no_package_but_jax_and_what_it_brings():
     said.append(done.stderr.strip())
     for module, line in zip(without[:4], said, strict=True):
         assert f"{module} must be installed for this, but is not: pip install {module}." in line
+
+
+LEFT_OUT = """
+import importlib
+import jax
+import jimpact as ji
+
+jax.config.update("jax_enable_x64", True)
+
+assert ji.__file__.startswith({folder!r})
+pair = ji.chain([1.0, 3.0])
+out = ji.impact(ji.Newton(0.5), pair, [1.0, 0.0])
+fit = ji.fit(ji.Newton(0.9), pair, ji.Experiments([[1.0, 0.0]], [out.velocity], sigma=0.01))
+print(round(float(fit.value[0]), 6))
+for module in {modules}:
+    importlib.import_module(module)
+for ask in ({asked}):
+    try:
+        ask()
+    except (ImportError, ValueError) as error:
+        print(error)
+"""
+# Rooms that can be left out of a copy, and what is asked for then.
+ASKED = {
+    "tracks": ("ji.tracks.read", "ji.plot.track", "ji.read_study('study.toml')"),
+    "montecarlo": ("ji.monte_carlo", "ji.plot.monte_carlo", "ji.read_study('study.toml')"),
+    "methods": ("ji.compare", "ji.plot.comparison"),
+    "theory": ("ji.theory.gap_scale", "ji.plot.admissible_set"),
+}
+STUDY = """
+[scene]
+masses_kg = [1.0, 1.0]
+[law]
+name = "newton"
+restitution = 0.9
+[{table}]
+"""
+TABLES = {"tracks": "track", "montecarlo": "monte_carlo"}
+
+
+def rooms_that_stand_on(room):
+    """The room, and all whose files import it, directly or not."""
+    uses = {x: set() for x in STOREY}
+    for module, path in modules().items():
+        uses[room_of(module)] |= {room_of(imported) for imported, _, _ in imports_of(path)}
+    found = {room}
+    while more := {x for x in uses if uses[x] & found} - found:
+        found |= more
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("room", ASKED)
+def test_a_room_can_be_left_out(room, tmp_path):
+    """The rest imports, an impact and a fit run, and what is missing says which room it needs."""
+    leave = shutil.ignore_patterns("__pycache__")
+    copy = shutil.copytree(PACKAGE, tmp_path / "jimpact", ignore=leave)
+    shutil.rmtree(copy / room)
+    (tmp_path / "study.toml").write_text(STUDY.format(table=TABLES.get(room, "data")))
+    gone = rooms_that_stand_on(room)
+    left = sorted(m for m in modules() if room_of(m) not in gone and not m.endswith("__main__"))
+    asked = "".join(f"lambda: {each}, " for each in ASKED[room])
+    script = LEFT_OUT.format(folder=str(tmp_path), modules=left, asked=asked)
+    run = {"capture_output": True, "text": True, "cwd": tmp_path, "check": False}
+    done = subprocess.run([sys.executable, "-c", script], **run)
+    assert done.returncode == 0, done.stderr[-600:]
+    restitution, *said = done.stdout.splitlines()
+    assert restitution == "0.5"
+    assert len(said) == len(ASKED[room])
+    assert all(f"needs the room jimpact/{room}, which is missing here" in line for line in said)
