@@ -109,39 +109,6 @@ def test_derivatives():
         jax.hessian(after)(0.5)
 
 
-def edge_problem(sigma=0.01, name="edge", **options):
-    """Restitution and friction of four impacts of a box on its edge, not yet at the fit."""
-    scene, velocity = pressed(name)
-    shots = np.outer([0.8, 1.0, 1.2, 1.4], velocity)
-    after = np.outer([0.8, 1.0, 1.2, 1.4], EDGE)
-    data = ji.Experiments(shots, after, sigma=sigma)
-    law = ji.LZB(0.4, friction=0.25, **options)
-    return ji.FitProblem.from_shots(law, scene, data, ("restitution", "friction"))
-
-
-@pytest.mark.release
-def test_second_derivatives_of_a_fit_say_what_auto_is():
-    """The error names what the user may not have asked for; nothing is compiled."""
-    problem = edge_problem()
-
-    def cost(x):
-        return jnp.sum(problem.residual(x) ** 2)
-
-    with pytest.raises(NotImplementedError, match="or 'auto', which is 'implicit' for several"):
-        jax.jit(jax.hessian(cost)).lower(jnp.asarray(problem.start))
-
-
-def test_a_fit_takes_the_tolerance_that_the_noise_allows():
-    """Coarse under the noise; the usual one where it is smaller, unknown, or no error is seen."""
-    problem = edge_problem()
-    assert problem.law.rtol == 1e-4
-    assert any("`rtol` = 0.0001" in note for note in problem.notes)
-    gaps = np.abs(pressed("edge")[0].normals.T @ problem.experiments.pre[-1]).max()
-    for others in ({"sigma": None}, {"sigma": 1e-4 * gaps}, {"name": "corner"}):
-        assert edge_problem(**others).law.rtol is None, others
-    assert edge_problem(rtol=1e-6).law.rtol == 1e-6
-
-
 @pytest.mark.slow
 def test_derivatives_with_friction():
     """Those of the event-aligned method, for a box on a corner."""

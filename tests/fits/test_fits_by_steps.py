@@ -45,3 +45,26 @@ def test_gradient_of_a_fit():
     fine = ji.fit(edge_problem(rtol=1e-5), starts=1, profiles=False)
     assert np.abs(found.value - fine.value).max() < 0.01 * found.standard_error.min()
     np.testing.assert_allclose(found.standard_error, fine.standard_error, rtol=0.02)
+
+
+@pytest.mark.release
+def test_second_derivatives_of_a_fit_say_what_auto_is():
+    """The error names what the user may not have asked for; nothing is compiled."""
+    problem = edge_problem()
+
+    def cost(x):
+        return jnp.sum(problem.residual(x) ** 2)
+
+    with pytest.raises(NotImplementedError, match="or 'auto', which is 'implicit' for several"):
+        jax.jit(jax.hessian(cost)).lower(jnp.asarray(problem.start))
+
+
+def test_a_fit_takes_the_tolerance_that_the_noise_allows():
+    """Coarse under the noise; the usual one where it is smaller, unknown, or no error is seen."""
+    problem = edge_problem()
+    assert problem.law.rtol == 1e-4
+    assert any("`rtol` = 0.0001" in note for note in problem.notes)
+    gaps = np.abs(pressed("edge")[0].normals.T @ problem.experiments.pre[-1]).max()
+    for others in ({"sigma": None}, {"sigma": 1e-4 * gaps}, {"name": "corner"}):
+        assert edge_problem(**others).law.rtol is None, others
+    assert edge_problem(rtol=1e-6).law.rtol == 1e-6

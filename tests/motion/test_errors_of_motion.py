@@ -11,13 +11,6 @@ BALLS = ji.chain([1.0, 1.0, 1.0])
 V = [1.0, 0.0, 0.0]
 
 
-def samples(**options):
-    """A Monte Carlo run of few samples."""
-    given = {"law": ji.Binary(0.9, "earliest"), "scene": BALLS, "velocity": V}
-    gaps = ji.Uniform(0.0, 1e-5)
-    return ji.monte_carlo(**(given | {"gaps": gaps, "samples": 4, "progress": False} | options))
-
-
 MOTIONS = [
     ({"t_end": 0.0}, "`t_end` must be after the start at 0 s"),
     ({"t_end": (1.0, 0.5)}, "`t_end` must be after the start at 1 s, but has value 0.5"),

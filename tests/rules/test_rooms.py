@@ -143,6 +143,54 @@ def test_no_file_stands_on_itself():
         assert module not in reached
 
 
+# Tests that name a room above or beside their own, and why.
+ABOVE = {
+    "test_tracks.py": "studies of tracks are read, their shots fitted: by `cli` and `fits`",
+    "test_tracks_in_space.py": "studies of poses are read, their shots fitted: by `cli` and `fits`",
+    "test_montecarlo.py": "scatter beside the linearization of `theory`",
+    "test_motion_worked.py": "motions of a rocking block end where `theory` says",
+}
+
+
+def rooms_named(path):
+    """Rooms of the public names `ji.name`, `ji.room.name`, and of the modules that a file imports."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    spaces = {"ji": PACKAGE} | {
+        f"ji.{x}": PACKAGE / x for x in ("plot", "theory", "data", "tracks")
+    }
+    homes = {(space, name): home for space in spaces for name, home in homes_in(spaces[space])}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute):
+            place = ast.unparse(node.value), node.attr
+            if place in homes and f"{place[0]}.{place[1]}" not in spaces:
+                yield homes[place]
+    yield from (room_of(module) for module, _, _ in imports_of(path) if room_of(module))
+
+
+def homes_in(folder):
+    """(name, room) of the names that the stub of a folder states."""
+    for node in ast.parse((folder / "__init__.pyi").read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.ImportFrom) and node.module:
+            parts = node.module.split(".")
+            own = folder.name if folder != PACKAGE else parts[0]
+            home = own if node.level else parts[1]
+            yield from ((alias.name, home) for alias in node.names)
+
+
+@pytest.mark.parametrize("room", sorted(STOREY))
+def test_tests_of_a_room_name_no_room_above_or_beside_it(room):
+    """Laws are the instrument of tests of what they stand on, so those rooms count as one."""
+    top = max(STOREY[room], STOREY["laws"])
+    allowed = {room} | {x for x in STOREY if STOREY[x] < top or x == "laws"}
+    for path in sorted((ROOT / "tests" / room).glob("test_*.py")):
+        if path.name not in ABOVE:
+            assert set(rooms_named(path)) <= allowed, path.name
+
+
+def test_loose_files_are_few():
+    assert len(list((ROOT / "tests").glob("*.py"))) <= 5
+
+
 ALONE = """
 import importlib, sys
 
