@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from implicit_cases import pressed
 from programs import CODE
-from spatial_scenes import NAMED, random_boxes
+from spatial_scenes import random_boxes
 
 import jimpact as ji
 
@@ -41,12 +42,6 @@ DEFAULT_RTOL = 1e-5  # of the method, in the fastest approach
 
 
 TIGHT = 1e-6
-
-
-def pressed(name):
-    """Scene and velocity of a body on the ground."""
-    body = NAMED[name]()
-    return ji.Scene(body.mass, body.normals, body.tangents), jnp.asarray(body.velocity)
 
 
 @pytest.mark.release

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from implicit_cases import pressed
 from programs import CODE
-from spatial_scenes import NAMED
 
 import jimpact as ji
 from jimpact.core.contact import contact_of
@@ -18,12 +18,6 @@ from jimpact.numerics.driver import SLOTS_IN_SPACE
 from jimpact.numerics.step_impulses import StepProblem, descent_lengths, solve
 
 pytestmark = pytest.mark.release  # they compile programs of their own
-
-
-def pressed(name):
-    """Scene and velocity of a body on the ground."""
-    body = NAMED[name]()
-    return ji.Scene(body.mass, body.normals, body.tangents), jnp.asarray(body.velocity)
 
 
 def test_reverse_mode_of_many_numbers():

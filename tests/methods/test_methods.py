@@ -12,16 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import stability_reference
+from methods_cases import BALLS, DISC, HERTZ, SLIDES, STRIKE, rod
 from programs import failed, names
 from spatial_scenes import NAMED
 
 import jimpact as ji
-
-BALLS, STRIKE = ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0]
-
-
-HERTZ = ji.LZB([0.9, 0.9], [1.0, 1.0], 1.5)
-
 
 HERTZ_AFTER = [-0.0086153561548806457087, 0.10414279851550412011, 0.9044725576393765256]
 
@@ -96,19 +91,6 @@ def test_gradients_and_the_other_methods():
     }
     bare = ji.plot.work_precision(dataclasses.replace(result, points=points))
     assert all("gradient" not in axes.get_xlabel() for axes in bare.axes)
-
-
-# of a disc on the ground that slides as it falls: mass 2, inertia 0.2, radius 0.5
-DISC = ji.Scene([2.0, 2.0, 0.2], [[0.0], [1.0], [0.0]], tangents=[[1.0], [0.0], [0.5]])
-
-
-SLIDES, SLIP = [2.0, -1.0, 0.0], 2.0
-
-
-def rod(angle):
-    """A rod that falls on its lower end in the plane."""
-    across, up = -0.5 * np.cos(angle), 0.5 * np.sin(angle)
-    return ji.Scene([1, 1, 1 / 12], [[0.0], [1.0], [across]], tangents=[[1.0], [0.0], [up]])
 
 
 def on_the_ground(name):

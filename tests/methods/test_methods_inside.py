@@ -6,6 +6,7 @@ import jax
 import numpy as np
 import pytest
 from friction_reference import routh
+from methods_cases import BALLS, DISC, HERTZ, SLIDES, SLIP, STRIKE, rod
 
 import jimpact as ji
 from jimpact.methods.advice import situation_of
@@ -13,18 +14,6 @@ from jimpact.methods.contenders import CONTENDERS, Solution, outcome
 from jimpact.methods.points import EnergyNorm
 from jimpact.methods.stability import chain_of
 from jimpact.methods.validity import ValidityMap
-
-BALLS, STRIKE = ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0]
-
-
-HERTZ = ji.LZB([0.9, 0.9], [1.0, 1.0], 1.5)
-
-
-# of a disc on the ground that slides as it falls: mass 2, inertia 0.2, radius 0.5
-DISC = ji.Scene([2.0, 2.0, 0.2], [[0.0], [1.0], [0.0]], tangents=[[1.0], [0.0], [0.5]])
-
-
-SLIDES, SLIP = [2.0, -1.0, 0.0], 2.0
 
 
 def test_verlet_with_friction():
@@ -45,12 +34,6 @@ def test_verlet_with_friction():
     np.testing.assert_allclose(out.impulse, normal, atol=0.01)
     assert (error[0] < [2e-3, 2e-5]).all()
     assert (error[1] < 0.5 * steps).all()
-
-
-def rod(angle):
-    """A rod that falls on its lower end in the plane."""
-    across, up = -0.5 * np.cos(angle), 0.5 * np.sin(angle)
-    return ji.Scene([1, 1, 1 / 12], [[0.0], [1.0], [across]], tangents=[[1.0], [0.0], [up]])
 
 
 @pytest.mark.parametrize("angle", [0.3, 1.2])

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from montecarlo_cases import BALLS, BEFORE, CHUNK, GAPS, LAW, sampled, sometimes_bad
 from scipy import stats
 
 import jimpact as ji
@@ -25,26 +26,7 @@ from jimpact import (
 )
 from jimpact.theory import gap_sensitivity
 
-BALLS = chain([0.25, 1.0, 0.25])
-
-
-LAW = Binary(1.0, order="earliest")
-
-
-BEFORE = [1.0, 0.0, -1.0]
-
-
 LEFT, RIGHT = np.array([-0.6, -0.16, 1.24]), np.array([-1.24, 0.16, 0.6])  # which contact is first
-
-
-GAPS = Uniform(0.0, 1e-5)
-
-
-CHUNK = 256  # one compiled program for most of this file
-
-
-def sampled(samples=1000, law=LAW, velocity=BEFORE, gaps=GAPS, **options):
-    return monte_carlo(law, BALLS, velocity, gaps, samples, **({"chunk": CHUNK} | options))
 
 
 def test_statistics_are_those_of_the_raw_samples(tmp_path):
@@ -216,11 +198,6 @@ def test_bad_distributions_are_named():
         ).force.stiffness
         > 1
     )
-
-
-def sometimes_bad(key):
-    gaps = jax.random.uniform(key, (2,), minval=-1e-7, maxval=1e-5)
-    return jnp.where(gaps > 9.9e-6, jnp.nan, gaps)
 
 
 def test_bad_draws_are_counted_listed_and_kept_apart():

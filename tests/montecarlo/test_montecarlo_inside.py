@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from montecarlo_cases import CHUNK, GAPS, LAW, sampled, sometimes_bad
 
 from jimpact import (
     Binary,
@@ -29,24 +30,6 @@ from jimpact.core.registry import registered_laws
 from jimpact.montecarlo import statistics as histograms, store
 from jimpact.montecarlo.statistics import merged, moments
 from jimpact.montecarlo.store import fingerprint
-
-BALLS = chain([0.25, 1.0, 0.25])
-
-
-LAW = Binary(1.0, order="earliest")
-
-
-BEFORE = [1.0, 0.0, -1.0]
-
-
-GAPS = Uniform(0.0, 1e-5)
-
-
-CHUNK = 256  # one compiled program for most of this file
-
-
-def sampled(samples=1000, law=LAW, velocity=BEFORE, gaps=GAPS, **options):
-    return monte_carlo(law, BALLS, velocity, gaps, samples, **({"chunk": CHUNK} | options))
 
 
 def same(a, b):
@@ -116,11 +99,6 @@ def test_bad_samples_are_numbered_over_all_chunks():
     chunk = histograms.reduced(task, samples, 4, False)
     assert chunk["bad.index"].tolist() == [3 * 8 + 2]
     assert chunk["used"] == 4
-
-
-def sometimes_bad(key):
-    gaps = jax.random.uniform(key, (2,), minval=-1e-7, maxval=1e-5)
-    return jnp.where(gaps > 9.9e-6, jnp.nan, gaps)
 
 
 class Stops:

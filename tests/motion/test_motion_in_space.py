@@ -4,17 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from motion_in_space_cases import BRICK, SYSTEM, thrown
 
 import jimpact as ji
-
-BRICK = ji.Box([0.1, 0.06, 0.04], mass=0.5)
-
-
-SYSTEM, LAW = ji.System(BRICK, gravity=True), ji.Moreau(0.3, friction=0.4)
-
-
-def thrown(q0, v0, duration, **options):
-    return ji.simulate(SYSTEM, LAW, q0, v0, duration, samples=21, **options)
 
 
 @pytest.mark.release

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from motion_in_space_cases import BRICK, SYSTEM, thrown
 
 import jimpact as ji
 from jimpact.bodies.base import STANDARD_GRAVITY as G
@@ -166,16 +167,6 @@ def test_derivatives_of_a_sphere_that_begins_to_roll():
     exact = jax.jacfwd(lambda x: jnp.append(rolls(x)[0], rolls(x)[1]))(x)
     np.testing.assert_allclose(jax.jacfwd(ends)(x), exact, atol=1e-6)
     np.testing.assert_allclose(jax.jacrev(ends)(x), exact, atol=1e-6)
-
-
-BRICK = ji.Box([0.1, 0.06, 0.04], mass=0.5)
-
-
-SYSTEM, LAW = ji.System(BRICK, gravity=True), ji.Moreau(0.3, friction=0.4)
-
-
-def thrown(q0, v0, duration, **options):
-    return ji.simulate(SYSTEM, LAW, q0, v0, duration, samples=21, **options)
 
 
 @pytest.mark.release

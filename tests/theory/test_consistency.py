@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from consistency_cases import HORN, close
 from programs import kinetic_norm
 
 import jimpact as ji
@@ -21,15 +22,6 @@ from jimpact.theory import (
     quasi_basis,
     to_quasi_velocities,
 )
-
-HORN = np.array(
-    [[1, -1, 1, 1, -1], [-1, 1, -1, 1, 1], [1, -1, 1, -1, 1], [1, 1, -1, 1, -1], [-1, 1, 1, -1, 1]],
-    float,
-)
-
-
-def close(a, b, tolerance=1e-12):
-    np.testing.assert_allclose(np.asarray(a, float), np.asarray(b, float), 0, tolerance)
 
 
 def dense(matrix):

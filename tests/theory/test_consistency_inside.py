@@ -4,20 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from consistency_cases import HORN, close
 
 from jimpact.theory.restitution_matrices import margin
 
 MARGIN = jax.jit(margin)
-
-
-HORN = np.array(
-    [[1, -1, 1, 1, -1], [-1, 1, -1, 1, 1], [1, -1, 1, -1, 1], [1, 1, -1, 1, -1], [-1, 1, 1, -1, 1]],
-    float,
-)
-
-
-def close(a, b, tolerance=1e-12):
-    np.testing.assert_allclose(np.asarray(a, float), np.asarray(b, float), 0, tolerance)
 
 
 @pytest.mark.parametrize(
