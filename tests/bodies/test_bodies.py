@@ -415,7 +415,7 @@ def test_turning_is_exact(brick):
     np.testing.assert_allclose(weight, [0, 0, 20, 0, 0, 0], atol=1e-15)
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_a_quaternion_must_have_length_one():
     ball = ji.Sphere(0.1)
     with pytest.raises(ValueError, match=r"`quaternion` must have length 1, but has length 2"):

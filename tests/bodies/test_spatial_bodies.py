@@ -57,7 +57,7 @@ def places():
     return bodies, look(jnp.stack(q))
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_gaps_of_spheres_boxes_planes_and_walls(places):
     """Faces, edges and corners by the nearest point; within a box the depth below a face."""
     bodies, (contacts, normals, _, slope) = places

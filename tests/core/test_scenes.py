@@ -270,7 +270,7 @@ def test_cradle_gaps():
         cradle.scene([0.2, 0.0, 0.0])
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_scenes_are_differentiable_in_their_arguments():
     """d/d(width, height, angle) of an impact on a tilted block, against differences."""
 

@@ -7,7 +7,7 @@ import jimpact as ji
 from jimpact import read_study
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_the_cube():
     data = ji.data.cube_impacts()
     assert read_study("tossed_cube.toml").experiments.shots == data.only(data.contacts == 1).shots
@@ -22,7 +22,7 @@ def test_the_cube():
         ji.data.cube_impacts(3)
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_nearly_clean_impacts_of_the_cube():
     """Two corners: the clean impacts and 84 more, none twice."""
     two = ji.data.cube_impacts(2, nearly_clean=True)

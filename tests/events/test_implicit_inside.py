@@ -17,7 +17,7 @@ from jimpact.events.impact_dynamics import method_for
 from jimpact.numerics.driver import SLOTS_IN_SPACE
 from jimpact.numerics.step_impulses import StepProblem, descent_lengths, solve
 
-pytestmark = pytest.mark.release  # they compile programs of their own
+pytestmark = pytest.mark.slow  # they compile programs of their own
 
 
 def test_reverse_mode_of_many_numbers():

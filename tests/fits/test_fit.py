@@ -157,7 +157,7 @@ def test_outliers_do_not_hide_each_other_from_a_robust_loss():
         assert line.startswith("Suspicious: shots 10, 6, 3, which")
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_honest_shots_are_seldom_suspicious():
     """The level holds for all shots of a data set together: 1 in 100 sets, not 1 in 5."""
     pre = np.stack([np.linspace(1, 2, 24), np.zeros(24)], axis=1)
@@ -507,7 +507,7 @@ def test_the_interval_of_a_valley_is_reported(rank_2_of_3):
     np.testing.assert_array_equal(found.confidence_interval(), [p[0] for p in found.intervals()])
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_all_stiffness_ratios_that_fit_are_found():
     """Three of them come apart alike; the first is not the true one."""
     truth = ji.LZB([0.95, 0.95], [1.0, 40.0])
@@ -702,7 +702,7 @@ def test_bad_ties(ties, message):
         ji.fit(ji.Newton([0.5, 0.5]), BALLS, THREE, ties=ties)
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_a_free_exponent():
     truth = ji.LZB(0.9, exponent=1.3)
     data = ji.Experiments(PRE_3, simulated(truth, BALLS, PRE_3))

@@ -47,7 +47,7 @@ def test_gradient_of_a_fit():
     np.testing.assert_allclose(found.standard_error, fine.standard_error, rtol=0.02)
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_second_derivatives_of_a_fit_say_what_auto_is():
     """The error names what the user may not have asked for; nothing is compiled."""
     problem = edge_problem()

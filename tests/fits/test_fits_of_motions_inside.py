@@ -10,7 +10,7 @@ import jimpact as ji
 from jimpact.fits import fitting_motion
 
 
-@pytest.mark.release  # compiles programs of its own
+@pytest.mark.slow  # compiles programs of its own
 def test_several_motions_are_fitted_at_once(monkeypatch):
     """A motion of closed form in the place of the simulated one: heights of bounces, h e^2, ..."""
 

@@ -102,7 +102,7 @@ def test_shots_with_different_numbers_of_contacts_are_fitted_together():
     np.testing.assert_allclose(excess[[0, 2]][:, 0], 0.0, atol=1e-14)
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_padding_with_friction():
     """A cube's corner and its edge in one fit: contacts that are not there change nothing."""
     corner = ji.Scene([1.0, 1.0, 0.5], [[0.0], [1.0], [0.4]], tangents=[[1.0], [0.0], [0.3]])

@@ -29,7 +29,7 @@ def test_one_shot_is_always_reproduced():
         assert any("Nothing keeps this matrix consistent" in line for line in found.warnings)
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_all_entries_are_free_by_default():
     data = shots(E_TRUE)
     found = fit(RestitutionMatrix(START), CHAIN, data, starts=2)
@@ -37,7 +37,7 @@ def test_all_entries_are_free_by_default():
     np.testing.assert_allclose(found.law.matrix, E_TRUE, atol=1e-9)
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_a_study_of_a_matrix_needs_no_more_than_its_data(tmp_path):
     (tmp_path / "shots.csv").write_text(
         "pre_1[m/s],pre_2[m/s],post_1[m/s],post_2[m/s]\n1,0,0.25,0.75\n2,0,0.5,1.5\n"
@@ -53,7 +53,7 @@ def test_a_study_of_a_matrix_needs_no_more_than_its_data(tmp_path):
         np.testing.assert_allclose(found.value, 0.5, atol=1e-9)
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_too_few_shots_say_which_entries_are_undetermined():
     """Only contact 1 approaches: the second column of E has no effect."""
     data = shots(E_TRUE, pre=np.tile([1.0, 0.0, 0.0], (4, 1)))
@@ -68,7 +68,7 @@ def test_too_few_shots_say_which_entries_are_undetermined():
     assert np.isnan(found.standard_error[[0, 2]]).all()
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_several_simulated_shots_recover_the_matrix():
     found = fitted(shots(E_TRUE))
     np.testing.assert_allclose(found.law.matrix, E_TRUE, atol=1e-9)
@@ -78,7 +78,7 @@ def test_several_simulated_shots_recover_the_matrix():
     assert found.names == ("matrix[1,1]", "matrix[1,2]", "matrix[2,1]", "matrix[2,2]")
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_a_sparsity_pattern_is_kept():
     sparse = np.array([[0.3, 0.0], [0.5, 0.4]])
     found = fitted(shots(sparse), free=np.array([[True, False], [True, True]]))

@@ -42,7 +42,7 @@ def test_an_admissible_matrix_to_start_from(scene):
     assert min(slacks(admissible_start([scene])[among], np.linalg.inv(g))) > -1e-9
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_the_admissible_least_squares_solution_is_found():
     """Noisy data that gain energy: the constrained minimum, against scipy."""
     data = shots(np.array([[0.1, 0.2], [0.95, 0.1]]), noise=0.1, seed=4)
@@ -98,7 +98,7 @@ def test_the_best_admissible_matrix_is_found_at_many_edges():
         assert ((others - best) @ np.asarray(slope)).min() > -1e-6 * np.abs(slope).max()
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_gradient_descent_ends_at_the_same_matrix():
     data = shots(np.array([[0.1, 0.2], [0.95, 0.1]]), noise=0.1, seed=4)
     found = fitted(data, search=ji.Search(method="adam"))

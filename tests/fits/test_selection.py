@@ -36,7 +36,7 @@ def every():
     return ji.fit_laws(PAIR, data, ["moreau", "newton", "restitution_matrix"], speed=True)
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_laws_that_agree_are_listed_by_what_they_must_know(every):
     assert list(every.entries) == ["newton", "moreau"]
     newton, moreau = every.entries.values()
@@ -63,7 +63,7 @@ def test_the_criterion_without_sigma_is_corrected_for_few_values():
     assert best.aicc == pytest.approx(n * np.log(squares / n) + 2 * k * n / (n - k - 1))
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_a_law_that_fails_is_named_and_comes_last():
     """Newton pulls at a contact that separates."""
     balls = ji.chain([1.0, 1.0, 1.0])
@@ -94,7 +94,7 @@ def test_bad_laws(change, message):
         ji.fit_laws(PAIR, data, **change)
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_the_law_that_made_the_data_is_found():
     """Of three balls: dispersion that only LZB has; the simpler laws predict worse."""
     balls, rng = ji.chain([1.0, 1.0, 1.0]), np.random.default_rng(2)
@@ -128,7 +128,7 @@ def test_restitution_by_speed_is_what_it_says():
     assert float(none.restitution_at(7.0)) == 0.3
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_restitution_by_a_table_and_by_a_function_of_the_speed():
     speeds, values = [0.5, 1.0, 4.0], [0.9, 0.8, 0.5]
     table = ji.VelocityDependent(ji.Newton(0.9), curve=(speeds, values))
@@ -232,7 +232,7 @@ def test_bad_dependence_on_speed(make, message):
         make()
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_the_need_of_a_dependence_on_speed_is_tested():
     falling = 0.8 * SPEED**-0.2
     law = ji.VelocityDependent(ji.Newton(0.7), speed_exponent=0.1)

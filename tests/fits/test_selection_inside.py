@@ -49,7 +49,7 @@ def test_contacts_that_feel_each_other_share_a_speed():
     assert speed.tolist() == [0.2, 0.2, 0.2, 2.0, 0.0]
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_lzb_and_compliant_take_the_option():
     balls, v = ji.chain([1.0, 1.0, 1.0]), [2.0, 0.0, 0.0]
     for base in (ji.LZB(0.5, [1.0, 2.0]), ji.Compliant(ji.Bistiffness(1.0, 1.5, 0.5))):
@@ -61,7 +61,7 @@ def test_lzb_and_compliant_take_the_option():
         assert abs(float(slow.energy_change)) < 1e-10
 
 
-@pytest.mark.release
+@pytest.mark.slow
 @pytest.mark.usefixtures("lenient")
 def test_priors_are_declared_like_domains(found):
     kinds = pytest.importorskip("numpyro.distributions")

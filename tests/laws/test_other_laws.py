@@ -38,7 +38,7 @@ def test_the_ratio_of_lzb_returns_its_outcome():
     np.testing.assert_allclose(correlated(e, ratio), LZB_AFTER, atol=1e-12)
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_impulse_ratios_are_not_constant():
     """The chapter's criticism: F2 / F1 of (6.68) grows from 0 to where contact 1 opens."""
     balls = ji.chain(jnp.ones(3))  # the program of test_own_law.py

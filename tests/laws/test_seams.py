@@ -118,7 +118,7 @@ def test_poisson_with_friction():
     assert not slides.all()
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_poisson_of_one_contact_in_space():
     """A sphere that does not roll: with e_t = 0 both phases together are Moreau's impact."""
     sphere = ji.Scene(np.ones(3), [[0.0], [0.0], [1.0]], tangents=np.eye(3)[:, :2])
@@ -185,7 +185,7 @@ def test_light_balls_with_gaps_and_knife_edges_are_right_or_reported():
     assert reported.mean() < 0.05
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_derivatives_of_a_checked_outcome_are_those_of_the_plain_one():
     balls, v = ji.chain(np.ones(3)), jnp.array([1.0, 0.0, 0.0])
 

@@ -10,7 +10,7 @@ import jimpact as ji
 from jimpact.core.contact import contact_of, coupled_groups
 from jimpact.core.scene import pad_scene
 
-pytestmark = pytest.mark.release  # they compile programs of their own
+pytestmark = pytest.mark.slow  # they compile programs of their own
 
 PAIRS = np.array([[-1.0, 0.0, 0], [1, 0, 0], [0, -1, -1], [0, 1, 0], [0, 0, 1]])
 
@@ -74,7 +74,7 @@ def test_a_padded_chain_contains_itself(wall):
     assert (np.delete(padded.scene.gaps, np.r_[: padded.scene.contacts][padded.contacts]) > 0).all()
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_groups_with_friction_and_open_contacts():
     normals, tangents = np.zeros((6, 3)), np.zeros((6, 3))
     for j in range(3):

@@ -223,7 +223,7 @@ def test_functions_are_known_by_source_and_closure():
     assert fingerprint(chain([1.0, 1.0], wall=True)) != fingerprint(chain([1.0, 1.0], wall="left"))
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_a_killed_process_continues_with_the_same_bits(tmp_path, whole):
     code = f"""
 import jax; jax.config.update("jax_enable_x64", True)
@@ -253,7 +253,7 @@ monte_carlo(ji.Binary(1.0, order="earliest"), ji.chain([0.25, 1.0, 0.25]), [1.0,
 LAWS = registered_laws({"restitution": 0.9, "stiffness": 1.0, "matrix": 0.9 * np.eye(2)})[0]
 
 
-@pytest.mark.release
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LAWS)
 def test_every_law_can_be_sampled(name):
     law = LAWS[name]

@@ -46,7 +46,7 @@ def test_ball_on_a_linear_spring():
     np.testing.assert_allclose(motion.energy, motion.energy[0], atol=1e-8)
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_a_plastic_contact_returns_its_share():
     """e of the speed, from the residual indentation, but for the work of the weight."""
     motion = dropped(ji.Bistiffness(1e8, 1.5, 0.8))
@@ -57,7 +57,7 @@ def test_a_plastic_contact_returns_its_share():
     np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-9)
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_a_dashpot_may_slacken_before_its_spring():
     force = ji.KelvinVoigt(1e6, 200.0)
     motion = dropped(force)

@@ -94,7 +94,7 @@ def on_plane(v, tilt):
     return np.stack([v[..., 0] * np.cos(tilt) - v[..., 2] * np.sin(tilt), v[..., 1]], axis=-1)
 
 
-@pytest.mark.release
+@pytest.mark.slow
 @pytest.mark.parametrize("row", [0, 1, 2])
 def test_a_sphere_slides_until_it_rolls(spheres, row):
     motion, (time, velocity) = lane(spheres, row), rolls(jnp.array(ROWS[row]))
@@ -105,14 +105,14 @@ def test_a_sphere_slides_until_it_rolls(spheres, row):
     np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-11)
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_a_level_sphere_keeps_five_sevenths(spheres):
     motion = lane(spheres, 0)
     np.testing.assert_allclose(motion.events.time[0], 2 * 0.7 / (7 * 0.3 * G), rtol=1e-13)
     np.testing.assert_allclose(np.linalg.norm(motion.velocity[-1, :2]), 0.5, rtol=1e-14)
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_a_sphere_slides_or_rolls_from_rest(spheres):
     for row, share in ((3, 1.2 - 0.3), (4, 0.9 * 5 / 7)):
         motion, tilt = lane(spheres, row), ROWS[row][3]
@@ -121,7 +121,7 @@ def test_a_sphere_slides_or_rolls_from_rest(spheres):
         np.testing.assert_allclose(motion.q[-1, 0] - motion.q[0, 0], way * np.cos(tilt), rtol=1e-12)
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_a_sphere_that_is_pulled_begins_to_slide(spheres):
     """At 2/7 of the pull = mu m g; then v' = (pull - mu m g) / m."""
     motion, start = lane(spheres, 5), 0.1 * G * 3.5 / 14
@@ -132,7 +132,7 @@ def test_a_sphere_that_is_pulled_begins_to_slide(spheres):
     np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-10)
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_slip_that_begins_turns_with_the_forces(spheres):
     """Radau's method for `u / sqrt(u^2 + 1e-20)`."""
     from scipy.integrate import solve_ivp

@@ -41,7 +41,7 @@ def test_what_a_motion_does_not_reach_has_no_derivatives():
         assert np.isnan(hessians[1]).all()
 
 
-@pytest.mark.release  # compiles programs of its own
+@pytest.mark.slow  # compiles programs of its own
 def test_runs_of_the_program_follow_each_other():
     dropped = 0.97, [0.1, 0.101, 0.102], [0.0] * 3, 5.0
     motion = stack(*dropped)
@@ -60,7 +60,7 @@ def test_runs_of_the_program_follow_each_other():
         np.testing.assert_allclose(row, all_rows[: CHUNK + 100], rtol=1e-9)  # another program
 
 
-@pytest.mark.release  # compiles programs of its own
+@pytest.mark.slow  # compiles programs of its own
 def test_a_motion_back_in_time_is_reported():
     ball, start = (
         ji.System(ji.Column([1.0]), gravity=True),
@@ -76,7 +76,7 @@ A_BASE, W_BASE = 0.1, 2 * np.pi * 1.5  # of a plate at A sin(w t)
 PLATE = ji.System(ji.Column([2.0]), gravity=True, base=ji.HarmonicBase(A_BASE, 1.5))
 
 
-@pytest.mark.release  # compiles programs of its own
+@pytest.mark.slow  # compiles programs of its own
 def test_gaps_are_seen_from_the_base():
     """f = q - y_b, f' = v - y_b', and f'' = -y_b'' where q'' = 0."""
     t = 0.1
@@ -87,7 +87,7 @@ def test_gaps_are_seen_from_the_base():
     np.testing.assert_allclose(gap.drift, [W_BASE**2 * sine], rtol=1e-13)
 
 
-@pytest.mark.release  # compiles programs of its own
+@pytest.mark.slow  # compiles programs of its own
 def test_the_base_works_at_its_own_speed():
     """p u with p = m (1 + e) (u - v): T+ - T- is that and what restitution takes."""
     u, v, e = A_BASE * W_BASE, -1.0, 0.5

@@ -170,7 +170,7 @@ def test_spheres_fall_into_a_box_and_come_to_rest():
     assert -1e-3 < float(np.min(motion.gaps)) < 0
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_a_mixed_pile_has_the_contacts_of_planar_bodies():
     """The same gaps, normals and tangents, up to their sides; their order is another."""
     pentagon = 0.2 * np.stack(
@@ -285,7 +285,7 @@ def struck():
     return spheres, spheres.at(places), v
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_a_packing_has_the_contacts_of_its_body(struck):
     spheres, q, _ = struck
     scene, places, columns = spheres.closed_scene(q), np.asarray(q).reshape(8, 6)[:, :3], []
@@ -322,7 +322,7 @@ def test_a_packing_is_struck(struck):
     np.testing.assert_allclose(rate, expected, atol=1e-12)
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_a_step_of_a_packing_is_an_impact(struck):
     """Without friction by Moreau's law; with it, ball 1 rubs on balls 2 and 3, all on the table."""
     spheres, q, v = struck
@@ -364,7 +364,7 @@ def test_bad_packings_are_named(struck):
         spheres.closed_scene(q[1:])
 
 
-@pytest.mark.release
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["time", "implicit"])
 def test_dynamics_of_a_packing_are_those_of_the_dense_scene(struck, method):
     spheres, q, v = struck

@@ -25,7 +25,7 @@ def test_three_solutions_of_moreau():
     assert int(out.status) == CODE["several_outcomes"]
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_a_spinning_cube_flat_on_four_corners_has_several_outcomes():
     """How the corners share p decides how friction turns it: the order of the contacts, else."""
     corners = np.array([[x, y, -0.5] for x in (-0.5, 0.5) for y in (-0.5, 0.5)])

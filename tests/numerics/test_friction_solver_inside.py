@@ -17,7 +17,7 @@ from jimpact.numerics import dense
 from jimpact.numerics.friction import distribute, solve
 from jimpact.numerics.many_contacts import solve_many
 
-pytestmark = pytest.mark.release  # they compile programs of their own
+pytestmark = pytest.mark.slow  # they compile programs of their own
 
 PLANAR, SPATIAL, LANES = 3, 2, 128
 
@@ -160,6 +160,7 @@ def misfit(lanes, found, rows, complementary):
     return np.maximum(np.maximum(normal, outside), power).max(axis=1) / (1 + np.abs(x).max(axis=1))
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("complementary", [True, pytest.param(False, marks=pytest.mark.release)])
 def test_spatial_outcomes_satisfy_the_law(complementary):
     lanes = random_scenes(2)
@@ -235,6 +236,7 @@ def nearly_flat(i):
     return whole.reshape(5, 3, 5, 3), rate, np.append(np.full(4, mu), 0.3)
 
 
+@pytest.mark.release
 def test_four_corners_that_nearly_stick_have_impulses():
     """They must slip, by as little as 1e-6 of their speed: sweeps over the contacts find none."""
     lanes = [np.stack(x) for x in zip(*map(nearly_flat, NEARLY_FLAT), strict=True)]
@@ -263,6 +265,7 @@ def along(rows):
     return jax.jit(jax.vmap(one))
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("rows", [1, pytest.param(2, marks=pytest.mark.release)])
 def test_derivatives(rows):
     rng = np.random.default_rng(7)

@@ -27,7 +27,7 @@ from jimpact.methods.stability import Confirmation, Slice, StabilityMap
 from jimpact.methods.validity import ValidityMap
 from jimpact.plot.style import SMALL, WIDTH
 
-pytestmark = pytest.mark.release
+pytestmark = pytest.mark.slow
 
 AFTER = np.array([-0.1, 0.2, 0.9])
 

@@ -228,7 +228,7 @@ def test_a_motion_goes_on():
         jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * 2), found).then(later)
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_picture_of_a_motion(tmp_path):
     system, found = rocked(ji.HarmonicBase(0.01, 4.0, direction="vertical"))
     figure = ji.plot.motion(found, "dimer", system=system)
@@ -301,7 +301,7 @@ def test_pictures_of_many_bodies_show_those_that_move_most():
         ji.plot.motion(found, system=system, contacts=[8])
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_films_run_in_time(tmp_path):
     """Frames are equally spaced in time, and files last as long as they say."""
     system, found = rocked()

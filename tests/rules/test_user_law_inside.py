@@ -10,7 +10,7 @@ import jimpact as ji
 from jimpact import read_study
 from jimpact.cli.study_file import import_laws
 
-pytestmark = pytest.mark.release  # they compile programs of their own
+pytestmark = pytest.mark.slow  # they compile programs of their own
 
 FILE = '''
 import jax.numpy as jnp
@@ -103,7 +103,7 @@ def test_declared_domains(law):
     assert ji.REGISTRY["sluggish"].required == ("restitution",)
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_study_fit_and_monte_carlo(folder):
     study = read_study(folder / "study.toml")
     found = study.run()

@@ -86,7 +86,7 @@ def of_scene(scene, count):
     return [np.tile(x, (count, 1, 1)) for x in arrays]
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_given_slip_agrees_with_the_law():
     """(6.54)-(6.57) with xi = 1: the law finds that slip by itself, and the same impulses."""
     e, mu, fast = np.array([[0.5, 0.1], [0.2, 0.3]]), 0.2, np.array([2.0, -0.6, -0.3])

@@ -106,7 +106,7 @@ def test_friction_block():
     np.testing.assert_allclose(work.total, change, atol=1e-14)
 
 
-@pytest.mark.release
+@pytest.mark.slow
 @pytest.mark.parametrize("constraints", [0, 1])
 def test_identities_of_random_scenes(constraints):
     scene = random_scene(constraints)
@@ -157,7 +157,7 @@ def test_particle_has_no_coupling():
     np.testing.assert_allclose(parts, [-4, 0, -1.5], atol=1e-15)
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_basis_is_smooth_in_the_scene():
     """The derivative is that of the value: v(qn, qt) for given quasi-velocities."""
     scene = random_scene(1)

@@ -105,7 +105,7 @@ def full_matrix(scene, scale=0.4, seed=0):
     return jnp.asarray(scale * np.random.default_rng(seed).uniform(size=(size, size)))
 
 
-@pytest.mark.release
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", [block(theta=0.1), CONSTRAINED], ids=["block", "constrained"])
 def test_tangential_blocks(scene):
     """v+ = -E v- in all quasi-velocities; impulses, energy and constraints agree with it."""

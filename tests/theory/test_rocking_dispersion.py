@@ -98,7 +98,7 @@ def test_bad_input_of_the_angles():
         ji.theory.search_critical_angle(0.1, 0.0)
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_the_tip_is_found_by_impacts_alone():
     mu, e = [0.0, 0.3, 1.0], [0.3, 0.8, 1.0]
     angle = ji.theory.search_critical_angle(mu, e)
@@ -106,7 +106,7 @@ def test_the_tip_is_found_by_impacts_alone():
     np.testing.assert_allclose(angle[:, 0], ji.theory.critical_kinetic_angle(mu), atol=1e-7)
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_it_is_a_v():
     a = np.linspace(0.3, 5.0, 60)
     out = ji.theory.rocking_dispersion(a, [0.0, 0.1, 0.3, 1.0], [0.5, 1.0])

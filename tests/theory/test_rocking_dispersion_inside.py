@@ -6,7 +6,7 @@ from rocking_dispersion_cases import BOTH, MU, E, solved
 
 from jimpact.theory.rocking import OUTCOMES
 
-pytestmark = pytest.mark.release  # they compile programs of their own
+pytestmark = pytest.mark.slow  # they compile programs of their own
 
 
 RIGHT = np.array([1.6, 1.8, 2.0, 2.5, 3.0, 4.0, 6.0])

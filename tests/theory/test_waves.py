@@ -81,7 +81,7 @@ def test_a_solitary_wave():
     assert kinetic[28:33].sum() > 0.9999 * kinetic[20:].sum()
 
 
-@pytest.mark.release
+@pytest.mark.slow
 def test_a_dispersion_free_chain_in_an_impact():
     mass, stiffness = ji.theory.reinsch_chain(6)
     out = ji.impact(ji.LZB(1.0, stiffness, 1.0), ji.chain(mass), jnp.eye(6)[0])
