@@ -313,7 +313,7 @@ def force_chains():
 @styled()
 def drops():
     """Drops of a square: median error of the predicted angle after a hit, from two flights."""
-    with np.load(Path(__file__).parents[1] / "tests" / "data" / "drops.npz") as stored:
+    with np.load(Path(__file__).parents[1] / "tests" / "held" / "drops.npz") as stored:
         curves = {name: stored[name] for name in stored.files}
     figure, panels = new_figure(3.0, "", 1, 2, sharey=True)
     for axes, kind in zip(panels, ("first flight", "flight after an impact")):

@@ -28,9 +28,6 @@ _STOP, PASSES, NEAR = 1e-4, 16, 1e-6
 # limit's, each further one is GROWTH times as far from its neighbour.
 STEP, GROWTH = 0.4, 1.5
 FIRST_SHARE = 1 / 16  # of what can be reached: the first value where the error is infinite
-# Relative sums of squares that are equal: to what an impact is good to. Ten times less: profiles
-# find "lower" minima in rounding.
-SAME = {"float64": 1e-6, "float32": 1e-3}
 # Share of the root of the limit, or of the values inside, to which an end is searched for.
 END = 1e-3
 ROUNDS = 8  # of the search for an end: it is then right to a millionth of a step, mostly
@@ -80,7 +77,8 @@ class Deviances:
 
     Attributes:
         limit: deviance at the end of the interval, or of the region.
-        same: relative difference up to which sums of squares are equal.
+        same: relative difference up to which sums of squares are equal: what impacts are good to.
+            Ten times less: profiles find lower minima in rounding.
         variance: s^2 of the noise.
         error: (P,) standard errors in the solver's scale.
         starts: minima that searches start from, the best one first.
@@ -91,7 +89,7 @@ class Deviances:
     def __init__(self, fit: Estimate[Any], limit: float, show: Show):
         """Start from the minima of the fit; `limit` is a deviance, `show` displays progress."""
         self.fit, self.problem, self.limit, self.show = fit, fit.problem, limit, show
-        self.same = SAME[self.problem.precision]
+        self.same = RANK_TOLERANCE[self.problem.precision]
         has_noise = np.isfinite(fit.noise) and fit.noise > 0
         # of an exact fit: that of rounding
         self.variance = float(fit.noise**2) if has_noise else self.problem.exact_squares

@@ -24,9 +24,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jimpact.fits.covariances import diagonal_blocks
-from jimpact.fits.data import Experiments, kept_by_corrections
 from jimpact.fits.solve import AnyArray
+from jimpact.shots.covariances import diagonal_blocks
+from jimpact.shots.data import Experiments, kept_by_corrections
 
 
 @jax.tree_util.register_dataclass

@@ -10,11 +10,11 @@ import numpy as np
 from scipy.special import ndtri, stdtrit
 
 from jimpact.core.law import AnyLaw
-from jimpact.fits.data import Experiments
 from jimpact.fits.intervals import check_level, joined
 from jimpact.fits.problem import FitProblem
 from jimpact.fits.search import FitMinimum, Solution
 from jimpact.fits.uncertainty import Uncertainty
+from jimpact.shots.data import Experiments
 
 # Relative standard error of a stiffness beyond which its linearized interval is not believed.
 HARDLY_SEEN = 0.2

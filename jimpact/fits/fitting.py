@@ -13,7 +13,6 @@ import numpy as np
 from jimpact.core.law import AnyLaw
 from jimpact.core.scene import Scene
 from jimpact.fits.checks import Judged, unusable
-from jimpact.fits.data import Experiments
 from jimpact.fits.data_checks import wrong_unit
 from jimpact.fits.estimate import in_own_precision
 from jimpact.fits.intervals import check_level
@@ -41,6 +40,7 @@ from jimpact.fits.solve import (
     step_limit,
 )
 from jimpact.fits.uncertainty import uncertainty
+from jimpact.shots.data import Experiments
 from jimpact.tools.checks import as_whole, check_kind
 from jimpact.tools.progress import progress_bar
 from jimpact.tools.records import listed

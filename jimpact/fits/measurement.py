@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jimpact.fits.covariances import whitening
 from jimpact.fits.observables import Prediction
 from jimpact.fits.solve import AnyArray
+from jimpact.shots.covariances import whitening
 from jimpact.tools.compiling import full_precision
 
 # A trial whose outcome is meaningless gets a residual far above any honest one, so that a solver

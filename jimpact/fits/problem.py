@@ -18,7 +18,6 @@ import numpy as np
 
 from jimpact.core.law import Law, entries, forward_only, with_entries
 from jimpact.core.scene import Scene, dense_mass, stackable
-from jimpact.fits.data import Experiments
 from jimpact.fits.errors_before import ErrorsBefore
 from jimpact.fits.matrices import AdmissibleMatrices, matrix_region
 from jimpact.fits.measurement import Measurement
@@ -48,6 +47,7 @@ from jimpact.fits.solve import EXACT, Ends, LeastSquares, Solver, minimize
 from jimpact.fits.true_velocities import LawAtShots, law_at_shots
 from jimpact.fits.variables import Variables
 from jimpact.numerics.derive import without_derivatives
+from jimpact.shots.data import Experiments
 from jimpact.tools.checks import (
     as_float_array,
     check_concrete,

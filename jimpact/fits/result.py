@@ -14,7 +14,6 @@ from jimpact.core.law import AnyLaw, parameters_of
 from jimpact.core.scene import Scene
 from jimpact.fits.checks import Judged, fit_findings
 from jimpact.fits.curvature import bent_within_errors
-from jimpact.fits.data import Experiments
 from jimpact.fits.deviances import PROFILE_STARTS, lower_minimum, profiles_of
 from jimpact.fits.estimate import LEVEL, Estimate, in_own_precision
 from jimpact.fits.findings import Finding
@@ -22,6 +21,7 @@ from jimpact.fits.intervals import Profile
 from jimpact.fits.parameters import LawInScene, tied_names, tied_value
 from jimpact.fits.problem import outcome_at
 from jimpact.fits.search import solution_of
+from jimpact.shots.data import Experiments
 from jimpact.tools.checks import check_choice, check_kind, check_values
 from jimpact.tools.records import Column, Table, Tabular, counted, plain
 from jimpact.tools.status import STATUS

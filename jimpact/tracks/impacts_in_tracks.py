@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from jimpact.fits.shots_file import ANGULAR, LINEAR
+from jimpact.shots.shots_file import ANGULAR, LINEAR
 from jimpact.tools.checks import as_float_array, check_concrete, check_values
 from jimpact.tracks.arcs import Arcs, fit_arcs
 from jimpact.tracks.drag import straightened
