@@ -250,9 +250,9 @@ def chart_of_a_box(contacts: int, turned: list[float], title: str) -> Figure:
     closed = ji.Scene(scene.mass, scene.normals[:, at], tangents=tangents)
     velocity, mu = [1.0, 0.3, -1.0, 0.5, -0.4, 0.2], 0.3
     result = ji.work_precision(
+        ji.LZB(0.3, friction=mu),
         closed,
         velocity,
-        ji.LZB(0.3, friction=mu),
         laws={"moreau": ji.Moreau(0.3, friction=mu)},
         batch=64,
         repeats=3,
@@ -313,7 +313,7 @@ def force_chains():
 @styled()
 def drops():
     """Drops of a square: median error of the predicted angle after a hit, from two flights."""
-    with np.load(Path(__file__).parents[1] / "tests" / "data" / "drops.npz") as stored:
+    with np.load(Path(__file__).parents[1] / "tests" / "held" / "drops.npz") as stored:
         curves = {name: stored[name] for name in stored.files}
     figure, panels = new_figure(3.0, "", 1, 2, sharey=True)
     for axes, kind in zip(panels, ("first flight", "flight after an impact")):

@@ -34,7 +34,7 @@ API = {  # a page, and the modules whose public names it holds: the longest matc
     "Bodies": ("bodies",),
     "Laws": ("core.law", "core.registry", "laws"),
     "Contact forces": ("laws.forces", "laws.calibration"),
-    "Shots and fits": ("fits", "cli", "saved"),
+    "Shots and fits": ("shots", "fits", "cli", "saved"),
     "Tracks": ("tracks",),
     "Monte Carlo": ("montecarlo", "core.distributions"),
     "Motions": ("motion",),
@@ -60,8 +60,6 @@ def public_names() -> dict[str, list[str]]:
         for line in ast.parse(stub.read_text(encoding="utf-8")).body:
             if isinstance(line, ast.ImportFrom) and line.module:
                 module, names = line.module, [alias.name for alias in line.names]
-            elif isinstance(line, ast.Assign):  # names of another room
-                module, names = package, [ast.unparse(target) for target in line.targets]
             else:
                 continue
             for name in names:
@@ -319,9 +317,15 @@ def constants_page() -> dict[str, str]:
 
 ROOMS = (  # from above: (name, task); a room imports from rows below its own, and from itself
     (("cli", "commands"), ("saved", "saved results")),
-    (("plot", "pictures"), ("data", "measured impacts"), ("tracks", "tracks to shots")),
-    (("fits", "shots, fits, verdicts"), ("methods", "comparison, charts")),
-    (("motion", "whole motions"), ("theory", "outcomes, bounds"), ("montecarlo", "random gaps")),
+    (("fits", "fits, verdicts"), ("methods", "comparison, charts")),
+    (
+        ("motion", "whole motions"),
+        ("theory", "outcomes, bounds"),
+        ("montecarlo", "random gaps"),
+        ("tracks", "tracks to shots"),
+        ("data", "measurements"),
+    ),
+    (("shots", "measured shots and their files"), ("plot", "style of pictures, `ji.plot`")),
     (("laws", "one file for each law"),),
     (("events", "impact dynamics"), ("bodies", "gaps, tangents, mass")),
     (("core", "scene, contact, law, impact, audit, registry"),),

@@ -25,9 +25,15 @@ __all__ += ["__version__"]
 
 
 def __getattr__(name: str) -> object:
-    """The public name; an AttributeError that says which one was probably meant."""
-    if name in __all__ or name.startswith("__"):
-        return _public(name)
-    from jimpact.tools.checks import suggestion
+    """The public name; an AttributeError that says which one was probably meant.
 
-    raise AttributeError(f"jimpact has no name `{name}`.{suggestion(name, __all__)}")
+    An ImportError says which room is missing where a copy of the package lacks it.
+    """
+    if name.startswith("__"):
+        return _public(name)
+    from jimpact.tools.checks import missing_room, suggestion
+
+    if name not in __all__:
+        raise AttributeError(f"jimpact has no name `{name}`.{suggestion(name, __all__)}")
+    with missing_room(f"ji.{name}"):
+        return _public(name)

@@ -40,7 +40,6 @@ from .core.scene import (
     momentum as momentum,
     velocity_change as velocity_change,
 )
-from .fits.data import Experiments as Experiments, read_experiments as read_experiments
 from .fits.fitting import (
     bootstrap as bootstrap,
     fit as fit,
@@ -116,6 +115,7 @@ from .motion.system import (
     gravity as gravity,
 )
 from .saved import load as load
+from .shots.data import Experiments as Experiments, read_experiments as read_experiments
 from .theory.han_gilmore_tree import han_gilmore as han_gilmore
 from .tools.status import STATUS as STATUS
 

@@ -22,8 +22,8 @@ def load(path: str | Path) -> Fit[Any] | Motion:
 
     Raises:
         FileNotFoundError: no such file. ValueError: neither a fit nor a motion, one of another
-            format, a law that cannot be imported, or double precision while JAX is in single
-            precision.
+            format, a law that cannot be imported, or a motion in double precision while JAX is in
+            single precision. (A fit stays in its own precision.)
 
     >>> import pathlib, tempfile, jimpact as ji
     >>> folder = pathlib.Path(tempfile.mkdtemp())

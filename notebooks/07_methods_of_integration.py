@@ -48,7 +48,7 @@ law = ji.LZB(0.9, [1.0, 1.0], 1.5)
 settings = {"time": [1e-4, 1e-6, 1e-8], "rk4": [0.1, 0.03, 0.01]}
 laws = {"moreau": ji.Moreau(0.9), "binary": ji.Binary(0.9)}
 options = {"batch": 64, "repeats": 3, "gradients": False, "durations": False}
-chart = ji.work_precision(balls, v, law, list(settings), settings, laws, **options)
+chart = ji.work_precision(law, balls, v, list(settings), settings, laws, **options)
 print(chart)
 
 # %%

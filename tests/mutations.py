@@ -6,7 +6,7 @@
 Each mutation replaces one expression or statement of one function, both named by their syntax, so
 that formatting, comments and moves between files leave it alone. The package and its tests are
 copied, the mutation is applied to the copy, and the contract tests that should notice it run there.
-`tests/unit/test_mutations.py` checks that every mutation has exactly one place.
+`tests/rules/test_mutations.py` checks that every mutation has exactly one place.
 """
 
 import argparse
@@ -37,7 +37,7 @@ class Mutation:
     """A mistake: `expression`, which occurs once in `function`, replaced by `replacement`.
 
     `function` is a qualified name (`Class.method`), a class, or "" for the statements of a module.
-    One of the `tests` (files, or node ids, in tests/contract/) should fail with it.
+    One of the `tests` (files, or node ids, named by file) should fail with it.
     """
 
     name: str
@@ -91,8 +91,8 @@ MUTATIONS = [
     Mutation("an asymmetric mass passes inside jit", "is_allowed", "_is_symmetric(scene.mass)", "jnp.asarray(True)", ("test_contract.py::test_what_the_host_refuses_has_a_status_inside_jit[moreau]",)),
     Mutation("constraints may be broken inside jit", "Traced._refusal", """if self.constrained:
     allowed.append(jnp.all(_keeps_constraints(scene.constraints, v)))""", """if self.constrained:
-    pass""", ("test_errors.py::test_what_the_host_refuses_has_a_status_inside_jit",)),
-    Mutation("negative noise passes inside jit", "Traced._refusal", "(x >= 0) & (x < jnp.inf)", "x < jnp.inf", ("test_errors.py::test_what_the_host_refuses_has_a_status_inside_jit",)),
+    pass""", ("test_errors_of_core.py::test_what_the_host_refuses_has_a_status_inside_jit",)),
+    Mutation("negative noise passes inside jit", "Traced._refusal", "(x >= 0) & (x < jnp.inf)", "x < jnp.inf", ("test_errors_of_core.py::test_what_the_host_refuses_has_a_status_inside_jit",)),
     Mutation("freedom counted with parameters, not rank", "uncertainty", "problem.values - rank", "problem.values - len(scale)", ("test_fit.py::test_one_shot_of_three_balls_determines_two_of_three",)),
     Mutation("rank tolerance too coarse", "", "{'float64': 1e-06, 'float32': 0.001}", "{'float64': 0.1, 'float32': 0.001}", ("test_fit.py::test_one_shot_of_three_balls_determines_two_of_three", "test_fit.py::test_what_is_seen_weakly_is_seen",)),
     Mutation("standard errors without noise", "uncertainty", "noise ** 2", "noise", ("test_fit.py::test_errors_from_the_residual_are_those_of_linear_regression",)),
@@ -105,8 +105,8 @@ MUTATIONS = [
     Mutation("given samples of the next chunk", "Run.task", "values[number * size:(number + 1) * size]", "values[(number + 1) * size:(number + 2) * size]", ("test_montecarlo.py::test_given_samples_are_used_row_by_row",)),
     Mutation("normal gaps truncated at their mean", "Normal.sample", "-mean / std", "0 * mean", ("test_montecarlo.py::test_truncated_normal_gaps",)),
     Mutation("random parameters draw the same numbers", "RandomLaw.__call__", "jax.random.fold_in(key, i)", "key", ("test_montecarlo.py::test_random_parameters_are_independent",)),
-    Mutation("gap scale of a single ball", "gap_scale", "2 / diagonal(delassus_matrix(scene))", "1 / diagonal(delassus_matrix(scene))", ("test_compliant.py::test_gap_scale",)),
-    Mutation("crossover in units of the smaller indentation", "crossover", "jnp.max(scale.delta)", "jnp.min(scale.delta)", ("test_compliant.py::test_offsets_of_gaps_are_in_units_of_the_larger_indentation",)),
+    Mutation("gap scale of a single ball", "gap_scale", "2 / diagonal(delassus_matrix(scene))", "1 / diagonal(delassus_matrix(scene))", ("test_contact_scales.py::test_gap_scale",)),
+    Mutation("crossover in units of the smaller indentation", "crossover", "jnp.max(scale.delta)", "jnp.min(scale.delta)", ("test_contact_scales.py::test_offsets_of_gaps_are_in_units_of_the_larger_indentation",)),
     Mutation("bodies that pass each other are not reported", "_status", "progress.closing < 0", "False & (progress.closing < 0)", ("test_motion_stepped.py::test_bodies_that_pass_each_other_in_a_step_are_reported",)),
     Mutation("an impact at the beginning of its step", "_set_up", "0.5 * h * contacts.rates(free)[:, 0]", "0.0 * h * contacts.rates(free)[:, 0]", ("test_motion_stepped.py::test_an_impact_is_in_the_middle_of_its_step",)),
     Mutation("sign of e_t in time stepping", "_offsets", "e_t[:, None]", "-e_t[:, None]", ("test_motion_stepped.py::test_a_superball_leaves_with_its_slip_reversed",)),
@@ -117,16 +117,16 @@ MUTATIONS = [
     Mutation("degrees of freedom of the F test swapped", "_f_test", "fdtrc(more, freedom, ratio)", "fdtrc(freedom, more, ratio)", ("test_selection.py::test_the_need_of_a_dependence_on_speed_is_tested",)),
     Mutation("moments of inertia of a box with 1/10", "Box.__init__", "(jnp.sum(sizes ** 2) - sizes ** 2) / 12", "(jnp.sum(sizes ** 2) - sizes ** 2) / 10", ("test_bodies.py::test_moments_of_inertia_of_homogeneous_solids",)),
     Mutation("a rod's inertia about its end", "_dimer", "rod * length ** 2 / 12", "rod * length ** 2 / 3", ("test_scenes.py",)),
-    Mutation("sign of the Coriolis terms", "Body.inertial_force", "0.5 * jax.grad(lambda x: v @ momentum(x))(q)", "-0.5 * jax.grad(lambda x: v @ momentum(x))(q)", ("test_bodies.py::test_inertial_forces_keep_the_energy",)),
+    Mutation("sign of the Coriolis terms", "Body.inertial_force", "0.5 * jax.grad(lambda x: v @ momentum(x))(q)", "-0.5 * jax.grad(lambda x: v @ momentum(x))(q)", ("test_bodies_in_motion.py::test_inertial_forces_keep_the_energy",)),
     Mutation("velocities of boxes in the axes of space", "RigidBodies.contact_jacobian", "jnp.swapaxes(self.turns(at), -1, -2)", "self.turns(at)", ("test_bodies.py::test_contacts_of_a_box",)),
     Mutation("small turns twice as large", "RigidBodies.nearby", "[1 - 0.5 * dot(half, half)[:, None], half]", "[1 - 0.5 * dot(half, half)[:, None], 2 * half]", ("test_motion_in_space.py::test_derivatives_at_no_displacement_take_two_terms",)),
     Mutation("time of a hop halved", "_passed", "2 * jnp.abs(p)", "jnp.abs(p)", ("test_motion.py::test_finite_accumulation_is_passed",)),
     Mutation("plastic expansion with e for its square", "_unloading", "e ** 2", "e", ("test_contact_forces.py::test_a_plastic_contact_returns_its_share",)),
     Mutation("contacts of contact forces that always stick", "_with_friction.decided", "left >= jnp.where(let_go, within, 0.0)", "left >= left", ("test_contact_forces.py::test_friction_on_a_slope",)),
-    Mutation("contacts stick together that no forces hold", "_with_friction.decided", "growth <= within", "growth >= 0", ("test_known_faults.py::test_a_block_on_springs_passes_the_flat_position",)),
+    Mutation("contacts stick together that no forces hold", "_with_friction.decided", "growth <= within", "growth >= 0", ("test_known_faults_of_motion.py::test_a_block_on_springs_passes_the_flat_position",)),
     Mutation("a redundant contact does not come to rest with others", "_brought_slow_to_rest.resting", "jnp.abs(left) <= strike.rest", "stopped", ("test_motion_in_space.py::test_derivatives_of_a_thrown_brick_agree_with_differences",)),
     Mutation("sides that overhang do not touch", "polygon_on_polygon", "jnp.where(first, gaps[0], gaps[1])", "gaps[0]", ("test_bodies.py::test_gaps_are_distances",)),
-    Mutation("normals that jump are no events", "MechanicalFlow.projected", "const.active & (jnp.abs(rate) > most * speed)", "const.active & False", ("test_known_faults.py::test_a_corner_that_slides_over_an_edge_takes_no_energy",)),
+    Mutation("normals that jump are no events", "MechanicalFlow.projected", "const.active & (jnp.abs(rate) > most * speed)", "const.active & False", ("test_known_faults_of_motion.py::test_a_corner_that_slides_over_an_edge_takes_no_energy",)),
     Mutation("friction of contact forces pulls", "with_normal_forces", "-size", "size", ("test_contact_forces.py::test_friction_on_a_slope",)),
     Mutation("off-diagonal of a chain's Delassus matrix shifted", "tridiagonal_product", "vector[1:]", "vector[:-1]", ("test_scenes.py::test_chain_is_the_dense_scene",)),
     Mutation("an expansion as slow as a compression", "ImplicitSteps.moved", "jnp.where(expands, square, 1.0)", "1.0", ("test_implicit.py",)),
@@ -140,11 +140,11 @@ MUTATIONS = [
     Mutation("integral of a history without its correction", "_integral", "step ** 2", "0 * step ** 2", ("test_compliant.py::test_history_of_one_ball_on_a_linear_spring",)),
     Mutation("approach is the opening", "_history", "-_integral(seconds, rates, growth)", "_integral(seconds, rates, growth)", ("test_compliant.py::test_history_of_one_ball_on_a_linear_spring",)),
     Mutation("elastic energy of a history doubled", "_history", "0.5 * units.velocity ** 2", "units.velocity ** 2", ("test_compliant.py::test_history_of_one_ball_on_a_linear_spring",)),
-    Mutation("precompression by the printed exponent", "precompression_energy", "1 / eta", "1 / (eta + 1)", ("test_compliant.py::test_precompression_energy",)),
+    Mutation("precompression by the printed exponent", "precompression_energy", "1 / eta", "1 / (eta + 1)", ("test_contact_scales.py::test_precompression_energy",)),
     Mutation("kinetic angles of free bodies", "kinetic_angles", "delassus_matrix(scene)", "delassus_matrix(without_constraints(scene))", ("test_scenes.py::test_kinetic_angles_of_tied_bodies",)),
     Mutation("correlated contacts that keep all they take up", "_correlated", "inputs.restitution ** 2", "inputs.restitution", ("test_systems.py::test_outcomes[correlation]",)),
     Mutation("correlated contacts that separate", "_correlated", "pressed & (at.qn <= rest_of(inputs))", "pressed", ("test_contract.py::test_promises[correlation]", "test_other_laws.py",)),
-    Mutation("ratios up to the arithmetic mean", "interval", "-linear", "linear", ("test_other_laws.py::test_the_interval_ends_where_a_contact_stays_closed",)),
+    Mutation("ratios up to the arithmetic mean", "interval", "-linear", "linear", ("test_impulse_ratios.py::test_the_interval_ends_where_a_contact_stays_closed",)),
     Mutation("coefficients of Routh averaged", "Routh.impulses", "e ** 2", "e", ("test_other_laws.py::test_unequal_coefficients_of_routh_are_one",)),
     Mutation("yielding that is stored", "ContactFlow.normal_constants", "moves & (phase != Phase.YIELD)", "moves", ("test_yielding.py",)),
     Mutation("a force above its bound", "ContactFlow.normal_margins", "self.limit - x", "1.0", ("test_yielding.py",)),
@@ -222,6 +222,12 @@ def places(mutation, folder=ROOT / "jimpact"):
     ]
 
 
+def node_of(test):
+    """The node id of 'file.py::test': the folder is that of the one file of this name."""
+    (path,) = (ROOT / "tests").glob(f"*/{test.partition('::')[0]}")
+    return f"{path.parent.relative_to(ROOT)}/{test}"
+
+
 def run(mutation):
     """Run the tests on a mutated copy: (verdict, seconds, what noticed it)."""
     at = places(mutation)
@@ -239,7 +245,7 @@ def run(mutation):
         (folder / path.relative_to(ROOT)).write_text(text, encoding="utf-8")
         command = [sys.executable, "-m", "pytest", "-p", "no:xdist", "-x", "-q", "--no-header"]
         command += ["-o", "addopts=--import-mode=importlib", "--tb=no", "-rfE"]
-        command += [f"tests/contract/{test}" for test in mutation.tests]
+        command += [node_of(test) for test in mutation.tests]
         environment = os.environ | {"PYTHONPATH": name, "JAX_PLATFORMS": "cpu"}
         options = {"cwd": folder, "env": environment, "capture_output": True, "text": True}
         try:

@@ -172,7 +172,7 @@ def one(make):
     def run(mass, normals, gaps, v, *parameters):
         scene = ji.Scene(mass, normals, gaps=gaps)
         out = ji.impact(make(*parameters), scene, v)
-        return out, ji.audit(scene, v, out)
+        return out, ji.audit(out, scene, v)
 
     return run
 

@@ -32,3 +32,4 @@ from .shapes import (
     SpatialDimer as SpatialDimer,
     Sphere as Sphere,
 )
+from .study import body_of as body_of

@@ -399,9 +399,9 @@ def chart(command: options.ChartCommand, steps: Steps) -> CommandResult:
     laws, _ = registered_laws(shared_parameters(law), QUICK_LAWS)
     quick = [name for name in QUICK_METHODS if CONTENDERS[name].supports(law) is None]
     result = ji.work_precision(
+        law,
         study.scene,
         before,
-        law,
         command.methods or (None if command.full else quick),
         laws=None if command.full else laws,
         batch=command.batch,

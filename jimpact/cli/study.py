@@ -2,17 +2,14 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-import jimpact as ji
 from jimpact.bodies.base import CLOSED_BELOW, Body
+from jimpact.bodies.study import body_of
 from jimpact.cli.study_file import (
     NO_DATA,
-    arguments_of,
-    body_of,
-    check_keys,
-    check_kind,
     check_tables,
     fit_arguments,
     law_of,
@@ -21,35 +18,30 @@ from jimpact.cli.study_file import (
     without_none,
 )
 from jimpact.cli.study_motion import MotionStudy, motion_study_of
-from jimpact.cli.study_track import shots_of_bounces, shots_of_track, track_of
-from jimpact.core.distributions import Distribution, RandomLaw
 from jimpact.core.law import Law, free_parameters_of
 from jimpact.core.scene import Scene, chain
-from jimpact.fits.data import Experiments, read_experiments
 from jimpact.fits.fitting import fit
 from jimpact.fits.parameters import OF_SPEED, default_free
 from jimpact.fits.problem import FitProblem, of_shots
 from jimpact.fits.report import Fit
 from jimpact.fits.search import Search
+from jimpact.shots.data import Experiments, read_experiments
+from jimpact.tools.checks import missing_room
+from jimpact.tools.study_tables import arguments_of, check_keys, check_kind
 
 if TYPE_CHECKING:
     from jimpact.tracks.track import Track
 
-# Keys of the tables, and the arguments that they are: of `chain`, of `Body.scene`, of
-# `read_experiments`, of `monte_carlo`.
+# Rooms that hold the keys of their tables, `jimpact/ROOM/study.py`. One that is left out takes them
+# with it: a study with such a table is refused, all others are read.
+ROOMS = {"track": "tracks", "bounces": "tracks", "monte_carlo": "montecarlo"}
+
+# Keys of the other tables, and the arguments that they are: of `chain`, of `Body.scene`, of
+# `read_experiments`.
 CHAIN = {"masses_kg": "masses", "wall": "wall", "gaps_m": "gaps"}
 CONFIGURATION = {"q": "q", "closed_below_m": "closed_below"}
 DATA = ("file", "momentum_corrected", "near_m", "contacts")
 SHOTS = ("data", "track", "bounces")  # tables of shots, of which a study has one at most
-SAMPLING = {
-    **{"velocity_m_per_s": "velocity", "gaps_m": "gaps", "law": "law", "samples": "samples"},
-    **{"seed": "key", "chunk": "chunk", "bins": "bins"},
-}
-DISTRIBUTIONS: dict[tuple[str, ...], Callable[..., Distribution]] = {
-    ("high", "low"): ji.Uniform,
-    ("mean", "std"): ji.Normal,
-}  # by their keys
-
 AnyStudy = TypeVar("AnyStudy")
 
 
@@ -153,8 +145,7 @@ def read_study(path: str | Path, law: str | None = None) -> Study | MotionStudy:
         ValueError: the file is not TOML; a key is unknown or missing; scene, system, law or data
             refuse a value.
 
-    >>> import jimpact as ji
-    >>> ji.read_study("three_balls.toml").title, ji.read_study("cradle_motion.toml").title
+    >>>     >>> ji.read_study("three_balls.toml").title, ji.read_study("cradle_motion.toml").title
     ('Three equal hard balls, one shot', "Newton's cradle, three balls")
     """
 
@@ -211,7 +202,7 @@ def _impact_study(tables: Mapping[str, Any], path: Path, law_name: str | None) -
         parameters=values,
         options=fitted.options,
         priors=fitted.priors,
-        monte_carlo=_sampling(tables["monte_carlo"], law, scene) if "monte_carlo" in tables else {},
+        monte_carlo=_sampling(tables, law, scene),
         velocities=() if body is None else tuple(body.velocity_names),
         track=track,
     )
@@ -240,10 +231,11 @@ def _shots(
             f"the study must have one table of shots, but has {', '.join(f'[{x}]' for x in given)}."
         )
     if "track" in tables:
-        track = track_of(tables["track"], path)
-        return track, shots_of_track(track, tables["track"], owner)
+        tracks, table = _keys_of("track"), tables["track"]
+        track = tracks.track_of(table, path)
+        return track, tracks.shots_of_track(track, table, owner)
     if "bounces" in tables:
-        return None, shots_of_bounces(tables["bounces"])
+        return None, _keys_of("bounces").shots_of_bounces(tables["bounces"])
     return None, _experiments(tables["data"], path, owner) if "data" in tables else None
 
 
@@ -271,27 +263,17 @@ def _experiments(table: Mapping[str, Any], path: Path, owner: Scene | Body) -> E
     return experiments
 
 
-def _sampling(table: Mapping[str, Any], law: Law, scene: Scene) -> dict[str, Any]:
-    """Arguments of `monte_carlo` from the table [monte_carlo]; tables in it are distributions."""
-    check_keys("[monte_carlo]", table, SAMPLING, ("velocity_m_per_s",))
-    laws = table.get("law", {})
-    if not isinstance(laws, dict):
-        raise ValueError(f"[monte_carlo.law] must be a table, but is {laws!r}.")
-    random = {name: _distribution(f"law.{name}", x) for name, x in laws.items()}
-    sampled = {
-        key: _distribution(key, x) if isinstance(x, dict) else x
-        for key, x in table.items()
-        if key != "law"
-    }
-    drawn = RandomLaw(law, **random) if random else law
-    return {"scene": scene, "law": drawn} | arguments_of(sampled, SAMPLING)
+def _sampling(tables: Mapping[str, Any], law: Law, scene: Scene) -> dict[str, Any]:
+    """Arguments of `monte_carlo` from the table [monte_carlo]; without it none."""
+    if "monte_carlo" not in tables:
+        return {}
+    return _keys_of("monte_carlo").sampling_of(tables["monte_carlo"], law, scene)
 
 
-def _distribution(key: str, table: Any) -> Distribution:
-    """The distribution that a table of a study means."""
-    kind = DISTRIBUTIONS.get(tuple(sorted(table))) if isinstance(table, dict) else None
-    if kind is None:
-        raise ValueError(
-            f"`{key}` in [monte_carlo] must have low and high, or mean and std, but is {table!r}."
-        )
-    return kind(**table)
+def _keys_of(table: str) -> Any:
+    """The module of the room that holds the keys of a table; a ValueError where it is missing."""
+    try:
+        with missing_room(f"[{table}]"):
+            return import_module(f"jimpact.{ROOMS[table]}.study")
+    except ImportError as error:
+        raise ValueError(str(error)) from None

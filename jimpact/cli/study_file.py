@@ -2,7 +2,6 @@
 
 import dataclasses
 import importlib.util
-import inspect
 import sys
 import tomllib
 from collections.abc import Mapping
@@ -12,9 +11,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-import jimpact as ji
-from jimpact import bodies
-from jimpact.bodies.base import Body
 from jimpact.core.law import Law
 from jimpact.core.scene import Scene
 from jimpact.fits.matrices import admissible_start
@@ -24,24 +20,10 @@ from jimpact.fits.search import Search
 from jimpact.laws import REGISTRY
 from jimpact.laws.kinematic import RestitutionMatrix
 from jimpact.tools.checks import check_word, suggestion
+from jimpact.tools.study_tables import check_keys, check_kind
 
 STUDY = "study.toml"  # in a folder that `jimpact new` has made
 NO_DATA = "a study must have shots to be fitted, of [data], [track] or [bounces], but has none."
-# classes of bodies by name, which a study writes in any case
-BODIES = {name: getattr(bodies, name) for name in dir(bodies) if name in dir(ji)}
-# Units of the bodies' arguments, which a study writes behind their names. Words and directions have
-# no unit here, nor have lists of points [m] or of mixed units (`corners` of a Polygon, `planes`,
-# `at`), which the classes document.
-_UNITS = {
-    **dict.fromkeys(("mass", "masses", "sphere_mass", "rod_mass"), "kg"),
-    **dict.fromkeys(
-        ("width", "height", "length", "thickness", "radius", "radii", "gaps", "sizes"), "m"
-    ),
-    **dict.fromkeys(("centre", "rounding"), "m"),
-    "inertia": "kg_m2",
-    "angle": "rad",
-}
-
 
 # -------------------------------------------------------------------------- locating and reading
 
@@ -97,34 +79,6 @@ def _position(error: Exception) -> str:
 
 
 # ------------------------------------------------------------------------------------------- keys
-
-
-def check_keys(where: str, table: Any, allowed: Any, required: tuple[str, ...] = ()) -> None:
-    """Raise a ValueError for unknown or missing keys of a table."""
-    if not isinstance(table, Mapping):
-        raise ValueError(f"{where} must be a table, but is {table!r}.")
-    for key in required:
-        if key not in table:
-            raise ValueError(
-                f"{where} must have the key `{key}`, but has {', '.join(table) or 'none'}."
-            )
-    for key in table:
-        if key not in allowed:
-            raise ValueError(
-                f"{where} may have the keys {', '.join(allowed)}, but has `{key}`."
-                f"{suggestion(key, allowed)}"
-            )
-
-
-def check_kind(where: str, key: str, value: Any, kind: Any, words: str) -> None:
-    """Raise a ValueError unless the value of a key is of a Python type, which `words` name."""
-    if not isinstance(value, kind):
-        raise ValueError(f"`{key}` in {where} must be {words}, but is {value!r}.")
-
-
-def arguments_of(table: Mapping[str, Any], keys: Mapping[str, str]) -> dict[str, Any]:
-    """Values of a table by name of the argument, `keys` mapping its keys to arguments."""
-    return {name: table[key] for key, name in keys.items() if key in table}
 
 
 def check_tables(
@@ -246,38 +200,6 @@ def fit_arguments(options: Mapping[str, Any], search: Search) -> dict[str, Any]:
     check_kind("[fit]", "profiles", own.get("profiles", False), bool, "true or false")
     others = {name: value for name, value in options.items() if name not in own}
     return own | {"search": dataclasses.replace(search, **others)}
-
-
-def body_of(where: str, table: Any, others: tuple[str, ...] = ()) -> Body:
-    """Body that a table of a study describes; `where` is the head of the table, for errors.
-
-    `kind` is the name of a body's class (`Block`, `Box`, `Bodies`, ..., in any case); the other
-    keys are the arguments of that class, with their units behind them: `width_m`, `mass_kg`,
-    `inertia_kg_m2`, `angle_rad`. Bodies of `Bodies` are tables of this kind themselves.
-    `others` are keys of the table that mean something else.
-
-    >>> from jimpact.cli.study_file import body_of
-    >>> body_of("[scene]", {"kind": "Block", "width_m": 0.2, "height_m": 0.6}).names
-    ('x [m]', 'y [m]', 'angle [rad]')
-    """
-    check_keys(where, table, tuple(table), required=("kind",))
-    names = {name.lower(): name for name in sorted(BODIES)}
-    name = names.get(str(table["kind"]).lower(), table["kind"])
-    check_word(f"`kind` in {where}", name, names.values())
-    parameters = inspect.signature(BODIES[name]).parameters
-    # key of the table, with its unit -> argument of the class
-    keys = {f"{key}_{_UNITS[key]}" if key in _UNITS else key: key for key in parameters}
-    required = tuple(
-        x for x, key in keys.items() if parameters[key].default is inspect.Parameter.empty
-    )
-    check_keys(where, table, ("kind", *keys, *others), required)
-    arguments = {key: table[x] for x, key in keys.items() if x in table}
-    for several in {"bodies", "fixed"} & set(arguments):
-        within = f"{where.removesuffix(']')}.{several}]"
-        if not isinstance(arguments[several], list):
-            raise ValueError(f"[{within}] must be tables, each headed by [{within}].")
-        arguments[several] = [body_of(within, part) for part in arguments[several]]
-    return BODIES[name](**arguments)
 
 
 def import_laws(module: str, folder: Path) -> None:

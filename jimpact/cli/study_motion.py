@@ -1,47 +1,21 @@
 """Studies of motions: system, base, law, initial state and data, of a checked TOML file."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from jimpact.bodies.base import STANDARD_GRAVITY
-from jimpact.cli.study_file import (
-    arguments_of,
-    body_of,
-    check_keys,
-    check_kind,
-    check_tables,
-    fit_arguments,
-    law_of,
-    without_none,
-)
+from jimpact.cli.study_file import check_tables, fit_arguments, law_of, without_none
 from jimpact.core.law import Law
 from jimpact.fits.fitting_motion import MOTION_SEARCH, fit_motion
 from jimpact.fits.parameters import default_free
 from jimpact.fits.report import Fit
-from jimpact.fits.shots_file import UNEVEN_STEPS, Positions, read_positions
-from jimpact.motion.methods import METHODS, Method, as_method
 from jimpact.motion.record import Motion
 from jimpact.motion.simulate import simulate
-from jimpact.motion.system import HarmonicBase, System, gravity
-from jimpact.tools.checks import check_choice
-
-GRAVITY = "gravity_m_per_s2"
-# Keys of the tables [motion] and [base], and the arguments that they are: of `simulate`, of a
-# method, of `HarmonicBase`.
-MOTION = {
-    **{"q0": "q0", "v0": "v0", "t_end_s": "t_end", "samples": "samples", "method": "method"},
-    "max_events": "max_events",
-}
-METHOD = {
-    **{"step_s": "step", "closed_below_m": "closed_below", "max_steps": "max_steps"},
-    **{"rtol": "rtol", "slow": "slow"},
-}
-OTHERS = ("t_start_s", "friction")
-BASE = {"amplitude_m": "amplitude", "frequency_hz": "frequency", "phase_rad": "phase"}
-# Names of the directions of a base, by how many a body has.
-_DIRECTIONS = {1: ("vertical",), 2: ("horizontal", "vertical"), 3: ("x", "y", "vertical")}
+from jimpact.motion.study import run_of, system_of
+from jimpact.motion.system import System
+from jimpact.shots.shots_file import UNEVEN_STEPS, Positions, read_positions
+from jimpact.tools.study_tables import check_keys, check_kind
 
 
 @dataclass(frozen=True)
@@ -106,14 +80,11 @@ def motion_study_of(tables: Mapping[str, Any], path: Path, law_name: str | None)
     """
     check_tables(tables, ("system", "law", "motion"), ("base", "fit", "data"))
     law, _, fitted = law_of(tables, law_name, path.parent)
-    check_keys("[motion]", tables["motion"], (*MOTION, *METHOD, *OTHERS), ("q0", "v0", "t_end_s"))
     motion = tables["motion"]
-    arguments = arguments_of(motion, MOTION)
-    arguments["t_end"] = float(motion.get("t_start_s", 0.0)), motion["t_end_s"]
-    arguments["method"] = _method(motion)
+    arguments = run_of(motion)
     return MotionStudy(
         str(tables.get("title", path.stem)),
-        _system(tables["system"], tables.get("base"), motion.get("friction")),
+        system_of(tables["system"], tables.get("base"), motion.get("friction")),
         law,
         arguments=arguments,
         measured=_measured(tables["data"], path) if "data" in tables else None,
@@ -129,39 +100,3 @@ def _measured(table: Mapping[str, Any], study: Path) -> Positions:
     check_keys("[data]", table, ("file",), ("file",))
     check_kind("[data]", "file", table["file"], str, "a path")
     return read_positions(study.parent / table["file"])
-
-
-def _method(motion: Mapping[str, Any]) -> Method:
-    """Method of a motion with its options, from the table [motion]; default: 'events'."""
-    word = motion.get("method", "events")
-    check_choice("method", word, METHODS)
-    known = {field.name for field in fields(METHODS[word])}
-    for key, name in METHOD.items():
-        if key in motion and name not in known:
-            raise ValueError(f"`{key}` in [motion] must be left out for method {word!r}.")
-    return as_method(word, **arguments_of(motion, METHOD))
-
-
-def _system(
-    table: Mapping[str, Any], base: Mapping[str, Any] | None, friction: float | None
-) -> System:
-    """System of a body under its weight, from the table [system], on the base of [base] if any."""
-    body = body_of("[system]", table, (GRAVITY,))
-    acceleration = table.get(GRAVITY, STANDARD_GRAVITY)
-    weight = gravity(body, acceleration) if acceleration else None
-    if base is None:
-        return System(body, potential=weight, friction=friction)
-    check_keys("[base]", base, (*BASE, "direction"), ("amplitude_m", "frequency_hz"))
-    directions = body.base_directions
-    if directions is None:
-        raise ValueError(f"[base] must be left out: a {type(body).__name__} has no base.")
-    names = _DIRECTIONS[directions.shape[1]]
-    direction = base.get("direction", "vertical")
-    if direction not in names:
-        raise ValueError(
-            f"`direction` of a {type(body).__name__} must be {' or '.join(names)}, "
-            f"but is {direction!r}."
-        )
-    motion = HarmonicBase(**arguments_of(base, BASE))
-    column = directions[:, names.index(direction), None]
-    return System(body, potential=weight, base=motion, base_directions=column, friction=friction)

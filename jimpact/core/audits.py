@@ -62,7 +62,7 @@ class Audit(eqx.Module):
 
 
 @full_precision
-def audit(scene: Scene, velocity: Any, out: Impact) -> Audit:
+def audit(out: Impact, scene: Scene, velocity: Any) -> Audit:
     """Check an outcome against what every impact must satisfy, whatever the law.
 
     Equation: closed contacts `gamma+ >= 0` (kinematic), `p >= 0` (kinetic),
@@ -70,23 +70,25 @@ def audit(scene: Scene, velocity: Any, out: Impact) -> Audit:
     bilateral constraints.
 
     Args:
+        out: what `impact` returned, or an `Impact` filled by hand from measurements.
         scene: the scene of the impact.
         velocity: v- (n,) [m/s].
-        out: what `impact` returned, or an `Impact` filled by hand from measurements.
 
     Returns:
         `Audit`: a boolean () for each of the four, `consistent` for all; `print` says it in words.
 
     Raises:
-        ValueError: the number of velocities is not that of coordinates.
+        ValueError: the number of velocities is not that of coordinates. TypeError: arguments in
+            another order.
 
     Source: Brogliato (2016), section 6.2.4.
 
     >>> import jimpact as ji
     >>> scene, v = ji.chain([1.0, 1.0]), [1.0, 0.0]
-    >>> bool(ji.audit(scene, v, ji.impact(ji.Newton(0.5), scene, v)).consistent)
+    >>> bool(ji.audit(ji.impact(ji.Newton(0.5), scene, v), scene, v).consistent)
     True
     """
+    check_kind("scene", scene, Scene, "audit(out, scene, velocity)")
     v = as_velocity(scene, velocity)
     contact = contact_of(scene, v, uses_gaps=True)
     root = jnp.sqrt(diagonal(contact.delassus))
@@ -172,7 +174,7 @@ def summary(out: Impact, scene: Scene, velocity: Any, names: Sequence[str] = ())
     before = float(kinetic_energy(scene, velocity))
     change = float(out.energy_change)
     remaining = (before + change) / before if before else float("nan")
-    broken = audit(scene, velocity, out).broken
+    broken = audit(out, scene, velocity).broken
     words = [f"{name} {'VIOLATED' if name in broken else 'ok'}" for name in CONSISTENCIES]
     reason = nothing_approaches(scene, velocity)
     nothing_happens = reason is not None and not np.asarray(out.impulse).any()

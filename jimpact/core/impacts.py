@@ -151,11 +151,8 @@ def impact(
     )
     if scene.gaps is not None and not law.uses_gaps:
         _warn_of_unused_gaps(law, scene, v)
-    separable = is_separable(law)
-    groups = coupled_groups(scene) if separable else None
-    few = scene.contacts <= SHARED and scene.walls != (True, True) and scene.tangents is None
-    pads = few and groups is None and separable and law.pads_scenes
-    if pads and not is_traced((law, scene, v, given)) and is_top_level_call():
+    groups = coupled_groups(scene) if is_separable(law) else None
+    if groups is None and _shares_a_program(law, scene, v, given):
         return _impact_of_padded_scene(law, scene, v, given)
     with naming_the_adjoint():
         return _impact(law, scene, v, groups, given, Traced.of(law, scene, v, given))
@@ -245,6 +242,19 @@ class Traced(NamedTuple):
             allowed.append((given.rtol >= precision(v.dtype).noise) & (given.rtol <= 1))
         code = jnp.where(jnp.all(jnp.asarray(allowed)), CODE["ok"], CODE["out_of_range"])
         return jnp.where(jnp.any(jnp.asarray(unknown, bool)), CODE["not_finite"], code)
+
+
+def _shares_a_program(law: Law, scene: Scene, v: jax.Array, given: _Given) -> bool:
+    """Whether an impact runs by the program for SHARED contacts, so that it need not be compiled.
+
+    The law allows it, the scene has at most that many contacts, no friction and not two walls, and
+    nothing is traced or inside another program: what surrounds an impact sees its true sizes.
+    """
+    allowed = is_separable(law) and law.pads_scenes
+    plain = scene.walls != (True, True) and scene.tangents is None
+    if not allowed or not plain or scene.contacts > SHARED:
+        return False
+    return not is_traced((law, scene, v, given)) and is_top_level_call()
 
 
 def _impact_of_padded_scene(law: Law, scene: Scene, v: jax.Array, given: _Given) -> Impact:

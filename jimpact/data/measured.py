@@ -8,8 +8,8 @@ import numpy as np
 
 from jimpact.bodies.shapes import Block, Box
 from jimpact.core.scene import Scene
-from jimpact.fits.data import Experiments, read_experiments
-from jimpact.fits.shots_file import read_shots
+from jimpact.shots.data import Experiments, read_experiments
+from jimpact.shots.shots_file import read_shots
 
 _DATA = files("jimpact") / "data"
 ELLIPSE_AXES = 0.035, 0.025  # m, half of each, of the measured ellipse

@@ -13,7 +13,7 @@ Shapes stand in the signatures, `Float[Array, "m B"]`, with these names of axes:
     s      samples of a history, in the first axis
 
 `1` is one row for all contacts; `...` and `*B` are any number of axes, also none; `#` allows an
-axis of length 1 in the place of a longer one. `tests/contract/test_shapes.py` checks them.
+axis of length 1 in the place of a longer one. `tests/rules/test_shapes.py` checks them.
 """
 
 import lazy_loader

@@ -13,7 +13,6 @@ from scipy.sparse import block_diag, coo_array
 from scipy.special import chdtrc, fdtrc
 
 from jimpact.core.law import free_parameters_of
-from jimpact.fits.data import ROUNDING, kept_by_corrections
 from jimpact.fits.data_checks import DATA_CHECKS, LISTED, DataBalances
 from jimpact.fits.findings import Finding, findings
 from jimpact.fits.matrices import boundary, encloses
@@ -23,6 +22,7 @@ from jimpact.fits.search import MEDIAN, Solution
 from jimpact.fits.solve import RANK_TOLERANCE
 from jimpact.fits.uncertainty import uncertainty
 from jimpact.laws.kinematic import RestitutionMatrix
+from jimpact.shots.data import ROUNDING, kept_by_corrections
 from jimpact.tools.records import counted, degrees, listed
 from jimpact.tools.status import STATUS
 

@@ -7,9 +7,9 @@ import numpy as np
 from scipy.special import ndtri, stdtr, stdtrit
 
 from jimpact.core.scene import Scene, dense_mass
-from jimpact.fits.covariances import diagonal_blocks
-from jimpact.fits.data import ROUNDING, Experiments, closed_normals, possible_normals
 from jimpact.fits.findings import Finding
+from jimpact.shots.covariances import diagonal_blocks
+from jimpact.shots.data import ROUNDING, Experiments, closed_normals, possible_normals
 from jimpact.tools.records import listed
 
 # ------------------------------------------------------------------ thresholds of the data

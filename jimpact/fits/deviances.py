@@ -28,7 +28,6 @@ _STOP, PASSES, NEAR = 1e-4, 16, 1e-6
 # limit's, each further one is GROWTH times as far from its neighbour.
 STEP, GROWTH = 0.4, 1.5
 FIRST_SHARE = 1 / 16  # of what can be reached: the first value where the error is infinite
-SAME = 1e-6  # relative sums of squares that are equal
 # Share of the root of the limit, or of the values inside, to which an end is searched for.
 END = 1e-3
 ROUNDS = 8  # of the search for an end: it is then right to a millionth of a step, mostly
@@ -78,6 +77,8 @@ class Deviances:
 
     Attributes:
         limit: deviance at the end of the interval, or of the region.
+        same: relative difference up to which sums of squares are equal: what impacts are good to.
+            Ten times less: profiles find lower minima in rounding.
         variance: s^2 of the noise.
         error: (P,) standard errors in the solver's scale.
         starts: minima that searches start from, the best one first.
@@ -88,6 +89,7 @@ class Deviances:
     def __init__(self, fit: Estimate[Any], limit: float, show: Show):
         """Start from the minima of the fit; `limit` is a deviance, `show` displays progress."""
         self.fit, self.problem, self.limit, self.show = fit, fit.problem, limit, show
+        self.same = RANK_TOLERANCE[self.problem.precision]
         has_noise = np.isfinite(fit.noise) and fit.noise > 0
         # of an exact fit: that of rounding
         self.variance = float(fit.noise**2) if has_noise else self.problem.exact_squares
@@ -142,7 +144,7 @@ class Deviances:
 
     def _is_below(self, squares: float, other: float) -> bool:
         """True if a sum of squares is less than another one by more than rounding."""
-        return bool(squares < other * (1 - SAME) - self.problem.exact_squares)
+        return bool(squares < other * (1 - self.same) - self.problem.exact_squares)
 
     def of(self, squares: float) -> float:
         """The deviance `(S - S_best) / s^2` of a sum of squares, at least 0."""
@@ -185,7 +187,7 @@ class Deviances:
             trials, waiting = list(waiting), {}
             for (g, cell, branch), squares, y in zip(trials, ends.squares.tolist(), ends.y):
                 cells = minima[g]
-                if cell in cells and not squares < (1 - SAME) * cells[cell].squares:
+                if cell in cells and not squares < (1 - self.same) * cells[cell].squares:
                     continue  # not lower than from another start
                 cells[cell] = Lowest(squares, y, branch)
                 if self.of(squares) > self.limit:  # no further in this direction

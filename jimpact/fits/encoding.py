@@ -14,6 +14,7 @@ import numpy as np
 import jimpact
 from jimpact.core.law import StaticNumber, StaticNumbers
 from jimpact.core.scene import PairNormals
+from jimpact.fits.errors_before import ErrorsBefore
 from jimpact.fits.findings import Finding
 from jimpact.fits.intervals import Profile
 from jimpact.fits.matrices import AdmissibleMatrices
@@ -32,12 +33,22 @@ _PACKAGES = ("jimpact", "jax", "jaxlib", "equinox", "numpy", "scipy")
 _KINDS: dict[str, Any] = {
     kind.__name__: kind for kind in (StaticNumber, StaticNumbers, float, np.float64, tuple, list)
 } | {"Prior": Prior._make}
-_LATER = {"covariance", "curve"}  # that files of format 1 may lack: they had no such thing
+# Fields that files of earlier builds may lack. Their fits with errors of v- hold these errors as
+# they were passed on, which `before` = None keeps: profiles belong to what was minimized then.
+_LATER = {"covariance", "curve", "pre", "before"}
 # classes of a fit that have no public name, by their own
 _PARTS = {
     kind.__name__: kind
     for kind in (
-        *(AdmissibleMatrices, Finding, FitMinimum, FitProblem, LawInMotion, LawInScene),
+        *(
+            AdmissibleMatrices,
+            ErrorsBefore,
+            Finding,
+            FitMinimum,
+            FitProblem,
+            LawInMotion,
+            LawInScene,
+        ),
         *(Measurement, Neighbours, PairNormals, Parameters, Profile, Shots, Solution),
         *(Uncertainty, Variables),
     )
@@ -126,7 +137,7 @@ def grouped(fields: dict[str, Any], parts: Mapping[str, Any]) -> dict[str, Any]:
     """
     others, groups = dict(fields), {}
     for name, part in parts.items():
-        of_part = {key: others.pop(key) for key in _saved_fields(part)}
+        of_part = {key: others.pop(key) for key in _saved_fields(part) if key in others}
         groups[name] = {"class": part.__name__, "fields": of_part}
     return others | groups
 

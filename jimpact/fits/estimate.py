@@ -1,17 +1,20 @@
 """Parameters where a search has ended, with the errors of a linearized law."""
 
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
+import jax
 import numpy as np
 from scipy.special import ndtri, stdtrit
 
 from jimpact.core.law import AnyLaw
-from jimpact.fits.data import Experiments
 from jimpact.fits.intervals import check_level, joined
 from jimpact.fits.problem import FitProblem
 from jimpact.fits.search import FitMinimum, Solution
 from jimpact.fits.uncertainty import Uncertainty
+from jimpact.shots.data import Experiments
 
 # Relative standard error of a stiffness beyond which its linearized interval is not believed.
 HARDLY_SEEN = 0.2
@@ -19,6 +22,24 @@ LEVEL = 0.95  # of confidence intervals, where none is asked for
 
 
 Value = TypeVar("Value")
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def in_own_precision(function: Function) -> Function:
+    """A function of a fit, computed in the precision in which the fit was made.
+
+    JAX's precision may have changed since: what is computed later belongs to the fit all the same.
+    """
+
+    @functools.wraps(function)
+    def computed(fit: Any, *arguments: Any, **options: Any) -> Any:
+        """The function, of the fit and its other arguments; of no fit in JAX's own precision."""
+        if not isinstance(fit, Estimate):
+            return function(fit, *arguments, **options)
+        with jax.enable_x64(fit.problem.precision == "float64"):
+            return function(fit, *arguments, **options)
+
+    return computed  # type: ignore[return-value]
 
 
 class OfField(Generic[Value]):
@@ -60,6 +81,7 @@ class Estimate(Generic[AnyLaw]):
     predicted = OfField[np.ndarray]("search")
     status = OfField[np.ndarray]("search")
     slopes = OfField[np.ndarray | None]("search")
+    pre = OfField[np.ndarray | None]("search")
     converged = OfField[bool]("search")
     stuck = OfField[bool]("search")
     at_bound = OfField[np.ndarray]("search")

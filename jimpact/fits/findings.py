@@ -29,6 +29,7 @@ KINDS = {
     "matrix_edge": "a restitution matrix ends at the edge of the admissible ones",
     "matrix_free": "nothing keeps a restitution matrix consistent",
     # of the errors
+    "bent": "the law bends within the errors of v-",
     "mixed_units": "m/s and rad/s without sigma",
     "unknown_errors": "the data do not show their noise",
     "single_precision": "computed in float32",

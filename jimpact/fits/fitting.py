@@ -13,8 +13,8 @@ import numpy as np
 from jimpact.core.law import AnyLaw
 from jimpact.core.scene import Scene
 from jimpact.fits.checks import Judged, unusable
-from jimpact.fits.data import Experiments
 from jimpact.fits.data_checks import wrong_unit
+from jimpact.fits.estimate import in_own_precision
 from jimpact.fits.intervals import check_level
 from jimpact.fits.observables import COARSE_RTOL
 from jimpact.fits.parameters import DEFAULT_FREE
@@ -27,8 +27,8 @@ from jimpact.fits.search import (
     Solution,
     find_minima,
     robust_minimum,
-    settled,
     solution_of,
+    solved,
     start_points,
 )
 from jimpact.fits.solve import (
@@ -40,6 +40,7 @@ from jimpact.fits.solve import (
     step_limit,
 )
 from jimpact.fits.uncertainty import uncertainty
+from jimpact.shots.data import Experiments
 from jimpact.tools.checks import as_whole, check_kind
 from jimpact.tools.progress import progress_bar
 from jimpact.tools.records import listed
@@ -62,8 +63,10 @@ def fit(
     """Fit parameters of a law to measured velocities by weighted least squares.
 
     Equation: minimize `sum ((v+(law) - v+ measured) / sigma)^2` over the measured values, and, with
-    priors, `+ sum ((x - mean) / std)^2`. With `sigma_pre` the errors of v- are added to those of v+
-    by `dv+/dv-` at the first minimum; `search.loss` may take the place of the square.
+    priors, `+ sum ((x - mean) / std)^2`. With errors of v- (`sigma_pre`, `covariance`) it is the
+    joint misfit of v- and v+, and the true v- of each shot are searched for with the parameters
+    (errors in both variables): they do not bias them. `search.loss` may take the place of the
+    square.
 
     Args:
         law: the law to fit; its parameters are the start values. All contacts share one value of
@@ -148,13 +151,7 @@ def fit(
             problem = _without(problem, lost)
             solution = find_minima(problem, starts, seed, solver)
         _check_derivatives(problem, solution)
-        if solution.slopes is not None:  # dv+/dv-: errors of v- count, and all minima move a little
-            values = np.array([minimum.value for minimum in solution.starts])
-            points = problem.variables.point(values)
-            problem = problem.with_errors_before(solution.slopes)
-            (problem,), ends = settled([problem], points, solver)
-            counts = np.array([minimum.count for minimum in solution.starts])
-            solution = solution_of(problem, ends, counts, solution.lost_starts)
+        problem = problem.with_errors_before(solution.slopes)
         robust = None
         if search.loss != "squares":
             problem, solution, robust = robust_minimum(problem, solution, search.loss, solver)
@@ -277,7 +274,7 @@ def fit_many(
     first = of_shots(law, scene, many[0], *choice)
     # problems of other shots follow from the first one, but where more depends on the data:
     # scenes, errors of v-, and the coarse tolerance that their noise allows
-    follow = scene is not None and first.measurement.mixing is None
+    follow = scene is not None and first.before is None
     follow &= getattr(first.law, "rtol", None) != COARSE_RTOL
     problems = [first]
     for data in many[1:]:
@@ -292,13 +289,18 @@ def fit_many(
             points = start_points(first, starts, np.random.default_rng(seed))
             points = np.tile(points, (len(members), 1))
             group = [problems[k] for k in members]
-            settled_problems, ends = settled(group, points, solver, FINE_OF_MANY)
-            for i, (k, problem) in enumerate(zip(members, settled_problems)):
+            solved_problems, ends = solved(group, points, solver, FINE_OF_MANY)
+            for i, (k, problem) in enumerate(zip(members, solved_problems)):
                 each[k] = ends.rows(slice(i * starts, (i + 1) * starts))
                 problems[k] = problem
 
     @functools.cache
     def made(k: int) -> Fit[AnyLaw]:
+        """The `Fit` of data set k, in the precision of its problem."""
+        with jax.enable_x64(problems[k].precision == "float64"):
+            return made_now(k)
+
+    def made_now(k: int) -> Fit[AnyLaw]:
         """The `Fit` of data set k; if it has unusable shots, fitted anew without these."""
         solution = solution_of(problems[k], each[k])
         search = Search(seed=seed, max_steps=max_steps, progress=False)
@@ -363,6 +365,7 @@ class Refits:
         return np.quantile(self.value, [0.5 - 0.5 * level, 0.5 + 0.5 * level], axis=0).T
 
 
+@in_own_precision
 def bootstrap(
     fit: Fit,
     samples: int = 200,
@@ -373,8 +376,8 @@ def bootstrap(
 ) -> Refits:
     """Fits to data that the fitted law made, with the noise of the fit (parametric bootstrap).
 
-    Equation: `v+* = v+(law) + sigma z`, z standard normal; sigma as stated, else `fit.noise`;
-    errors of v- are passed on by the law.
+    Equation: `v+* = v+(law) + sigma z`, z standard normal; sigma as stated, else `fit.noise`. With
+    errors of v-, v- and v+ are drawn around the true v- of the fit, and v+ of the law there.
 
     Args:
         fit: with a known noise.
@@ -403,9 +406,14 @@ def bootstrap(
     if not np.isfinite(fit.noise):
         raise ValueError("Argument `fit` must have a known noise, but its noise is not finite.")
     problem = fit.problem
-    z = np.random.default_rng(seed).normal(size=(samples, *fit.predicted.shape))
-    errors = problem.measurement.errors_of(fit.noise * np.moveaxis(z, 0, -1))
-    measured = fit.predicted + np.moveaxis(errors, -1, 0)
+    rng = np.random.default_rng(seed)
+    if problem.before is not None:
+        measured, before = _measured_again(fit, samples, rng)
+    else:
+        z = rng.normal(size=(samples, *fit.predicted.shape))
+        errors = problem.measurement.errors_of(fit.noise * np.moveaxis(z, 0, -1))
+        measured = fit.predicted + np.moveaxis(errors, -1, 0)
+        before = [None] * samples
     # means of priors are drawn, too, as if they had been measured again
     means = np.tile(problem.prior_mean, (samples, 1))
     z = np.random.default_rng((seed, 1)).normal(size=(samples, len(problem.priors)))
@@ -413,11 +421,25 @@ def bootstrap(
         i = prior.parameter
         means[:, i] = fit.value[i] + fit.noise * prior.std * drawn
     dtype = problem.dtype
-    pairs = zip(measured.astype(dtype), means)
-    resampled = [problem.measured_again(values, mean) for values, mean in pairs]
+    drawn = zip(measured.astype(dtype), means, before)
+    resampled = [problem.measured_again(*values) for values in drawn]
     return _refits(fit, resampled, workers, progress)
 
 
+def _measured_again(fit: Fit, samples: int, rng: np.random.Generator) -> tuple[Any, Any]:
+    """v+ and v- (B, K, n) of shots measured again, at the true v- of the fit."""
+    problem = fit.problem
+    assert problem.before is not None
+    assert fit.search.pre is not None
+    assert fit.slopes is not None
+    shift = np.einsum("kij,kj->ki", fit.slopes, problem.velocities_before - fit.search.pre)
+    before, after = problem.before.drawn(rng, (samples, *fit.search.pre.shape))
+    pre = fit.search.pre + fit.noise * before
+    post = problem.before.corrected(pre, fit.predicted - shift + fit.noise * after)
+    return np.where(problem.measurement.is_measured, post, np.nan), pre
+
+
+@in_own_precision
 def leave_one_out(fit: Fit, *, workers: int | None = None, progress: float | None = None) -> Refits:
     """A fit without each of the K shots in turn; `predicted` (K, n) is of the shot left out.
 
@@ -458,6 +480,6 @@ def _refits(
     points = np.tile(fit.problem.variables.point(fit.value), (len(problems), 1))
     with progress_bar(progress) as show:
         solver = Solver(show=show, workers=workers)
-        _, ends = settled(problems, points, solver, FINE_OF_MANY)
+        _, ends = solved(problems, points, solver, FINE_OF_MANY)
     predicted = ends.predicted[:, : len(fit.predicted)] if fit.predicted.ndim else ends.predicted
     return Refits(fit.names, fit.problem.values_at(ends.y), predicted, ends.converged)

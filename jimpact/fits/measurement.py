@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jimpact.fits.covariances import whitening
 from jimpact.fits.observables import Prediction
 from jimpact.fits.solve import AnyArray
+from jimpact.shots.covariances import whitening
 from jimpact.tools.compiling import full_precision
 
 # A trial whose outcome is meaningless gets a residual far above any honest one, so that a solver
@@ -61,15 +61,19 @@ class Measurement:
         """True where a value was measured."""
         return np.asarray(~np.isnan(self.value))
 
-    def residual(self, prediction: Prediction) -> Float[Array, " R"]:
-        """`L (predicted - value) / sigma` of R values; 0 where no value was measured.
+    def error(self, prediction: Prediction) -> Float[Array, "*value"]:
+        """`predicted - value`; 0 where no value was measured.
 
         Where the prediction is meaningless, it is off by `PENALTY` times the largest value.
         """
         bad = jnp.broadcast_to(prediction.bad, self.value.shape)
         error = jnp.where(bad, 0.0, prediction.value) - jnp.where(bad, 0.0, self.value)
         error = jnp.where(bad, PENALTY * self.unit, error)
-        error = jnp.where(self.weight > 0, error, 0.0)  # its derivatives may be NaN
+        return jnp.where(self.weight > 0, error, 0.0)  # its derivatives may be NaN
+
+    def residual(self, prediction: Prediction) -> Float[Array, " R"]:
+        """`L error / sigma` of R values, with `error` as above."""
+        error = self.error(prediction)
         return _mixed(error * self.weight, self.mixing, jnp).reshape(-1)
 
     def weighed(self, factor: Float[np.ndarray, "*value"]) -> "Measurement":

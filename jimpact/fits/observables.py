@@ -14,8 +14,8 @@ from jimpact.core.contact import contact_of
 from jimpact.core.impacts import impact
 from jimpact.core.law import AnyLaw, Law
 from jimpact.core.scene import Scene
-from jimpact.fits.data import Experiments
 from jimpact.fits.parameters import placed
+from jimpact.shots.data import Experiments
 from jimpact.tools.status import CODE, sign_tolerance
 
 # Outcomes whose velocities are meaningless.

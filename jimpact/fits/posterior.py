@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact.core.distributions import Normal, Uniform
+from jimpact.fits.estimate import in_own_precision
 from jimpact.fits.parameters import mean_and_std
 from jimpact.fits.problem import FitProblem
 from jimpact.fits.report import Fit, check_squares
@@ -25,6 +26,7 @@ _FREE = "z"  # what is sampled in the place of an admissible matrix
 MIXED = 1.05  # r-hat above which chains disagree about where the posterior is
 
 
+@in_own_precision
 def posterior(
     fit: Fit | FitProblem,
     priors: Mapping[str, Any] | None = None,

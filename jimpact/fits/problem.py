@@ -18,8 +18,7 @@ import numpy as np
 
 from jimpact.core.law import Law, entries, forward_only, with_entries
 from jimpact.core.scene import Scene, dense_mass, stackable
-from jimpact.fits.data import Experiments
-from jimpact.fits.errors_before import covariance_after
+from jimpact.fits.errors_before import ErrorsBefore
 from jimpact.fits.matrices import AdmissibleMatrices, matrix_region
 from jimpact.fits.measurement import Measurement
 from jimpact.fits.observables import (
@@ -45,7 +44,10 @@ from jimpact.fits.parameters import (
     with_parts_of_scene,
 )
 from jimpact.fits.solve import EXACT, Ends, LeastSquares, Solver, minimize
+from jimpact.fits.true_velocities import LawAtShots, law_at_shots
 from jimpact.fits.variables import Variables
+from jimpact.numerics.derive import without_derivatives
+from jimpact.shots.data import Experiments
 from jimpact.tools.checks import (
     as_float_array,
     check_concrete,
@@ -58,6 +60,10 @@ from jimpact.tools.compiling import full_precision
 
 # Programs of up to so many shots (or values in a row) are shared by all numbers of starts.
 FEW = 64
+
+ONLY_FIRST = (
+    "A fit with errors of v- must be differentiated once only: its derivatives hold the true v-."
+)
 
 _STATIC = {"static": True}  # fields that are no arrays for JAX
 # ... and what a compiled function does not get: it would be compiled anew for each value
@@ -78,10 +84,12 @@ class FitProblem:
     (P, 2) and `names` say where to begin, how far x may go, and what it means. `fit(problem)` does
     all that `fit` does. Each of the `priors` adds a value to the residual, `(x_i - mean) / std`.
 
-    Errors S of v- are passed on: with `J = dv+/dv-` of the law, those of a shot have the covariance
-    `C = diag(sigma^2) + J S J^T`, and its residual is multiplied by the inverse of the Cholesky
-    factor of C (J of the start; `fit` takes J of the law it finds). Of shots whose momentum was
-    corrected, `post - K m (post - pre)`, the residual has `(I - K m) J` in the place of J.
+    Errors of v- make the true v- of each shot, a, a nuisance that is projected out (see
+    `errors_before`): with S the covariance of (v-, v+), J = dv+/dv- of the law at a and
+    `A = [-J, I]`, the residual is `F^-1 (v+(a) + J (v- - a) - v+ measured)`, `F F^T = A S A^T`. Its
+    derivatives are those of Gauss-Newton, at fixed a and F: the gradient of its sum of squares is
+    exact, and second derivatives raise a NotImplementedError. Of shots whose momentum was
+    corrected, `post - K m (post - pre)`, A is `(I - K m) [-J, I]`.
 
     Make one with `from_shots` or `from_observable`. Solvers work on y, x in natural scales; arrays
     of parameters are as long as there are entries in the fitted fields, Q, of which the first P
@@ -92,6 +100,8 @@ class FitProblem:
         observe: law -> `Prediction`.
         variables: the parameters as a solver sees them.
         measurement: what was measured, and its errors.
+        before: errors of (v-, v+) where those of v- count, or None; `measurement` then has the
+            errors of v+ for one J: of the start, or where a fit has ended.
         matrix: the part of the box in which a restitution matrix is admissible, or None.
         prior_mean, prior_weight: (Q,) of the parameters; weight 1 / std, 0 without a prior.
         fields: that hold the entries.
@@ -128,6 +138,7 @@ class FitProblem:
     experiments: Experiments | None = field(default=None, metadata=_STATIC)
     scene: Scene | None = field(default=None, metadata=_STATIC)
     left_out: tuple[str, ...] = field(default=(), metadata=_STATIC)
+    before: ErrorsBefore | None = None
 
     # ------------------------------------------------------------------ how problems are made
 
@@ -151,10 +162,10 @@ class FitProblem:
             free, bounds, priors, ties: as in `fit`.
         """
         problem = of_shots(law, scene, experiments, free, bounds, priors, ties)
-        if problem.measurement.mixing is None:
+        if problem.before is None:
             return problem
         slopes = outcome_at(problem, problem.start).slopes
-        assert slopes is not None  # as errors are correlated by `mixing`
+        assert slopes is not None  # as errors of v- count
         return problem.with_errors_before(slopes[0])
 
     @classmethod
@@ -230,39 +241,92 @@ class FitProblem:
         observe, _, measurement = _measured_shots(data, scene)
         observe, measurement = _in(self.dtype, (observe, measurement))
         return replace(
-            self, observe=observe, measurement=measurement, experiments=data, scene=scene
+            self,
+            observe=observe,
+            measurement=measurement,
+            before=None,
+            experiments=data,
+            scene=scene,
         )
 
     def weighed(self, factor: np.ndarray) -> "FitProblem":
         """The problem with the residuals multiplied by factors.
 
         Args:
-            factor: shaped like `measured`; 0 leaves a value out.
+            factor: shaped like `measured`; 0 leaves a value out. With errors of v-, 0 or 1.
         """
         return replace(self, measurement=_in(self.dtype, self.measurement.weighed(factor)))
 
-    def measured_again(self, measured: np.ndarray, prior_mean: np.ndarray) -> "FitProblem":
+    def measured_again(
+        self, measured: np.ndarray, prior_mean: np.ndarray, pre: np.ndarray | None = None
+    ) -> "FitProblem":
         """The problem with other measured values of the same errors, and other means of priors.
 
         Args:
             measured: shaped like that of the problem.
             prior_mean: (Q,).
+            pre: v- (K, n); None: they stay.
         """
         measurement = replace(self.measurement, value=measured)
-        return replace(self, measurement=measurement, prior_mean=prior_mean)
+        again = replace(self, measurement=measurement, prior_mean=prior_mean)
+        return again if pre is None else again.with_velocities_before(pre)
 
-    def with_errors_before(self, slopes: np.ndarray | None) -> "FitProblem":
-        """The problem with the errors of v-, if there are any, passed on to v+.
+    def with_velocities_before(self, pre: np.ndarray) -> "FitProblem":
+        """The problem of shots with other v-.
 
         Args:
-            slopes: `dv+/dv-` of the shots (K or more, n, n); None: nothing changes.
+            pre: v- (K, n).
         """
-        data = self.experiments
-        if slopes is None or data is None or data.sigma_pre is None:
+        assert isinstance(self.observe, Shots)
+        velocities = np.array(self.observe.pre)
+        velocities[:, : pre.shape[1]] = pre
+        return self.with_velocities(velocities)
+
+    def with_velocities(self, pre: Any) -> "FitProblem":
+        """The problem of shots with other v- of all coordinates.
+
+        Args:
+            pre: v- (K, N), of the coordinates that made scenes alike, too.
+        """
+        observe = eqx.tree_at(lambda shots: shots.pre, self.observe, pre)
+        return replace(self, observe=observe)
+
+    def with_errors_before(self, slopes: np.ndarray | None) -> "FitProblem":
+        """The problem whose `measurement` has the errors of v+ with those of v- passed on.
+
+        Args:
+            slopes: `J = dv+/dv-` of the shots (K or more, n, n); None: nothing changes.
+        """
+        if slopes is None or self.before is None:
             return self
-        covariance = covariance_after(data, self.scene, slopes)
+        covariance = self.before.covariance_after(np.asarray(slopes[: len(self.measured)], float))
         changed = self.measurement.with_covariance(covariance)
         return replace(self, measurement=_in(self.dtype, changed))
+
+    def held(self, pre: np.ndarray, slopes: np.ndarray) -> "FitProblem":
+        """The problem with the true v- held, as one without errors of v-.
+
+        Equation: v+ measured less `J (v- - a)` is compared with the law at a; the errors stay.
+
+        Args:
+            pre: a (K, n).
+            slopes: J (K, n, n) at a.
+        """
+        shift = np.einsum("kij,kj->ki", slopes, self.velocities_before - pre)
+        measurement = replace(self.measurement, value=self.measured - shift)
+        held = replace(self, measurement=measurement, before=None)
+        return held.with_velocities_before(pre)
+
+    @property
+    def velocities_before(self) -> np.ndarray:
+        """Measured v- (K, n)."""
+        assert isinstance(self.observe, Shots)
+        return np.asarray(self.observe.pre, float)[:, : self.observe.bodies]
+
+    def without_host(self) -> "FitProblem":
+        """The problem without what only the host needs."""
+        measurement = replace(self.measurement, sigma=None)  # its weights have it
+        return replace(self, **_ONLY_ON_HOST, measurement=measurement)
 
     def for_compiled(self) -> "FitProblem":
         """The problem as an argument of compiled functions, which serve many problems.
@@ -270,14 +334,16 @@ class FitProblem:
         What only the host needs is None. The number of shots is raised to `filled_count` by copies
         of the last one, of no weight.
         """
-        measurement = replace(self.measurement, sigma=None)  # its weights have it
-        bare = replace(self, **_ONLY_ON_HOST, measurement=measurement)
+        bare = self.without_host()
         if not isinstance(self.observe, Shots):
             return bare
         count = len(self.measured)
         shots = np.minimum(np.arange(filled_count(count)), count - 1)
         observe = jax.tree.map(lambda x: np.asarray(x)[shots], self.observe)
-        return replace(bare, observe=observe, measurement=bare.measurement.filled(shots))
+        before = None if self.before is None else self.before.filled(shots)
+        return replace(
+            bare, observe=observe, measurement=bare.measurement.filled(shots), before=before
+        )
 
     def least_squares(self) -> LeastSquares:
         """The problem as solvers need it: residual, box and projection in the variables y (Q,)."""
@@ -285,10 +351,10 @@ class FitProblem:
         shape, q, dtype = bare.measured.shape, len(low), low.dtype
         is_table = isinstance(self.observe, Shots) or self.measured.ndim == 2
         statuses = shape[0] if isinstance(self.observe, Shots) else 1
-        # zeros shaped like predictions, status codes, and dv+/dv- of each shot
+        # zeros shaped like predictions and status codes, then dv+/dv- and true v- of each shot
         outcomes: Any = (np.zeros(shape, dtype), np.zeros(statuses, np.int32))
-        if bare.measurement.mixing is not None:
-            outcomes += (np.zeros((*shape, shape[-1]), dtype),)
+        if bare.before is not None:
+            outcomes += (np.zeros((*shape, shape[-1]), dtype), np.zeros(shape, dtype))
         residual = np.zeros(math.prod(shape) + q, dtype)
         project = None
         if self.matrix is not None:
@@ -345,8 +411,34 @@ class FitProblem:
 
     def _of_data(self, x: Any) -> jax.Array:
         """The residual of what was measured."""
-        residual = self.measurement.residual(self.observe(self.law_in_scene(x)))
-        return residual[np.flatnonzero(self.measurement.is_measured)]
+        measured = np.flatnonzero(self.measurement.is_measured)
+        if self.before is not None:
+            return self._projected(jnp.asarray(x, self.dtype))[measured]
+        return self.measurement.residual(self.observe(self.law_in_scene(x)))[measured]
+
+    @full_precision
+    def _projected(self, x: jax.Array) -> jax.Array:
+        """The residual from which the true v- are projected out; only its first derivatives."""
+
+        @jax.custom_jvp
+        def residual(x: jax.Array) -> jax.Array:
+            """At parameters x (P,)."""
+            return self._law_at_shots(self.law_in_scene, x).residual.reshape(-1)
+
+        @residual.defjvp
+        def _rule(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
+            """The residual and `jacobian dx`; a second derivative raises."""
+            x = without_derivatives(primals[0], NotImplementedError(ONLY_FIRST))
+            law = self._law_at_shots(self.law_in_scene, x)
+            return law.residual.reshape(-1), (law.jacobian @ tangents[0]).reshape(-1)
+
+        return residual(x)
+
+    def _law_at_shots(self, law_of: Callable[[jax.Array], Law], x: jax.Array) -> LawAtShots:
+        """The law linearized at the true v- that agree best with it and the data."""
+        assert isinstance(self.observe, Shots)
+        assert self.before is not None
+        return law_at_shots(law_of, x, self.observe, self.measurement, self.before)
 
     def jacobian(self, x: Any) -> jax.Array:
         """(R, P) derivatives of `residual` at x (P,), by forward mode."""
@@ -372,7 +464,9 @@ class FitProblem:
         That of the priors is not in it.
 
         Equation: `-|r|^2 / 2 - sum log(sigma sqrt(2 pi))`; where sigma is unknown, it is integrated
-        over `d sigma / sigma`: `-R log |r|`, up to a constant.
+        over `d sigma / sigma`: `-R log |r|`, up to a constant. With errors of v- the true v- are
+        the most probable ones, and the sum is that of the start: were it that of x, it would draw
+        a restitution down as errors of v- that are left out do.
         """
         squares = jnp.sum(self._of_data(x) ** 2)
         if self.sigma is None:
@@ -384,40 +478,52 @@ class FitProblem:
     def evaluate(self, y: jax.Array) -> tuple[jax.Array, jax.Array, Any]:
         """At y (Q,): residual (R + Q,) over `size`, Jacobian (R + Q, Q), (values, status).
 
-        The last Q are those of the priors. Where errors of v- are passed on, `dv+/dv-` (K, n, n)
-        of the shots comes last: one program compiles an impact once.
+        The last Q are those of the priors. With errors of v-, `dv+/dv-` (K, n, n) and the true v-
+        (K, n) come last.
         """
-        mixing = self.measurement.mixing
-        # n velocities before, of which errors are passed on
-        count, passed = y.shape[0], 0 if mixing is None else mixing.shape[-1]
+        if self.before is not None:
+            return self._evaluate_projected(y)
 
-        def outcome(both: jax.Array) -> tuple[tuple[jax.Array, jax.Array], Any]:
-            """Residual and prediction at (y, change of v-), to be differentiated, and as values."""
-            moved = self
-            if passed:
-                pre = self.observe.pre.at[:, :passed].add(both[count:])  # type: ignore[attr-defined]
-                moved = eqx.tree_at(lambda problem: problem.observe.pre, self, pre)
-            residual, prediction = moved._scaled_residual(both[:count])
-            out = residual, prediction.value
-            return out, (*out, prediction.status)
+        def outcome(y: jax.Array) -> tuple[jax.Array, Any]:
+            """Residual, to be differentiated, and all outcomes as values."""
+            residual, prediction = self._scaled_residual(y)
+            return residual, (residual, prediction.value, prediction.status)
 
-        both = jnp.concatenate([y, jnp.zeros(passed, y.dtype)])
-        (jacobian, slopes), (residual, *aux) = jax.jacfwd(outcome, has_aux=True)(both)
-        if passed:
-            aux.append(slopes[..., count:])
-        return residual, jacobian[:, :count], tuple(aux)
+        jacobian, (residual, *outcomes) = jax.jacfwd(outcome, has_aux=True)(y)
+        return residual, jacobian, tuple(outcomes)
+
+    def _evaluate_projected(self, y: jax.Array) -> tuple[jax.Array, jax.Array, Any]:
+        """`evaluate` with errors of v-."""
+
+        def law_of(y: jax.Array) -> Law:
+            """The law at the variables y (Q,)."""
+            return forward_only(self.law_in_scene(self.variables.parameters(y)))
+
+        law = self._law_at_shots(law_of, y)
+        residual = jnp.concatenate([law.residual.reshape(-1), self._of_priors(y)])
+        of_data = law.jacobian.reshape(-1, len(y))
+        jacobian = jnp.concatenate([of_data, jax.jacfwd(self._of_priors)(y)])
+        size = self.measurement.size
+        outcomes = law.predicted, law.status, law.by_velocities, law.pre
+        return residual / size, jacobian / size, outcomes
 
     def squares(self, y: jax.Array) -> jax.Array:
-        """The sum of squares of the residual at `y` (Q,), see `evaluate`; without derivatives."""
+        """The sum of squares of the residual at `y` (Q,), see `evaluate`; without derivatives.
+
+        With errors of v- those that `measurement` has passed on.
+        """
         return jnp.sum(self._scaled_residual(y)[0] ** 2)
 
     def _scaled_residual(self, y: jax.Array) -> tuple[jax.Array, Prediction]:
         """Residual (R + Q,) over `size` at y (Q,), of the priors last, and the prediction."""
         x = self.variables.parameters(y)
         prediction = self.observe(forward_only(self.law_in_scene(x)))
-        of_priors = (x - self.prior_mean) * self.prior_weight
-        residual = jnp.concatenate([self.measurement.residual(prediction), of_priors])
+        residual = jnp.concatenate([self.measurement.residual(prediction), self._of_priors(y)])
         return residual / self.measurement.size, prediction
+
+    def _of_priors(self, y: jax.Array) -> jax.Array:
+        """`(x - mean) / std` of the priors (Q,) at y (Q,)."""
+        return (self.variables.parameters(y) - self.prior_mean) * self.prior_weight
 
     def values_at(self, y: np.ndarray) -> np.ndarray:
         """x (..., P) of y (..., Q), on the host."""
@@ -494,7 +600,7 @@ def outcome_at(problem: FitProblem, x: Any) -> Ends:
 def of_shots(
     law: Law, scene: Scene | None, experiments: Experiments, free: Any = DEFAULT_FREE, *choice: Any
 ) -> FitProblem:
-    """`FitProblem.from_shots`, but the errors of v- are passed on with `dv+/dv- = I` at first.
+    """`FitProblem.from_shots`, but `measurement` has the errors of v+ for `dv+/dv- = I`.
 
     `choice`: bounds, priors and ties.
     """
@@ -517,8 +623,11 @@ def of_shots(
         scene=scene,
         matrix=matrix_region(problem.law, alike, problem.variables, problem.start, problem.ties),
     )
+    if experiments.sigma_pre is None:
+        return problem
+    before = _in(problem.dtype, ErrorsBefore.of(experiments, scene))
     count, n = experiments.pre.shape
-    return problem.with_errors_before(np.tile(np.eye(n), (count, 1, 1)))
+    return replace(problem, before=before).with_errors_before(np.tile(np.eye(n), (count, 1, 1)))
 
 
 def _measured_shots(
@@ -553,7 +662,8 @@ def _build(
 ) -> FitProblem:
     """The problem of a measurement; `choice`: free, bounds, priors, ties; `energy`: a scale [J]."""
     leaves = jax.tree.leaves((law, observe, measurement.value))
-    dtype = np.result_type(*(x.dtype for x in leaves if eqx.is_inexact_array(x)))
+    widest = np.result_type(*(x.dtype for x in leaves if eqx.is_inexact_array(x)))
+    dtype = jax.dtypes.canonicalize_dtype(widest)  # float32 where JAX computes in that
     free, bounds, prior, tie = (*choice, *[None] * 4)[:4]
     for name, pairs in (("bounds", bounds), ("priors", prior), ("ties", tie)):
         if pairs is not None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jimpact.fits.deviances import PROFILE_STARTS, Deviances, Grid, profiles_of
-from jimpact.fits.estimate import LEVEL
+from jimpact.fits.estimate import LEVEL, in_own_precision
 from jimpact.fits.intervals import Profile, check_level
 from jimpact.fits.parameters import as_names, scaled
 from jimpact.fits.report import Fit
@@ -27,6 +27,7 @@ def _check_profiled(fit: Fit, level: float, points: int) -> None:
         )
 
 
+@in_own_precision
 def profile(
     fit: Fit,
     names: str | Iterable[str] | None = None,
@@ -92,6 +93,7 @@ class Contour:
     log: tuple[bool, bool]
 
 
+@in_own_precision
 def contour(
     fit: Fit,
     first: str,

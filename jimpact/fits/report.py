@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Generic
 
+import jax
 import numpy as np
 
 import jimpact
@@ -261,7 +262,8 @@ def _sigma_sources(fit: "Fit") -> list[str]:
         lines.append(f"               with that of readings in steps of {size}: step / sqrt(12)")
     if data is not None and data.sigma_pre is not None:
         errors = "their covariance with" if data.covariance is not None else "those of"
-        lines.append(f"               with {errors} the velocities before, passed on by the law")
+        searched = "the velocities before, whose true values are searched for"
+        lines.append(f"               with {errors} {searched}")
     return lines
 
 
@@ -412,8 +414,8 @@ def load_fit(path: str | Path) -> "Fit":
         `Fit`, with all that one can do with it.
 
     Raises:
-        FileNotFoundError: no such file. ValueError: not a fit, one of another format, a law that
-            cannot be imported, or double precision while JAX is in single precision.
+        FileNotFoundError: no such file. ValueError: not a fit, one of another format, or a law that
+            cannot be imported.
 
     >>> import pathlib, tempfile, jimpact as ji
     >>> data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.3, 0.7], [0.6, 1.4]], sigma=0.02)
@@ -436,7 +438,8 @@ def load_fit(path: str | Path) -> "Fit":
             f"{record['format']} (written by jimpact {writer}; this is {jimpact.__version__})."
         )
     try:
-        return instance_of(Fit, _of_this_build(record["result"]))
+        with jax.enable_x64(True):  # arrays keep the precision that they were saved in
+            return instance_of(Fit, _of_this_build(record["result"]))
     except (KeyError, AttributeError, ImportError, TypeError) as error:
         raise ValueError(
             f"{path}: the fit, saved by jimpact {writer}, cannot be read: {error!r}. A law of your "
@@ -501,7 +504,10 @@ class Fit(FitResult[AnyLaw], Generic[AnyLaw]):
         steps: iterations of the best start.
         lost_starts: how many were given up far above the best, or did not converge.
         stuck: whether no step lowers the sum of squares, although derivatives promise it.
-        slopes: `dv+/dv-` (K, n, n) of the shots, where errors of v- are passed on, else None.
+        pre: true v- (K, n) that agree best with the law and the data, where v- have errors; else
+            None. `predicted` is then `v+(pre) + slopes (v- - pre)`: the law at the measured v-,
+            linearized.
+        slopes: `dv+/dv-` (K, n, n) at these v-, or None.
         findings: what is wrong with data or fit, by kind, shots and numbers; computed on first
             access, as profiles are.
         warnings: the same in words.

@@ -13,14 +13,15 @@ import numpy as np
 from jimpact.core.law import AnyLaw, parameters_of
 from jimpact.core.scene import Scene
 from jimpact.fits.checks import Judged, fit_findings
-from jimpact.fits.data import Experiments
+from jimpact.fits.curvature import bent_within_errors
 from jimpact.fits.deviances import PROFILE_STARTS, lower_minimum, profiles_of
-from jimpact.fits.estimate import LEVEL, Estimate
+from jimpact.fits.estimate import LEVEL, Estimate, in_own_precision
 from jimpact.fits.findings import Finding
 from jimpact.fits.intervals import Profile
 from jimpact.fits.parameters import LawInScene, tied_names, tied_value
 from jimpact.fits.problem import outcome_at
 from jimpact.fits.search import solution_of
+from jimpact.shots.data import Experiments
 from jimpact.tools.checks import check_choice, check_kind, check_values
 from jimpact.tools.records import Column, Table, Tabular, counted, plain
 from jimpact.tools.status import STATUS
@@ -95,6 +96,7 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
     picture = "fit"
 
     @cached_property
+    @in_own_precision
     def findings(self) -> tuple[Finding, ...]:
         """Results of the tests of data and fit, by kind, shots and numbers."""
         if self.known_findings is not None:
@@ -102,12 +104,14 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
         return (*self._findings_of_search, *lower_minimum(self.names, self.profiles))
 
     @cached_property
+    @in_own_precision
     def _findings_of_search(self) -> tuple[Finding, ...]:
         """The findings without those of profiles, which need these first."""
         assert self.judged is not None
-        return tuple(fit_findings(self.judged))
+        return (*fit_findings(self.judged), *bent_within_errors(self.judged))
 
     @cached_property
+    @in_own_precision
     def profiles(self) -> tuple[Profile, ...]:
         """Profiles of all parameters if `wants_profiles`, or if it is None and they are needed."""
         if self.known_profiles is not None:
@@ -153,6 +157,7 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
         return Table([Column(name) for name in ("parameter", *names)], rows)
 
     @property
+    @in_own_precision
     def scene(self) -> Scene | None:
         """The scene of all shots, with what was fitted of it; None: the shots have their own."""
         return self.problem.to_scene(self.value)
@@ -174,6 +179,7 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
         return self.standard_error > PRIOR_ALONE * self.noise * std
 
     @property
+    @in_own_precision
     def tied(self) -> dict[str, tuple[float, float]]:
         """Values of tied entries with their standard errors, by name."""
         problem, ties = self.problem, self.problem.ties
@@ -204,6 +210,7 @@ class FitResult(Estimate[AnyLaw], Tabular, Generic[AnyLaw]):
         blind = (np.abs(slope[..., ~seen]) > 0).any(axis=-1)
         return np.where(blind, np.inf, np.sqrt(variance))
 
+    @in_own_precision
     def predict(self, shots: Any, scene: Scene | None = None, level: float = 0.95) -> Predicted:
         """Velocities after further shots, with the errors that the parameters leave in them.
 

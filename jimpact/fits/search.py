@@ -16,7 +16,6 @@ from jimpact.fits.solve import (
     COARSE,
     RANK_TOLERANCE,
     SETTLED,
-    SETTLING,
     Ends,
     Method,
     Solver,
@@ -161,7 +160,8 @@ class Solution:
     starts: tuple[FitMinimum, ...]
     predicted: Float[np.ndarray, "*value"]
     status: Int[np.ndarray, " K"]
-    slopes: Float[np.ndarray, "M n n"] | None = None  # of the K shots, then of copies (`filled`)
+    slopes: Float[np.ndarray, "K n n"] | None = None
+    pre: Float[np.ndarray, "K n"] | None = None
     converged: bool
     stuck: bool = False
     at_bound: Bool[np.ndarray, " P"]
@@ -206,7 +206,8 @@ def solution_of(
         starts=tuple(minima),
         predicted=end.predicted[shots],
         status=end.status[shots],
-        slopes=end.slopes,
+        slopes=None if end.slopes is None else end.slopes[shots],
+        pre=None if end.pre is None else end.pre[shots],
         converged=bool(end.converged),
         stuck=bool(end.stuck),
         at_bound=((end.y <= problem.variables.low) | (end.y >= problem.variables.high))[:count],
@@ -480,7 +481,7 @@ def _same_values(
     return bool((np.abs(directions @ apart) <= allowed).all())
 
 
-def settled(
+def solved(
     problems: list[FitProblem],
     points: Float[np.ndarray, "S Q"],
     solver: Solver,
@@ -488,23 +489,15 @@ def settled(
 ) -> tuple[list[FitProblem], Ends]:
     """Minima from points, as by `minimize`, and the problems with the errors that hold there.
 
-    Errors of v- are passed on to v+ by the derivatives `dv+/dv-` of each problem's best minimum,
-    which in turn moves with these errors: both are computed by turns until the minimum stays.
+    Errors of v- are passed on to v+ by the derivatives `dv+/dv-` of each problem's best minimum.
     """
-    each, start = len(points) // len(problems), points
-    for _ in range(SETTLING):
-        ends = minimize([p.least_squares() for p in problems], start, solver, stop)
-        if ends.slopes is None:
-            return problems, ends
-        best = np.nanargmin(ends.squares.reshape(-1, each), axis=1)
-        slopes = ends.slopes[np.arange(0, len(points), each) + best]
-        problems = [p.with_errors_before(slope) for p, slope in zip(problems, slopes)]
-        moved = np.abs(ends.y - start).max(axis=1) > SETTLED
-        start = ends.y
-        if not moved.any():  # residuals and Jacobians with the weights of the final law
-            last = solver._replace(max_steps=1)
-            return problems, minimize([p.least_squares() for p in problems], start, last)
-    return problems, ends._replace(converged=ends.converged & ~moved)
+    ends = minimize([problem.least_squares() for problem in problems], points, solver, stop)
+    if ends.slopes is None:
+        return problems, ends
+    starts = len(points) // len(problems)
+    best = np.nanargmin(ends.squares.reshape(-1, starts), axis=1)
+    slopes = ends.slopes[np.arange(0, len(points), starts) + best]
+    return [p.with_errors_before(slope) for p, slope in zip(problems, slopes)], ends
 
 
 # ---------------------------------------------------------------------------- robust losses
@@ -528,13 +521,28 @@ def robust_minimum(
             median = float(np.median(np.abs(error[measured])))
             scale = max(MEDIAN * median, np.finfo(float).tiny)
         weight, slope = LOSSES[loss](error / scale)  # psi(u) / u, psi'(u)
-        factor, before = np.sqrt(weight), problem.variables.point(solution.value)
-        weighed = problem.weighed(factor)
-        solution = solution_of(weighed, minimize([weighed.least_squares()], before[None], solver))
-        if np.abs(problem.variables.point(solution.value) - before).max() <= SETTLED:
+        factor = np.sqrt(weight)
+        point = problem.variables.point(solution.value)
+        held = problem
+        if solution.pre is not None and solution.slopes is not None:
+            held = problem.held(solution.pre, solution.slopes)
+        weighed = held.weighed(factor)
+        solution = solution_of(weighed, minimize([weighed.least_squares()], point[None], solver))
+        moved = np.abs(problem.variables.point(solution.value) - point).max()
+        if problem.before is not None:  # the true v- follow the parameters
+            there = solution_of(problem, outcome_at(problem, solution.value))
+            solution = replace(
+                solution,
+                predicted=there.predicted,
+                status=there.status,
+                slopes=there.slopes,
+                pre=there.pre,
+            )
+        if moved <= SETTLED:
             break
     else:
         solution = replace(solution, converged=False)
+    problem = problem.with_errors_before(solution.slopes)
     psi = (weight * error / scale)[measured]
     noise = scale * np.sqrt(np.sum(psi**2)) / max(slope[measured].mean(), LEAST_SLOPE)
     # weighted as in the problem, without the factors of the loss

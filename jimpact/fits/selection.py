@@ -11,7 +11,6 @@ from scipy.special import chdtrc, fdtrc, stdtr
 from jimpact.core.law import Law, free_parameters_of, with_parameter
 from jimpact.core.registry import REGISTRY, registered_laws, simplest_first
 from jimpact.core.scene import Scene
-from jimpact.fits.data import Experiments
 from jimpact.fits.fitting import fit, leave_one_out
 from jimpact.fits.matrices import admissible_start
 from jimpact.fits.parameters import OF_SPEED, default_free
@@ -19,6 +18,7 @@ from jimpact.fits.problem import FEW
 from jimpact.fits.report import Fit, check_squares, named_values
 from jimpact.fits.search import Search
 from jimpact.laws.velocity_dependent import VelocityDependent
+from jimpact.shots.data import Experiments
 from jimpact.tools.checks import check_choice, check_kind
 from jimpact.tools.progress import progress_bar
 from jimpact.tools.records import Column, Table, Tabular, as_data, degrees

@@ -75,7 +75,8 @@ HARDLY_WORSE = 30.0
 # Singular values of the scaled Jacobian below this share of the largest are zero: derivatives of
 # an impact are good to about 1e-7 (float64; 1e-4 in float32), so smaller ones may be errors.
 RANK_TOLERANCE = {"float64": 1e-6, "float32": 1e-3}
-SETTLED, SETTLING = 1e-5, 10  # change (natural scales) and rounds, where errors of v- are passed on
+# Change (natural scales) and rounds of what is solved by turns: admissible points, robust weights.
+SETTLED, SETTLING = 1e-5, 10
 
 
 @jax.tree_util.register_dataclass
@@ -373,7 +374,8 @@ class Ends(NamedTuple):
     jacobian: Float[np.ndarray, "*S R Q"]
     predicted: Float[np.ndarray, "..."]  # S, and the shape of what was measured
     status: Int[np.ndarray, "*S K"]  # codes of the shots; one of another observable
-    slopes: Float[np.ndarray, "*S K n n"] | None  # dv+/dv- where errors of v- are passed on
+    slopes: Float[np.ndarray, "*S K n n"] | None  # dv+/dv- at true v-, with errors of v-
+    pre: Float[np.ndarray, "*S K n"] | None  # these true v-
     converged: Bool[np.ndarray, "*S"]  # True close enough to a minimum, see `CONVERGED`
     stuck: Bool[np.ndarray, "*S"]  # no step lowers |r|^2, although derivatives promise it
     steps: Int[np.ndarray, "*S"]
@@ -430,6 +432,7 @@ def minimize(
         states, _ = _descended(many, allowed, once, *rule)
         moved, y = np.abs(allowed - y).max(axis=1) > SETTLED, allowed
     size = np.asarray(many.size, float)
+    before = states.aux[2:]
     return Ends(
         y=np.asarray(states.y, float),
         squares=2 * np.asarray(states.cost, float) * size**2,
@@ -437,7 +440,8 @@ def minimize(
         jacobian=np.asarray(states.jacobian, float) * size[:, None, None],
         predicted=np.asarray(states.aux[0], float),
         status=states.aux[1],
-        slopes=states.aux[2] if len(states.aux) > 2 else None,
+        slopes=before[0] if before else None,
+        pre=before[1] if before else None,
         converged=converged & ~moved,
         stuck=np.asarray(stuck),
         steps=np.asarray(steps),

@@ -4,6 +4,7 @@ A pair's coefficient of restitution does not determine what a chain does: forces
 the same speed spread an impact differently (docs/compliant.md).
 """
 
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -18,12 +19,17 @@ from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Force, UserForce
 from jimpact.tools.checks import as_float_array, check_values
 from jimpact.tools.compiling import precise_jit
+from jimpact.tools.status import CODE, STATUS
 
 # Tolerance of the pair's impact (else the law's default): the calibrated e is right to as many
 # digits. Ten times more loses one of them.
 RTOL = {"float64": 1e-11}
+# ... of forces that cannot be followed so finely, one after the other. Ten times the last one:
+# e would have four digits.
+COARSER = (1e-8, 1e-7, 1e-6, 1e-5)
 LEAST = 0.05  # restitution; below, e hardly depends on the damping any more
 STRONGEST = 0.99  # s = d / (1 + d) of the largest dimensionless damping d that is tried
+END = 1e-9  # share of `STRONGEST` within which a bisection has met no root; ten times more: as well
 BISECTIONS = 60  # halvings of s, to rounding in double precision
 
 
@@ -39,7 +45,9 @@ def measured_restitution(force: Force, mass: Any, speed: Any) -> jax.Array:
         speed: approach v > 0 [m/s].
 
     Returns:
-        e, of the common shape; NaN where the impact has no end.
+        e, of the common shape, right to `RTOL`; where a force cannot be followed so finely, to the
+        first of `COARSER` that can be held (inside jit NaN). NaN where the impact has no end, with
+        a warning.
 
     Raises:
         ValueError: mass or speed not positive.
@@ -52,7 +60,21 @@ def measured_restitution(force: Force, mass: Any, speed: Any) -> jax.Array:
     check_values("mass", m, low=0.0, open_low=True)
     check_values("speed", v, low=0.0, open_low=True)
     known = force.pair_restitution(m, v)
-    return _each(_integrated, force, m, v) if known is None else known
+    if known is not None:
+        return known
+    restitution, status = _each(_integrated, force, m, v)
+    if isinstance(status, jax.core.Tracer):
+        return restitution
+    for rtol in COARSER:
+        failed = status != CODE["ok"]
+        if not failed.any():
+            return restitution
+        coarse, status_coarse = _each(_bounce, force, m, v, jnp.asarray(rtol, v.dtype))
+        restitution = jnp.where(failed, coarse, restitution)
+        status = jnp.where(failed, status_coarse, status)
+    if reasons := {STATUS[code].name for code in status.ravel().tolist() if code}:
+        warnings.warn(f"The impact of a pair ends with {', '.join(reasons)}.", stacklevel=2)
+    return restitution
 
 
 def calibrate(force: Force, restitution: Any, mass: Any, speed: Any) -> Force:
@@ -64,7 +86,8 @@ def calibrate(force: Force, restitution: Any, mass: Any, speed: Any) -> Force:
 
     Args:
         force: `KelvinVoigt`, `HuntCrossley`, `KuwabaraKono` or `Bistiffness`; its own damping does
-            not matter.
+            not matter. Or a `UserForce` whose parameters are a dict with an entry 'damping', of
+            which up to 99 times the value is tried.
         restitution: e in [0.05, 1], scalar or one per contact.
         mass: reduced mass > 0 [kg].
         speed: of approach > 0 [m/s]; at another speed e differs.
@@ -73,7 +96,8 @@ def calibrate(force: Force, restitution: Any, mass: Any, speed: Any) -> Force:
         A force of the same kind.
 
     Raises:
-        TypeError: a force without a damping (a user's own). ValueError: e out of range.
+        TypeError: a force without a damping. ValueError: e out of range, or not reached by the
+            largest damping (NaN inside jit).
 
     >>> import jimpact as ji
     >>> force = ji.calibrate(ji.KuwabaraKono(1e9, 0.0), restitution=0.9, mass=1e-3, speed=0.5)
@@ -87,15 +111,25 @@ def calibrate(force: Force, restitution: Any, mass: Any, speed: Any) -> Force:
     m, v = as_float_array("mass", mass), as_float_array("speed", speed)
     check_values("mass", m, low=0.0, open_low=True)
     check_values("speed", v, low=0.0, open_low=True)
-    strong = force.damping_scale(m, v)
-    if strong is None:
-        raise TypeError(f"Argument `force` must have a damping to find, but is {force!r}.")
-    undamped = with_parameter(force, "damping", jnp.zeros_like(strong))
-    return with_parameter(force, "damping", _each(_damping, undamped, m, v, e))
+    scale = force.damping_scale(m, v)
+    if scale is None:
+        raise TypeError(
+            f"Argument `force` must have a damping to find, but is {force!r}; a `UserForce` has "
+            "one as the entry 'damping' of a dict of parameters."
+        )
+    (damping,) = _each(_damping, force, m, v, e)
+    if not isinstance(damping, jax.core.Tracer) and jnp.isnan(damping).any():
+        raise ValueError(
+            "Argument `restitution` must be one that the force reaches with a damping of up to "
+            f"{STRONGEST / (1 - STRONGEST):.0f} times its scale {scale}, but has value {e}."
+        )
+    return force.with_damping(damping)
 
 
 @precise_jit
-def _each(function: Callable[..., jax.Array], force: Force, *values: jax.Array) -> jax.Array:
+def _each(
+    function: Callable[..., tuple[jax.Array, ...]], force: Force, *values: jax.Array
+) -> tuple[jax.Array, ...]:
     """`function(force, *values)`, a function of scalars, for each entry of their common shape.
 
     Arrays of the force are broadcast with `values`, but those of a `UserForce` are passed on as
@@ -109,30 +143,47 @@ def _each(function: Callable[..., jax.Array], force: Force, *values: jax.Array) 
     flat = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, shape).ravel(), (arrays, values))
     fixed = force if arrays is None else eqx.filter(force, eqx.is_array, inverse=True)
     run = jax.vmap(lambda leaves, scalars: function(eqx.combine(leaves, fixed), *scalars))
-    return run(*flat).reshape(shape)
+    return tuple(result.reshape(shape) for result in run(*flat))
 
 
-def _integrated(force: Force, mass: jax.Array, speed: jax.Array) -> jax.Array:
-    """e = -v+ / v- () of a mass [kg] that hits a wall at a speed [m/s]; NaN where it has no end."""
-    law = Compliant(force, rtol=RTOL.get(str(jnp.result_type(mass, speed))))
-    out = impact(law, chain(mass[None], wall=True), speed[None])
-    return jnp.where(out.status == 0, -out.velocity[0] / speed, jnp.nan)
+def _integrated(force: Force, mass: jax.Array, speed: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """e of a mass [kg] that hits a wall at a speed [m/s] to the tolerance `RTOL`, and the status.
+
+    Equation: `e = -v+ / v-`; NaN where the impact has no end.
+    """
+    return _bounce(force, mass, speed, RTOL.get(str(jnp.result_type(mass, speed))))
 
 
-def _damping(force: Force, mass: jax.Array, speed: jax.Array, e: jax.Array) -> jax.Array:
+def _bounce(
+    force: Force, mass: jax.Array, speed: jax.Array, rtol: Any
+) -> tuple[jax.Array, jax.Array]:
+    """e = -v+ / v- () of a mass [kg] that hits a wall at a speed [m/s], and the status.
+
+    e is NaN where the impact has no end. `rtol` None: the default tolerance of the law.
+    """
+    law = Compliant(force)
+    out = impact(law, chain(mass[None], wall=True), speed[None], rtol=rtol)
+    ended = out.status == CODE["ok"]
+    return jnp.where(ended, -out.velocity[0] / speed, jnp.nan), out.status
+
+
+def _damping(force: Force, mass: jax.Array, speed: jax.Array, e: jax.Array) -> tuple[jax.Array]:
     """Damping () with which a pair of reduced `mass` [kg] has the restitution e at a speed [m/s].
 
     Equation: `damping = scale s / (1 - s)` of the force's `damping_scale`, s in [0, 1) the root of
-    `e - e(s)`, by bisection; derivatives by the implicit function theorem.
+    `e - e(s)`, by bisection; derivatives by the implicit function theorem. NaN where no s up to
+    `STRONGEST` is one.
     """
     scale = force.damping_scale(mass, speed)
     assert scale is not None  # `calibrate` has checked
 
     def excess(s: jax.Array) -> jax.Array:
         """`e - e(s)` (), increasing: restitution asked for less that of this damping."""
-        damped = with_parameter(force, "damping", scale * s / (1 - s))
+        damped = force.with_damping(scale * s / (1 - s))
         known = damped.pair_restitution(mass, speed)
-        return e - (_integrated(damped, mass, speed) if known is None else known)
+        if known is None:
+            known, _ = _integrated(damped, mass, speed)
+        return e - known
 
     def bisected(f: Callable[[jax.Array], jax.Array], guess: jax.Array) -> jax.Array:
         """The root () of an increasing function f between 0 and `STRONGEST`."""
@@ -153,4 +204,5 @@ def _damping(force: Force, mass: jax.Array, speed: jax.Array, e: jax.Array) -> j
         return right / linear(jnp.ones_like(right))
 
     s = jax.lax.custom_root(excess, jnp.zeros_like(e), bisected, scalar_solve)
-    return scale * s / (1 - s)
+    reached = s < STRONGEST * (1 - END)
+    return (jnp.where(reached, scale * s / (1 - s), jnp.nan),)

@@ -12,7 +12,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jimpact.core.law import LARGEST_EXPONENT, Declared, StaticOrValues, Values, parameter
+from jimpact.core.law import (
+    LARGEST_EXPONENT,
+    Declared,
+    StaticOrValues,
+    Values,
+    parameter,
+    with_parameter,
+)
 from jimpact.tools.checks import as_float_array, check_function
 from jimpact.tools.loops import fori_loop
 
@@ -71,6 +78,11 @@ class Force(Declared):
     def damping_scale(self, mass: jax.Array, speed: jax.Array) -> jax.Array | None:
         """A strong `damping` of a pair of reduced `mass` [kg] at a `speed` [m/s]; None: no such."""
         return None
+
+    def with_damping(self, damping: jax.Array) -> "Force":
+        """The force with another value of its parameter `damping`."""
+        force: Force = with_parameter(self, "damping", damping)
+        return force
 
     def pair_restitution(self, mass: jax.Array, speed: jax.Array) -> jax.Array | None:
         """e of a pair of reduced `mass` [kg] at a `speed` [m/s]; None: to be integrated."""
@@ -371,7 +383,8 @@ class UserForce(Force):
         function: smooth for x >= 0; it must push at x > 0, rate = 0. Where F(0) > 0 the contact
             ends at x = 0 with that force. Contacts that touch at rest can then take any force up
             to F(0) without motion; this is not resolved (status `max_steps`).
-        parameters: any pytree; its arrays are differentiable.
+        parameters: any pytree; its arrays are differentiable. `calibrate` finds the entry
+            'damping' of a dict.
 
     >>> import jimpact as ji
     >>> soft = ji.UserForce(lambda x, rate, k: k * x * (1 + x), 3.0)
@@ -389,6 +402,16 @@ class UserForce(Force):
         check_function("function", function)
         self.function = function
         self.parameters = jax.tree.map(lambda leaf: as_float_array("parameters", leaf), parameters)
+
+    def damping_scale(self, mass: jax.Array, speed: jax.Array) -> jax.Array | None:
+        """The size of the entry 'damping' of `parameters`, if they are a dict with one."""
+        if not isinstance(self.parameters, dict) or "damping" not in self.parameters:
+            return None
+        return jnp.abs(self.parameters["damping"])
+
+    def with_damping(self, damping: jax.Array) -> "UserForce":
+        """The force with another entry 'damping' of its parameters."""
+        return UserForce(self.function, self.parameters | {"damping": damping})
 
     def force(self, x: jax.Array, rate: jax.Array) -> jax.Array:
         """`function(x, rate, parameters)`."""

@@ -163,9 +163,9 @@ class WorkPrecision(Tabular):
 
 @full_precision
 def work_precision(
+    law: LZB,
     scene: Scene,
     velocity: Any,
-    law: LZB,
     methods: Sequence[str | Contender] | None = None,
     settings: Mapping[str, Sequence[float]] | None = None,
     laws: Mapping[str, Law] | None = None,
@@ -186,10 +186,10 @@ def work_precision(
     `max |v-|`. Times are per impact, one alone and in a batch, taken in turns; compile times apart.
 
     Args:
-        scene: n coordinates, m contacts.
-        velocity: v- (n,) [m/s], at least one contact approaching.
         law: the `LZB` law; its `method` and `rtol` play no part, its `max_steps` does. With
             `friction` (scenes with tangents, planar or in space) methods without it are left out.
+        scene: n coordinates, m contacts.
+        velocity: v- (n,) [m/s], at least one contact approaching.
         methods: names in `jimpact.methods.contenders.CONTENDERS`, or contenders of your own; None:
             all that support the impact. One that raises is left out, and the table says why.
         settings: settings by method, in place of its default ones.
@@ -209,15 +209,17 @@ def work_precision(
 
     Raises:
         ValueError: a method that is unknown or does not support the law, nothing approaches,
-            single precision, bad sizes. TypeError: a law that is not LZB.
+            single precision, bad sizes. TypeError: a law that is not LZB, or arguments in another
+            order.
 
     >>> import jimpact as ji
     >>> pair, law, ladder = ji.chain([1.0, 2.0]), ji.LZB(0.5), {"verlet": [0.1, 0.01]}
     >>> options = {"laws": {}, "batch": 4, "gradients": False}
-    >>> chart = ji.work_precision(pair, [1.0, 0.0], law, ["verlet"], ladder, **options)
+    >>> chart = ji.work_precision(law, pair, [1.0, 0.0], ["verlet"], ladder, **options)
     >>> [f"{point.error['velocity']:.0e}" for point in chart.points["verlet"]]
     ['2e-04', '4e-06']
     """
+    check_kind("scene", scene, Scene, "work_precision(law, scene, velocity, ...)")
     repeats = as_whole("repeats", repeats, 1)
     case = _case(scene, velocity, law, as_whole("batch", batch, 1))
     chosen, left_out = _chosen(methods, settings or {}, case)

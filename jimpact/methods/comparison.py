@@ -185,7 +185,7 @@ def compare(
         name: Entry(
             law=laws[name],
             outcome=(out := run()),
-            audit=audit(scene, v, out),
+            audit=audit(out, scene, v),
             energy_ratio=float(energy_ratio(scene, v, out.velocity)),
             dispersion_index=float(dispersion_index(scene, out.velocity)),
             time=times[name],

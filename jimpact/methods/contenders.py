@@ -8,7 +8,7 @@ A contender of your own is a function and its settings, and stands in the chart 
 ...     return Solution(ji.impact(ji.Newton(law.restitution), scene, velocity).impulse)
 >>> mine = Contender("mine", newton, "rtol", (1e-3,))
 >>> pair, options = ji.chain([1.0, 1.0]), {"laws": {}, "batch": 4, "gradients": False}
->>> chart = ji.work_precision(pair, [1.0, 0.0], ji.LZB(0.5), [mine], **options)
+>>> chart = ji.work_precision(ji.LZB(0.5), pair, [1.0, 0.0], [mine], **options)
 >>> chart.points["mine"][0].error["velocity"] < 1e-10  # one contact: all laws agree
 True
 """

@@ -473,7 +473,7 @@ def runner(max_steps: int, setup: Setup, method: Contender, balls: int) -> Runne
         """Outcome at one point (7,), and the energy gained over T-."""
         law, scene, v = setup.impact_at(point, balls, max_steps)
         out, compared = solved(method, law, scene, v, setting)
-        return compared, audit(scene, v, out).energy_gain
+        return compared, audit(out, scene, v).energy_gain
 
     batch = jax.jit(jax.vmap(one))
 

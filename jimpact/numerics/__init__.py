@@ -14,5 +14,5 @@ Shapes stand in the signatures, `Float[Array, "m B"]`, with these names of axes:
     K      neighbours of a contact
 
 `1` is one row for all contacts; `...` and `*B` are any number of axes, also none; `#` allows an
-axis of length 1 in the place of a longer one. `tests/contract/test_shapes.py` checks them.
+axis of length 1 in the place of a longer one. `tests/rules/test_shapes.py` checks them.
 """

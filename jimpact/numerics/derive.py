@@ -210,7 +210,7 @@ class _WithJacobian:
             """Results, and rates (d, .., B) in d directions, given by entries in all arguments."""
             directions, first = [], 0
             for x, n in zip(moving, sizes):  # entries first .. first + n are those of x
-                own = rows[:, first : first + n].reshape(-1, *x.shape[:-1], 1)
+                own = rows[:, first : first + n].reshape(len(rows), *x.shape[:-1], 1)
                 own = jnp.broadcast_to(own, (len(rows), *x.shape))
                 directions.append(varying_like(own, x))
                 first += n

@@ -6,24 +6,8 @@
 True
 """
 
-from importlib import import_module
-from typing import Any
+from jimpact.tools.faces import face
 
-import lazy_loader
-
-_of_theory, _names, __all__ = lazy_loader.attach_stub(__name__, __file__)
-# Two functions of the chapter that need a `System`, which is made in the room of motions.
-OF_MOTION = "contact_problem", "quasi_lagrange"
-__all__ += OF_MOTION
-
-
-def __getattr__(name: str) -> Any:
-    """A public name: of this room, or of the motions."""
-    if name in OF_MOTION:
-        return getattr(import_module("jimpact.motion.accelerations"), name)
-    return _of_theory(name)
-
-
-def __dir__() -> list[str]:
-    """The public names."""
-    return sorted([*_names(), *OF_MOTION])
+# Two functions of the chapter need a `System`: the stub says that motions hold them.
+__getattr__, __dir__ = face(__name__, __file__)
+__all__ = __dir__()

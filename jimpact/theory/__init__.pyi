@@ -1,6 +1,9 @@
 """Public names of `ji.theory` and where they live."""
 
-import jimpact.motion.accelerations as _of_motion
+from jimpact.motion.accelerations import (
+    contact_problem as contact_problem,
+    quasi_lagrange as quasi_lagrange,
+)
 
 from .admissible import AdmissibleSet as AdmissibleSet, admissible_set as admissible_set
 from .chains import (
@@ -80,6 +83,3 @@ from .rocking import (
     rocking_ratios as rocking_ratios,
     search_critical_angle as search_critical_angle,
 )
-
-contact_problem = _of_motion.contact_problem
-quasi_lagrange = _of_motion.quasi_lagrange

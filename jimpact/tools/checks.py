@@ -6,7 +6,8 @@ JAX is imported by those functions that need it: a study file is checked without
 import importlib
 import operator
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +26,26 @@ def needed(module: str, how: str) -> ModuleType:
         return importlib.import_module(module)
     except ImportError as error:
         raise ImportError(f"{module} must be installed for this, but is not: {how}.") from error
+
+
+@contextmanager
+def missing_room(name: str) -> Iterator[None]:
+    """A room that this copy of the package lacks becomes an ImportError that says so of `name`.
+
+    >>> with missing_room("ji.monte_carlo"):
+    ...     importlib.import_module("jimpact.montekarlo")
+    Traceback (most recent call last):
+    ImportError: ji.monte_carlo needs the room jimpact/montekarlo, which is missing here.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        package, _, module = (error.name or "").partition(".")
+        if package != "jimpact" or not module:
+            raise
+        room = module.partition(".")[0]
+        said = f"{name} needs the room jimpact/{room}, which is missing here."
+        raise ImportError(said, name=error.name) from error
 
 
 def is_traced(value: Any) -> bool:
@@ -215,12 +236,14 @@ def in_numbers(values: Any) -> str:
     return f"({', '.join(numbers)})"
 
 
-def check_kind(name: str, value: Any, kind: type) -> None:
-    """Raise a TypeError unless `value` is an instance of `kind`."""
+def check_kind(name: str, value: Any, kind: type, call: str = "") -> None:
+    """Raise a TypeError unless `value` is an instance of `kind`; it shows the `call`, if given."""
     if isinstance(value, kind):
         return
     hint = ""
-    if kind is Mapping:
+    if call:
+        hint = f" The call is {call}."
+    elif kind is Mapping:
         hint = " Give each a name, as in {'a': ...}."
     elif isinstance(value, type) and issubclass(value, kind):
         hint = f" That is the class; {value.__name__}(...) makes an object of it."

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from jimpact.fits.data import Experiments
+from jimpact.shots.data import Experiments
 from jimpact.tools.checks import as_float_array, check_concrete, check_values
 
 

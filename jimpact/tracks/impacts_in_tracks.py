@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from jimpact.fits.covariances import diagonal_blocks
-from jimpact.fits.shots_file import ANGULAR, LINEAR
+from jimpact.shots.covariances import diagonal_blocks
+from jimpact.shots.shots_file import ANGULAR, LINEAR
 from jimpact.tools.checks import as_float_array, check_concrete, check_values
 from jimpact.tracks.arcs import Arcs
 from jimpact.tracks.flight import Flight, Force

@@ -12,8 +12,8 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from jimpact.fits.covariances import diagonal_blocks
-from jimpact.fits.shots_file import ANGULAR, LINEAR
+from jimpact.shots.covariances import diagonal_blocks
+from jimpact.shots.shots_file import ANGULAR, LINEAR
 from jimpact.tracks.arcs import Arcs
 from jimpact.tracks.frames import noise
 from jimpact.tracks.judging import findings_of_noise, findings_of_turns

@@ -357,7 +357,7 @@ def _check_rising(path: str | Path, what: str, t: np.ndarray) -> None:
 def _units(unit: str | Sequence[str] | None, names: Sequence[Name]) -> list[str]:
     """Unit of each column, one of `UNITS`, from one for all or one each; None: as names state."""
     if unit is None:
-        stated = [_stated_unit(str(name)) for name in names]
+        stated = [stated_unit(str(name)) for name in names]
         if not all(stated):
             raise ValueError(
                 "Argument `unit` must be given, as names of columns state none: one of "
@@ -375,7 +375,7 @@ def _units(unit: str | Sequence[str] | None, names: Sequence[Name]) -> list[str]
     return units
 
 
-def _stated_unit(name: str) -> str | None:
+def stated_unit(name: str) -> str | None:
     """Unit in brackets in the name of a column; None without."""
     stated = re.search(rf"[\[(]\s*({_OTHER})\s*[\])]", name)
     own = {"µm": "um", "°": "deg"}
@@ -384,7 +384,7 @@ def _stated_unit(name: str) -> str | None:
 
 def _check_unit_in_name(path: str | Path, name: str, unit: str) -> None:
     """Raise where the name of a column states another unit in brackets."""
-    stated = _stated_unit(name)
+    stated = stated_unit(name)
     if stated and stated != unit:
         raise ValueError(
             f"{path}: column `{name}` states the unit {stated}, but argument `unit` is {unit!r}."

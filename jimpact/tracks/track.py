@@ -10,8 +10,8 @@ from scipy.optimize import lsq_linear
 
 from jimpact.bodies.base import Body
 from jimpact.core.scene import Scene, dense_mass
-from jimpact.fits.covariances import covariance_of
-from jimpact.fits.data import ROUNDING, Experiments
+from jimpact.shots.covariances import covariance_of
+from jimpact.shots.data import ROUNDING, Experiments
 from jimpact.tools.checks import check_kind, check_values
 from jimpact.tools.records import counted
 from jimpact.tracks.arcs import Arcs

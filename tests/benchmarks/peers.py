@@ -102,9 +102,9 @@ def main():
     for name, (scene, velocity) in SCENES.items():
         with stage(name):
             charts[name] = ji.work_precision(
+                ji.LZB(1.0),
                 scene,
                 velocity,
-                ji.LZB(1.0),
                 contenders()[:2] if options.quick else contenders(),
                 batch=16 if options.quick else 1024,
                 repeats=1 if options.quick else 5,

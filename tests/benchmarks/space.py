@@ -13,7 +13,7 @@ the median of calls that follow, processor time. e = .3, mu = .3, Hertz contacts
 alone (for its time) and in batches of BATCH: statuses, failures, the slowest, and Moreau's batch.
 
 `--agreement`: v+ and its slopes in mu, e and ln k_1 beside an independent integration and its
-differences, which `tests/data/friction_space.npz` holds (see space_reference.py): median and worst.
+differences, which `tests/held/friction_space.npz` holds (see space_reference.py): median and worst.
 """
 
 import json
@@ -31,7 +31,7 @@ import first_call
 import numpy as np
 from harness import arguments, show, write_csv
 
-sys.path.insert(0, str(Path(__file__).parent.parent))
+sys.path.insert(0, str(Path(__file__).parents[1] / "bodies"))
 import spatial_scenes
 
 E, MU = 0.3, 0.3
@@ -46,7 +46,7 @@ WANTED = {"value": 4.0, "jacobian": 8.0, "second": 20.0}  # first calls, in unit
 ROBUST = 1.5  # first value of the implicit method
 SCENES = (*spatial_scenes.NAMED, "plane, 2 contacts")
 CUBES = {"cube corner": 1, "cube edge": 2, "cube flat": 4}
-HELD = Path(__file__).parent.parent / "data" / "friction_space.npz"
+HELD = Path(__file__).parent.parent / "held" / "friction_space.npz"
 INPUTS = ("mass", "normals", "tangents", "velocity", "restitution", "friction", "stiffness")
 SHARP = 1e-3  # slopes are compared where lower differences agree to this: no kink in between
 KINDS = (*spatial_scenes.KINDS, *CUBES)

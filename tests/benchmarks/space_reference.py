@@ -1,6 +1,6 @@
-"""Writes `tests/data/friction_space.npz`: impacts of boxes and of the measured cube with friction in
+"""Writes `tests/held/friction_space.npz`: impacts of boxes and of the measured cube with friction in
 space on 1, 2 and 4 contacts, by an integration that shares no code with the package (`regularized`
-in tests/friction_reference.py), and slopes in mu, e and the first stiffness by its differences.
+in tests/laws/friction_reference.py), and slopes in mu, e and the first stiffness by its differences.
 
     python tests/benchmarks/space_reference.py        (minutes)
 
@@ -18,11 +18,11 @@ from types import SimpleNamespace
 import numpy as np
 
 TESTS = Path(__file__).parent.parent
-sys.path.insert(0, str(TESTS))
+sys.path[:0] = [str(TESTS / "bodies"), str(TESTS / "laws")]
 import friction_reference  # noqa: E402
 import spatial_scenes  # noqa: E402
 
-DATA = TESTS / "data" / "friction_space.npz"
+DATA = TESTS / "held" / "friction_space.npz"
 KINDS = {1: ("corner",), 2: ("edge",), 4: ("flat", "nearly flat")}
 BOXES, CUBES = 4, 2  # of a number of contacts; impacts of the measured cube
 RESTITUTIONS, FRICTIONS = (0.2, 0.5, 0.9), (0.1, 0.3, 0.6, 1.0)

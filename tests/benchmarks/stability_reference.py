@@ -1,4 +1,4 @@
-"""Writes `tests/data/stability_points.npz`: 300 Latin-hypercube points over all axes, and the
+"""Writes `tests/held/stability_points.npz`: 300 Latin-hypercube points over all axes, and the
 outcomes of `lzb_oracle.cpp` there (80-bit precision, another formulation, no shared code).
 
     python tests/benchmarks/stability_reference.py        (needs g++; half an hour)
@@ -20,7 +20,7 @@ from scipy.integrate._ivp import dop853_coefficients
 from scipy.stats import qmc
 
 HERE = Path(__file__).parent
-DATA = HERE.parent / "data" / "stability_points.npz"
+DATA = HERE.parent / "held" / "stability_points.npz"
 SIZES, SHARES = (2, 3, 6, 20, 100), (0.08, 0.37, 0.3, 0.2, 0.05)
 POINTS, SEED = 300, 5
 TOLERANCES, STEPS, SECONDS = ("1e-12", "1e-14"), 100_000_000, 20.0

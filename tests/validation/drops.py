@@ -17,7 +17,7 @@ from when_written import written
 import jimpact as ji
 
 PAGE = Path(__file__).parents[2] / "docs" / "drops.md"
-NUMBERS = PAGE.parents[1] / "tests" / "data" / "drops.npz"  # what docs/gallery.py draws
+NUMBERS = PAGE.parents[1] / "tests" / "held" / "drops.npz"  # what docs/gallery.py draws
 SIDE, FRAME, GRAVITY = 0.06, 0.004, 9.81  # [m], [s], [m/s^2]
 ARM = SIDE / 6**0.5  # radius of gyration [m]: an angle times it is a length
 BLOCK = ji.Block(SIDE, SIDE)
