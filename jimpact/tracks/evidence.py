@@ -32,17 +32,17 @@ ROUNDS = 8  # of impacts and waves by turns; three are common
 # Smallest size of waves, in sigma, and their times as shares of the longest flight. Shares of ten
 # in the place of three miss waves by half of their likelihood.
 SMALLEST_WAVES = 0.3
-SHARES = 0.6 * 3.0 ** -np.arange(5)
+SHARES = 0.3 * 3.0 ** -np.arange(5)
 FINER = (3.0**-0.5, 3.0**0.5)  # of the best size, the same of its time
 # Velocity of waves, their size over their time, as a share of the speed of the flights: more are no
 # errors of places. Ten times more would take bounces for waves, ten times less would take the waves
 # of most lenses for impacts.
-WAVE_SPEED = 0.02
+WAVE_SPEED = 0.05
 WAVED = (
     3.0  # candidates that the first waves are long, as they part a wave; ten times more part none
 )
 # Least time of waves, in frames: shorter ones are white. Ten times more is a flight.
-LEAST_TIME = 5.0
+LEAST_TIME = 15.0
 # Frames by which waves are looked for; more are taken together. Ten times more take ten times as
 # long, and waves are slow.
 MOST_FRAMES = 150
@@ -225,6 +225,8 @@ def likely_errors(
     bent = np.zeros((len(flights), n), bool)
     acceleration = flight.acceleration.copy()
     least = least_noise(frames.q)
+    held = held_rather(frames, flights, flight)
+    likely: dict[int, Likelihood] = {}
     for c in range(n):
         some = Coordinate.of(frames, flights, flight, c)
         if len(some.t) <= 2 * len(some.starts):
@@ -236,6 +238,8 @@ def likely_errors(
         on_lines = Likelihood(some, known, least[c], WAVE_SPEED * speeds[c], none)
         found = on_lines.most_likely(frames.step)
         curved = on_lines.curved()
+        if (curved & ~held[some.flights]).any():
+            curved = some.counts > 3  # what bends one flight, a table or drag, bends all
         if curved.any():
             other = replace(on_lines, bent=curved).most_likely(frames.step)
             price_of_curves = curved.sum() * price_of_bend(len(some.t))
@@ -245,8 +249,33 @@ def likely_errors(
         sigma[c] = found.sigma
         waves[c] = found.wave
         times[c] = found.time
+        likely[c] = on_lines
+    angles = np.array(frames.angles or (False,) * n)
+    for kind in (angles, ~angles):
+        if not bent[np.ix_(~held, kind)].any():
+            continue
+        for c in map(int, np.flatnonzero(kind & ~bent[~held].any(axis=0))):
+            if c in likely:  # drag and spin bend all places, though one by little
+                curved = likely[c].some.counts > 3
+                found = replace(likely[c], bent=curved).most_likely(frames.step)
+                bent[likely[c].some.flights, c] = curved
+                sigma[c] = found.sigma
+                waves[c] = found.wave
+                times[c] = found.time
     model = flight.with_values(acceleration, flight.drag)
     return Errors(sigma, waves, times), model, bent
+
+
+def held_rather(frames: Frames, flights: Sequence[np.ndarray], flight: Flight) -> np.ndarray:
+    """True (F,) for flights nearer to no acceleration than to a known one, in some coordinate."""
+    held = np.zeros(len(flights), bool)
+    for c in map(int, np.flatnonzero(flight.acceleration * ~flight.unknown)):
+        some = Coordinate.of(frames, flights, flight, c)
+        size = np.add.reduceat(some.curve**2, some.starts)
+        excess = np.add.reduceat(some.curve * some.rest, some.starts) / np.maximum(size, 1e-300)
+        own = flight.acceleration[c]
+        held[some.flights] |= np.abs(excess + own) < abs(own) / 2
+    return held
 
 
 class Likely(NamedTuple):
@@ -448,13 +477,19 @@ def judged(
     found = [task.settled(errors, model)]
     if len(flights) > 1:
         largest = largest_waves(frames, flights, speeds)
-        found.append(task.settled(largest, flight, found[0]))
+        if largest.waves.any():
+            found.append(task.settled(largest, flight, found[0]))
     return _cheapest(frames, found)
 
 
 def largest_waves(frames: Frames, flights: Sequence[np.ndarray], speeds: np.ndarray) -> Errors:
-    """Waves as fast as WAVE_SPEED allows, over WAVED candidates: a start from few impacts."""
+    """Waves as fast as WAVE_SPEED allows, over WAVED candidates: a start from few impacts.
+
+    None where no flight is long enough for them.
+    """
     durations = [np.ptp(frames.t[some]) for some in flights]
+    if SHARES.max() * sum(durations) < LEAST_TIME * frames.step:
+        return Errors.white(frames.sigma)
     time = max(WAVED * float(np.median(durations)), LEAST_TIME * frames.step)
     times = np.full(len(speeds), time)
     return Errors(frames.sigma, WAVE_SPEED * speeds * time, times)

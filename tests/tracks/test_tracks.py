@@ -99,7 +99,7 @@ def test_signs_units_and_gravity_that_are_wrong_are_told():
     for sigma in (1e-3, None):
         for bad, words in (
             (dict(q=-y), "curves the other way"),
-            (dict(acceleration=0.0), "not ballistic"),
+            (dict(acceleration=0.0), "acceleration"),
             (dict(q=np.degrees(angle), acceleration=0.0, units="rad"), "degrees"),
         ):
             arguments = {"t": t, "q": y, "sigma": sigma, "acceleration": -G} | bad
