@@ -17,7 +17,7 @@ from scipy.optimize import minimize_scalar
 
 from jimpact.tracks.division import price
 from jimpact.tracks.flight import Flight
-from jimpact.tracks.frames import Frames, least_noise
+from jimpact.tracks.frames import Frames, least_noise, noise
 from jimpact.tracks.waves import Covariance, Errors
 
 # Cost by which a flight of another acceleration must be better than an impact to take it away, and
@@ -43,6 +43,7 @@ WAVED = (
 )
 # Least time of waves, in frames: shorter ones are white. Ten times more is a flight.
 LEAST_TIME = 15.0
+LEAST_MEANS = 4.0  # of means of frames; ten times more would miss waves of half a flight
 # Frames by which waves are looked for; more are taken together. Ten times more take ten times as
 # long, and waves are slow.
 MOST_FRAMES = 150
@@ -328,11 +329,11 @@ class Likelihood:
         few, size = self.some.together(MOST_FRAMES)
         known = None if self.sigma is None else self.sigma / size**0.5
         binned = Likelihood(few, known, self.least / size**0.5, self.fastest, self.bent)
-        best = binned.best_waves(LEAST_TIME * step * size)
+        best = binned.best_waves(step * max(LEAST_TIME, LEAST_MEANS * size))
         saved = binned.white().cost - best.cost
         if saved < self.price_of_waves:
             return white
-        return self._beside(best, size)
+        return self._beside(best)
 
     def white(self) -> Likely:
         """Errors without waves: sigma as given, unless residuals show clearly larger ones.
@@ -441,8 +442,8 @@ class Likelihood:
         of_waves = self.price_of_waves if ratio else 0.0
         return Likely(float(cost), sigma, ratio * sigma, time, float(evidence) + of_waves)
 
-    def _beside(self, best: Likely, size: int) -> Likely:
-        """White errors beside the waves `best`, of means of `size` frames."""
+    def _beside(self, best: Likely) -> Likely:
+        """White errors beside the waves `best`, between .4 and 2.7 times those of differences."""
         wave = best.wave
         time = best.time
         if self.sigma is not None:
@@ -453,8 +454,9 @@ class Likelihood:
             sigma = float(np.exp(logarithm))
             return replace(self, sigma=sigma).at(wave / sigma, time)
 
-        middle = np.log(max(best.sigma * size**0.5, self.least))
-        bounds = (max(middle - 2.0, np.log(self.least) - 1e-9), middle + 2.0)
+        differences = float(noise(self.some.rest[:, None])[0])  # which waves hardly enter
+        middle = np.log(max(differences, self.least))
+        bounds = (middle - 1.0, middle + 1.0)
         found = minimize_scalar(
             lambda x: of(x).cost, bounds=bounds, method="bounded", options={"xatol": 0.02}
         )
