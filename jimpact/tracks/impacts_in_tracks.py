@@ -46,18 +46,21 @@ def find_impacts(
     """The impacts of a track: instants, velocities before and after, and their covariance.
 
     Equation: between impacts `q = P + v (t - tau) + a (t - tau)^2 / 2`; the arcs on both sides of
-    an impact meet at its instant tau. Places P, velocities and instants of all impacts minimize
-    the sum of `((q - measured) / sigma)^2` at once: maximum likelihood for normal errors. Nothing
-    is smoothed or differentiated. Where a contact lasts, the arcs meet at the centroid of the pulse
-    of its force.
+    an impact meet at its instant tau. Places P, velocities and instants of all impacts are most
+    likely at once for normal errors, of standard error sigma and, where residuals show them, with
+    waves that neighbouring frames share; flights that bend have accelerations of their own. There
+    are as many impacts as there is evidence for beside these. Nothing is smoothed or
+    differentiated. Where a contact lasts, the arcs meet at the centroid of the pulse of its force.
 
     Args:
         t: times of the frames, rising (T,) [s].
         q: coordinates (T,) or (T, n) [m] or [rad]; NaN where the body was lost. An angle goes on
             beyond pi, or is unwrapped where `units` say 'rad'. The velocities are the rates of q.
         sigma: standard errors of q, a number or (n,), > 0; None: estimated from the residuals.
+            Residuals that are clearly larger than a given sigma take its place, and are told.
         acceleration: between impacts, a number or (n,) [m/s^2]; -9.80665 of a height; None: one
-            unknown in each coordinate, common to all flights.
+            unknown in each coordinate, common to all flights, or an entry of a list, `[0, None]`;
+            or a function of velocities (.., n) [m/s] that returns accelerations, as of spin.
         drag: k >= 0 of the air's `-k |v| v`, |v| that of the places [1/m]; .12 of a table-tennis
             ball; None: one unknown for all flights. Between impacts the arcs bend accordingly.
         contact: the longest duration of a contact, whose frames are left out, >= 0 [s].
@@ -73,8 +76,8 @@ def find_impacts(
             to a factor: between impacts it turns freely. None: as a sphere or a cube does.
 
     Returns:
-        `Track`, which prints and plots; `warnings` say which flights are not ballistic, and that
-        no impact was found. With `quaternion` velocities are (x', omega), omega in the axes of the
+        `Track`, which prints and plots; `warnings` say which flights are not ballistic, which
+        impacts are doubtful, and that no impact was found; `candidates` how many went, and why. With `quaternion` velocities are (x', omega), omega in the axes of the
         body, as of `ji.Box`, and poses hold the quaternion's scalar first.
 
     Raises:
