@@ -13,7 +13,6 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from jimpact.tracks.division import price
 from jimpact.tracks.flight import Flight
@@ -44,6 +43,10 @@ WAVED = (
 # Least time of waves, in frames: shorter ones are white. Ten times more is a flight.
 LEAST_TIME = 15.0
 LEAST_MEANS = 4.0  # of means of frames; ten times more would miss waves of half a flight
+TURNS = 2  # of white errors beside waves; more change them by less than a hundredth
+# Share of the diagonal of normal matrices by which they are kept from being singular where a flight
+# has one frame. Ten times more is still far below noise.
+ROUNDED = 1e-12
 # Frames by which waves are looked for; more are taken together. Ten times more take ten times as
 # long, and waves are slow.
 MOST_FRAMES = 150
@@ -198,8 +201,8 @@ def _rest(grams: np.ndarray, terms: int) -> np.ndarray:
     scale = 1 / np.sqrt(np.maximum(np.diagonal(normal, axis1=1, axis2=2), 1e-300))
     normal = normal * scale[:, :, None] * scale[:, None]
     right = right * scale
-    inverse = np.linalg.pinv(normal, hermitian=True)
-    explained = np.einsum("fi,fij,fj->f", right, inverse, right)
+    normal = normal + ROUNDED * np.eye(terms)
+    explained = (right * np.linalg.solve(normal, right[:, :, None])[:, :, 0]).sum(axis=1)
     return np.maximum(grams[:, -1, -1] - explained, 0.0)
 
 
@@ -443,24 +446,14 @@ class Likelihood:
         return Likely(float(cost), sigma, ratio * sigma, time, float(evidence) + of_waves)
 
     def _beside(self, best: Likely) -> Likely:
-        """White errors beside the waves `best`, between .4 and 2.7 times those of differences."""
-        wave = best.wave
-        time = best.time
+        """White errors beside the waves `best`, by turns from those of differences on."""
         if self.sigma is not None:
-            return self.at(wave / self.sigma, time)
-
-        def of(logarithm: float) -> Likely:
-            """Cost of a sigma."""
-            sigma = float(np.exp(logarithm))
-            return replace(self, sigma=sigma).at(wave / sigma, time)
-
-        differences = float(noise(self.some.rest[:, None])[0])  # which waves hardly enter
-        middle = np.log(max(differences, self.least))
-        bounds = (middle - 1.0, middle + 1.0)
-        found = minimize_scalar(
-            lambda x: of(x).cost, bounds=bounds, method="bounded", options={"xatol": 0.02}
-        )
-        return of(max(float(found.x), float(np.log(self.least))))
+            return self.at(best.wave / self.sigma, best.time)
+        free = replace(self, sigma=None)
+        sigma = max(float(noise(self.some.rest[:, None])[0]), self.least)
+        for _ in range(TURNS):
+            sigma = free.at(best.wave / sigma, best.time).sigma
+        return replace(self, sigma=sigma).at(best.wave / sigma, best.time)
 
 
 # ------------------------------------------------------------------------------ which are impacts
