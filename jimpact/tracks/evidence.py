@@ -43,6 +43,9 @@ WAVED = (
 # Least time of waves, in frames: shorter ones are white. Ten times more is a flight.
 LEAST_TIME = 15.0
 LEAST_MEANS = 4.0  # of means of frames; ten times more would miss waves of half a flight
+# Share of the frames in flights that are not held from which on those that bend make all bend. A
+# tenth of it would free all flights of a body that slides at times.
+MOSTLY = 0.4
 TURNS = 2  # of white errors beside waves; more change them by less than a hundredth
 # Share of the diagonal of normal matrices by which they are kept from being singular where a flight
 # has one frame. Ten times more is still far below noise.
@@ -231,6 +234,7 @@ def likely_errors(
     least = least_noise(frames.q)
     held = held_rather(frames, flights, flight)
     likely: dict[int, Likelihood] = {}
+    mostly = np.zeros(n, bool)
     for c in range(n):
         some = Coordinate.of(frames, flights, flight, c)
         if len(some.t) <= 2 * len(some.starts):
@@ -242,8 +246,10 @@ def likely_errors(
         on_lines = Likelihood(some, known, least[c], WAVE_SPEED * speeds[c], none)
         found = on_lines.most_likely(frames.step)
         curved = on_lines.curved()
-        if (curved & ~held[some.flights]).any():
-            curved = some.counts > 3  # what bends one flight, a table or drag, bends all
+        free = ~held[some.flights]
+        if some.counts[curved & free].sum() > MOSTLY * some.counts[free].sum():
+            curved = some.counts > 3  # what bends most, a table or drag, bends all
+            mostly[c] = True
         if curved.any():
             other = replace(on_lines, bent=curved).most_likely(frames.step)
             price_of_curves = curved.sum() * price_of_bend(len(some.t))
@@ -256,9 +262,9 @@ def likely_errors(
         likely[c] = on_lines
     angles = np.array(frames.angles or (False,) * n)
     for kind in (angles, ~angles):
-        if not bent[np.ix_(~held, kind)].any():
+        if not (mostly & bent.any(axis=0))[kind].any():
             continue
-        for c in map(int, np.flatnonzero(kind & ~bent[~held].any(axis=0))):
+        for c in map(int, np.flatnonzero(kind & ~mostly)):
             if c in likely:  # drag and spin bend all places, though one by little
                 curved = likely[c].some.counts > 3
                 found = replace(likely[c], bent=curved).most_likely(frames.step)
