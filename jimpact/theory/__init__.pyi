@@ -1,5 +1,6 @@
 """Public names of `ji.theory` and where they live."""
 
+from jimpact.core.contact import kinetic_angles as kinetic_angles
 from jimpact.motion.accelerations import (
     contact_problem as contact_problem,
     quasi_lagrange as quasi_lagrange,
