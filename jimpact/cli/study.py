@@ -118,10 +118,10 @@ def read_study(path: str | Path, law: str | None = None) -> Study | MotionStudy:
       with scenes of their own near_m, contacts (only shots with that many). Without shots a study
       can be compared, not fitted.
     - `[track]`, in the place of `[data]`: file (relative to the study), and the arguments of
-      `ji.tracks.read` and `ji.tracks.find_impacts` by their names (columns, unit, time or rate,
-      decimal; sigma, acceleration, drag, contact, shortest, window; of poses quaternion, inertia);
-      "unknown" of acceleration or drag is None; of a body near_m. The study's `track` holds the
-      impacts.
+      `ji.tracks.read` and `ji.tracks.find_impacts` by their names (columns, unit, time, frame or
+      rate, where, decimal; sigma, acceleration, drag, contact, shortest, window; of poses
+      quaternion, inertia); "unknown" of acceleration or drag is None; of a body near_m; label of
+      the shots, doubtful. The study's `track` holds the impacts.
     - `[bounces]`, in the place of `[data]`: times, sigma, gravity, see `ji.tracks.bounce_times`.
     - `[monte_carlo]`: velocity_m_per_s, gaps_m, law, samples, seed, chunk, bins; see
       `monte_carlo`.

@@ -7,19 +7,23 @@ second. Places and instants are found by Gauss-Newton; an arc meets its neighbou
 normal matrix is banded.
 
 K impacts have K + 2 ends of K + 1 flights: the impacts, the first and the last frame. The unknowns
-of the fit are (P_i, tau_i) of each end in turn, n + 1 values, then those of acceleration (n) and
-drag (1) that are free. Slopes of one flight are in 3 n + 3 values: P_i, tau_i, P_(i+1), tau_(i+1),
-a, k.
+of the fit are (P_i, tau_i, b_i) of each end in turn, 2 n + 1 values, b_i the acceleration of the
+flight's own that begins there (0 unless the model has it), then those of acceleration (n) and drag
+(1) that are unknown. Slopes of one flight are in W values: those of both its ends, a, k.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import solveh_banded
 
-from jimpact.tracks.drag import bent, bent_slopes, between
+from jimpact.tracks.drag import between
+from jimpact.tracks.flight import Flight
+from jimpact.tracks.frames import Frames
+from jimpact.tracks.waves import Errors
 
 STEPS = 60  # of Gauss-Newton; 5 are common. More are not, as frames change flights by turns.
 SETTLING = 20  # steps after which frames stay in their flights
@@ -28,7 +32,8 @@ SETTLING = 20  # steps after which frames stay in their flights
 BEYOND = 3
 # Share of a flight by which an instant moves in a step, below one half, so that two never meet.
 LARGEST_MOVE = 0.45
-# Share of a frame below which the instants have settled. Ten times more is still far below noise.
+# Share of a frame below which the instants have settled, and the places in their parts. Ten times
+# more is still far below noise.
 SETTLED = 1e-7
 
 
@@ -36,33 +41,84 @@ SETTLED = 1e-7
 class Arcs:
     """Arcs between K + 2 ends, of which the first and the last are no impacts.
 
-    Fields: instants tau (K + 2,) [s], places P (K + 2, n) [m, rad], acceleration a (n,) [m/s^2],
-    drag k [1/m]; free: (acceleration, drag), true for unknown ones; covariance of the unknowns;
-    members: frames of each flight; residual (T, n) in units of sigma, NaN where no frame was used.
+    Fields: instants tau (K + 2,) [s], places P (K + 2, n) [m, rad], accelerations of flights' own
+    (K + 2, n), the model of the flights, their errors; covariance of the unknowns; members: frames
+    of each flight; residual (T, n) in units of sigma, NaN where no frame was used; `bent` (K + 1,
+    n), true where a flight has an acceleration of its own.
     """
 
     instants: np.ndarray
     places: np.ndarray
-    acceleration: np.ndarray
-    drag: float
-    free: tuple[bool, bool]
+    own: np.ndarray
+    flight: Flight
+    errors: Errors
     covariance: np.ndarray
     members: list[np.ndarray]
     residual: np.ndarray
+    bent: np.ndarray
+
+    @property
+    def acceleration(self) -> np.ndarray:
+        """Acceleration a (n,) of all flights [m/s^2]."""
+        return self.flight.acceleration
+
+    @property
+    def drag(self) -> float:
+        """Drag k of all flights [1/m]."""
+        return self.flight.drag
+
+    @property
+    def impacts(self) -> int:
+        """Number K of impacts."""
+        return len(self.instants) - 2
+
+    @cached_property
+    def end_velocities(self) -> tuple[np.ndarray, np.ndarray]:
+        """Velocities (K + 1, n) at the first and at the last end of each flight [m/s, rad/s]."""
+        h = np.diff(self.instants)
+        mean = np.diff(self.places, axis=0) / h[:, None]
+        bend = (self.acceleration + self.own[:-1]) / 2 * h[:, None]
+        first = mean - bend
+        last = mean + bend
+        if self.flight.bends:
+            for i in range(len(h)):
+                _, rates = self.flight.deviation(np.zeros(1), *self.ends(i))
+                first[i] += rates[0]
+                last[i] += rates[-1]
+        return first, last
+
+    @property
+    def size(self) -> int:
+        """Number of values of an end in `covariance`: place, instant, acceleration of its own."""
+        return 2 * self.places.shape[1] + 1
+
+    def rows_of_instants(self) -> np.ndarray:
+        """Rows (K,) of the instants of impacts in `covariance`."""
+        return _rows_of_instants(*self.places.shape)
+
+    def changed(self, change: np.ndarray) -> "Arcs":
+        """Arcs after a change (N,) of the unknowns."""
+        count, n = self.places.shape
+        ends = change[: count * self.size].reshape(count, self.size)
+        return replace(
+            self,
+            instants=self.instants + ends[:, n],
+            places=self.places + ends[:, :n],
+            own=self.own + ends[:, n + 1 :],
+            flight=self.flight.moved(change[count * self.size :]),
+        )
+
+    def ends(self, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Instants (2,) and places (2, n) of the ends of flight i, its own acceleration (n,)."""
+        pair = slice(i, i + 2)
+        return self.instants[pair], self.places[pair], self.own[i]
 
     def velocities(self) -> tuple[np.ndarray, np.ndarray]:
         """Velocities v- (K, n) and v+ (K, n) [m/s, rad/s] of each impact, see the head of the file.
 
         Drag adds the end rates of `bent` to those of parabolas.
         """
-        h = np.diff(self.instants)
-        mean, bend = np.diff(self.places, axis=0) / h[:, None], self.acceleration / 2
-        first, last = mean - bend * h[:, None], mean + bend * h[:, None]
-        if self.drag:
-            ends, both = _pairs(self.instants), _pairs(self.places)
-            a, k = np.tile(self.acceleration, (len(h), 1)), np.full(len(h), self.drag)
-            _, rates = bent(np.zeros(1), ends, both, a, k)
-            first, last = first + rates[:, 0], last + rates[:, 1]
+        first, last = self.end_velocities
         return last[:-1], first[1:]
 
     def gain(self) -> np.ndarray:
@@ -71,215 +127,452 @@ class Arcs:
         Of a flight with duration h and mean velocity w: `v = w -/+ a h / 2` at its first and last
         end, w = (P_1 - P_0) / h, dw/dtau_1 = -w / h.
         """
-        K, n = len(self.instants) - 2, self.places.shape[1]
-        h, columns = np.diff(self.instants), _columns(n, self.free)
-        mean, bend = np.diff(self.places, axis=0) / h[:, None], self.acceleration / 2
-        gain, size = np.zeros((K, 2, n, len(self.covariance))), n + 1
+        K = self.impacts
+        n = self.places.shape[1]
+        size = self.size
+        gain = np.zeros((K, 2, n, len(self.covariance)))
         for i in range(K + 1):  # flight i has v+ of the impact before it, v- of the one after it
-            slopes, each = np.zeros((2, n, 3 * n + 3)), np.arange(n)
-            for end, sign in ((0, -1.0), (1, 1.0)):
-                slope = mean[i] / h[i] - sign * bend  # of the velocity in -h
-                slopes[end, each, each] = -1 / h[i]
-                slopes[end, each, size + each] = 1 / h[i]
-                slopes[end, :, n], slopes[end, :, size + n] = slope, -slope
-                slopes[end, each, 2 * size + each] = sign * h[i] / 2
-            if self.drag or self.free[1]:
-                pair = slice(i, i + 2)
-                where = (self.instants[pair], self.places[pair], self.acceleration, self.drag)
-                slopes += bent_slopes(np.zeros(1), *where)[3]
+            slopes = self._end_slopes(i)
+            own = slice(i * size, (i + 2) * size)
+            common = slopes[:, :, 2 * size + self.flight.columns]
             for k, side, end in ((i - 1, 1, 0), (i, 0, 1)):
                 if 0 <= k < K:
-                    gain[k, side, :, i * size : (i + 2) * size] = slopes[end, :, : 2 * size]
-                    gain[k, side, :, (K + 2) * size :] = slopes[end][:, 2 * size + columns]
+                    gain[k, side, :, own] = slopes[end, :, : 2 * size]
+                    gain[k, side, :, (K + 2) * size :] = common[end]
         return gain
+
+    def _end_slopes(self, i: int) -> np.ndarray:
+        """Derivatives (2, n, W) of the velocities at both ends of flight i."""
+        tau, places, own = self.ends(i)
+        n = places.shape[1]
+        size = self.size
+        each = np.arange(n)
+        h = tau[-1] - tau[0]
+        mean = (places[-1] - places[0]) / h
+        slopes = np.zeros((2, n, 2 * size + n + 1))
+        for end, sign in ((0, -1.0), (1, 1.0)):
+            slope = mean / h - sign * (self.acceleration + own) / 2  # of the velocity in -h
+            slopes[end, each, each] = -1 / h
+            slopes[end, each, size + each] = 1 / h
+            slopes[end, :, n] = slope
+            slopes[end, :, size + n] = -slope
+            slopes[end, each, 2 * size + each] = sign * h / 2
+        if self.flight.bends:
+            moved = self.flight.deviation_slopes(np.zeros(1), tau, places, own)[-1]
+            slopes += _in_columns(moved, n)
+        slopes[:, :, n + 1 : size] = slopes[:, :, 2 * size : -1]
+        return slopes
 
     @property
     def drag_error(self) -> float:
         """Standard error of an unknown drag, 0 of a known one [1/m]."""
-        return float(np.sqrt(self.covariance[-1, -1])) if self.free[1] else 0.0
+        return float(np.sqrt(self.covariance[-1, -1])) if self.flight.drag_unknown else 0.0
 
+    def instant_errors(self) -> np.ndarray:
+        """Standard errors (K,) of the instants [s]."""
+        return np.sqrt(np.diag(self.covariance)[self.rows_of_instants()])
+
+    @cached_property
     def covariance_of_velocities(self) -> np.ndarray:
         """Covariance `G C G^T` (2nK, 2nK) of (v-, v+) of each impact in turn, G of `gain`."""
         flat = self.gain().reshape(-1, len(self.covariance))
         return flat @ self.covariance @ flat.T
 
+    def jumps(self) -> np.ndarray:
+        """Largest `|v+ - v-| / error` over the coordinates of each impact (K,)."""
+        pre, post = self.velocities()
+        K, n = pre.shape
+        blocks = self.covariance_of_velocities.reshape(K, 2, n, K, 2, n)
+        each = np.arange(K)
+        own = blocks[each, :, :, each]  # (K, 2, n, 2, n)
+        before = own[:, 0, :, 0]
+        after = own[:, -1, :, -1]
+        between = own[:, 0, :, -1]
+        variance = before + after - between - between.swapaxes(1, 2)
+        errors = np.sqrt(np.maximum(np.diagonal(variance, axis1=1, axis2=2), 1e-300))
+        return np.abs((post - pre) / errors).max(axis=1, initial=0.0)
 
-def fit_arcs(
-    t: np.ndarray,
-    q: np.ndarray,
-    sigma: np.ndarray,
-    flights: list[np.ndarray],
-    acceleration: np.ndarray,
-    free: bool,
-    contact: float,
-    instants: np.ndarray | None = None,
-    frozen: bool = False,
-    drag: float = 0.0,
-    free_drag: bool = False,
-) -> Arcs:
-    """The arcs of these flights by maximum likelihood: least squares of (q - arc) / sigma.
+    def with_members(self, members: list[np.ndarray]) -> "Arcs":
+        """The same arcs by other frames, before they are fitted."""
+        return replace(self, members=members)
 
-    Gauss-Newton steps in places, instants and what is free, each instant bounded; after every step
-    frames are divided among the flights anew.
 
-    Args:
-        t: (T,) times.
-        q: (T, n), NaN where lost.
-        sigma: (n,).
-        flights: frames of each.
-        acceleration: known, or a first value.
-        free: whether it is unknown.
-        drag: known, or a first value.
-        free_drag: whether it is unknown.
-        contact: duration of a contact, whose frames are left out.
-        instants: first values for the impacts (K,).
-        frozen: whether these stay, so that places alone are found.
+def _in_columns(slopes: np.ndarray, n: int) -> np.ndarray:
+    """Slopes (.., 3 n + 3) of `bent_slopes` in the W columns of the unknowns of a flight."""
+    size = 2 * n + 1
+    ends = np.arange(n + 1)
+    found = np.zeros((*slopes.shape[:-1], 2 * size + n + 1))
+    found[..., ends] = slopes[..., : n + 1]
+    found[..., size + ends] = slopes[..., n + 1 : 2 * n + 2]
+    found[..., 2 * size :] = slopes[..., 2 * n + 2 :]
+    return found
+
+
+def _rows_of_instants(ends: int, n: int) -> np.ndarray:
+    """Rows (ends - 2,) of the instants of impacts among (place, instant, own acceleration)."""
+    return (np.arange(ends - 2) + 1) * (2 * n + 1) + n
+
+
+class _Ends(NamedTuple):
+    """Instants, places and accelerations of flights' own (K + 2, ..), and the model: all values."""
+
+    tau: np.ndarray
+    places: np.ndarray
+    own: np.ndarray
+    flight: Flight
+
+
+@dataclass(frozen=True)
+class Start:
+    """What a fit starts from.
+
+    Fields: frames of each flight; the model with first values; errors; `bent` (K + 1, n), true
+    where a flight has an acceleration of its own beside that of the model; the duration of a
+    contact, whose frames are left out [s]; first values of the instants (K,), None: where arcs
+    cross; instant_errors (K,): the instants are known, with these standard errors, and stay.
     """
+
+    flights: list[np.ndarray]
+    flight: Flight
+    errors: Errors
+    bent: np.ndarray
+    contact: float = 0.0
+    instants: np.ndarray | None = None
+    instant_errors: np.ndarray | None = None
+
+    def joined_at(self, k: int) -> "Start":
+        """The same with flights k and k + 1 as one."""
+        two = slice(k, k + 2)
+        flights = [*self.flights[:k], np.concatenate(self.flights[two]), *self.flights[k + 2 :]]
+        bent = np.delete(self.bent, k, axis=0)
+        bent[k] |= self.bent[k]
+        return replace(self, flights=flights, bent=bent)
+
+
+def fit_arcs(frames: Frames, start: Start) -> Arcs:
+    """The arcs of these flights by maximum likelihood: least squares of (q - arc), by their errors.
+
+    Gauss-Newton steps in places, instants and what is unknown, each instant bounded by the last
+    frame seen before and the first one seen after it; after every step frames are divided among the
+    flights anew.
+    """
+    t = frames.t
+    flights = [some[np.isfinite(frames.q[some]).any(axis=1)] for some in start.flights]
     pool = np.concatenate(flights)
+    last = np.array([t[some[-1]] for some in flights[:-1]])
+    first = np.array([t[some[0]] for some in flights[1:]])
+    low = last - BEYOND * frames.step
+    high = first + BEYOND * frames.step
+    instants = start.instants
     if instants is None:
-        instants = np.array([(t[f[-1]] + t[g[0]]) / 2 for f, g in pairwise(flights)])
+        instants = crossings(frames, flights, start.flight)
     tau = np.concatenate([[t[pool[0]]], instants, [t[pool[-1]]]])
-    last = np.array([t[f[-1]] for f in flights[:-1]])
-    first = np.array([t[f[0]] for f in flights[1:]])
-    a, step, unknown = acceleration.copy(), float(np.median(np.diff(t))), (free, free_drag)
-    places = between(tau, t, q)
-    members, moving = _members(t, pool, tau, contact, flights), False
-    for k in range(1 if frozen else STEPS):
-        values = ArcValues(tau, places, a, drag)
-        _, change = _step(t, q, sigma, members, values, unknown, moving)
+    places = between(tau, t, frames.q)
+    ends = _Ends(tau, places, np.zeros_like(places), start.flight)
+    division = _Members(t, pool, start.contact, flights)
+    problem = _Problem(frames, start.errors, start.bent, division.at(tau))
+    moving = start.instant_errors is None
+    for k in range(STEPS):
+        _, change = problem.step(ends, moving and k > 0)
         new = tau + change.tau
         room = LARGEST_MOVE * np.diff(tau)
         new[1:-1] = np.clip(new[1:-1], tau[1:-1] - room[:-1], tau[1:-1] + room[1:])
-        new[1:-1] = np.clip(new[1:-1], last - BEYOND * step, first + BEYOND * step)
-        moved, moving = np.abs(new - tau).max(initial=0.0), True
-        tau, places = new, places + change.places
-        a, drag = a + change.a, drag + change.drag
-        if k < SETTLING and not frozen:
-            members = _members(t, pool, tau, contact, flights)
-        if k > 0 and moved <= SETTLED * step:
+        new[1:-1] = np.clip(new[1:-1], low, high)
+        moved = change.seconds(new - tau, ends)
+        tau = new
+        model = ends.flight.moved(change.common)
+        ends = _Ends(tau, ends.places + change.places, ends.own + change.own, model)
+        if k < SETTLING and moving:
+            problem = problem.with_members(division.at(tau))
+        if k > 0 and moved <= SETTLED * frames.step:
             break
-    values = ArcValues(tau, places, a, drag)
-    normal, _ = _step(t, q, sigma, members, values, unknown, not frozen)
-    residual = np.full(q.shape, np.nan)
-    for i, frames in enumerate(members):
-        residual[frames] = (q[frames] - _arc(t[frames], i, values)) / sigma
-    ends = np.arange(len(tau))
-    covariance = _inverse(normal, ends if frozen else ends[[0, -1]])
-    return Arcs(*values, unknown, covariance, members, residual)
+    normal, _ = problem.step(ends, moving)
+    covariance = _inverse(normal)
+    if start.instant_errors is not None:
+        own = _rows_of_instants(*ends.places.shape)
+        covariance[own, own] = start.instant_errors**2
+    covariance = _of_places(covariance, problem.drift(ends))
+    residual = problem.residual(ends)
+    return Arcs(*ends, start.errors, covariance, problem.members, residual, start.bent)
 
 
-def _pairs(x: np.ndarray) -> np.ndarray:
-    """Neighbours (K - 1, 2, ..) of x (K, ..)."""
-    return np.stack([x[:-1], x[1:]], axis=1)
+def crossings(frames: Frames, flights: list[np.ndarray], flight: Flight) -> np.ndarray:
+    """Instants (K,) at which the lines of neighbouring flights cross, acceleration taken away.
 
-
-def _columns(n: int, free: tuple[bool, bool]) -> np.ndarray:
-    """Indices of the free ones among acceleration (n) and drag (1)."""
-    return np.flatnonzero([free[0]] * n + [free[1]])
-
-
-def _members(
-    t: np.ndarray, pool: np.ndarray, tau: np.ndarray, contact: float, flights: list[np.ndarray]
-) -> list[np.ndarray]:
-    """Frames of each flight by the instants tau: those in contact, tau_i +/- contact / 2, are out.
-
-    If a flight had less than 3 frames so, all of them stay as they are in `flights`.
+    Equation: lines `p + v (t - t_0)` of both: the least `|dp + dv (t - t_0)|` in sigma, between the
+    last frame before and the first one after.
     """
-    low = np.concatenate([[-np.inf], tau[1:-1] + contact / 2])
-    high = np.concatenate([tau[1:-1] - contact / 2, [np.inf]])
-    x = t[pool]
-    inside = [pool[np.searchsorted(x, i) : np.searchsorted(x, j)] for i, j in zip(low, high)]
-    return inside if min(map(len, inside)) >= 3 else flights
+    instants = np.zeros(len(flights) - 1)
+    straight = flight.straight(frames)
+    lines = [_line(straight, some, flight.acceleration) for some in flights]
+    for k, ((at, p, v), (other, p_after, v_after)) in enumerate(pairwise(lines)):
+        low = frames.t[flights[k][-1]]
+        high = frames.t[flights[k + 1][0]]
+        a = flight.acceleration
+        # of the parabola around one middle, the line around the other one
+        shift = other - at
+        p_here = p_after - v_after * shift + a * shift**2 / 2
+        v_here = v_after - a * shift
+        dp = (p_here - p) / frames.sigma
+        dv = (v_here - v) / frames.sigma
+        size = float(dv @ dv)
+        since = -float(dp @ dv) / size if size > 0 else np.inf
+        instants[k] = at + since if low <= at + since <= high else (low + high) / 2
+    return instants
 
 
-class ArcValues(NamedTuple):
-    """Values of all arcs, or a step in them."""
-
-    tau: np.ndarray  # instants (K + 2,) [s]
-    places: np.ndarray  # P (K + 2, n)
-    a: np.ndarray  # acceleration (n,)
-    drag: float  # k [1/m]
-
-
-def _arc(x: np.ndarray, i: int, values: ArcValues) -> np.ndarray:
-    """Places (F, n) of flight i at times x (F,).
-
-    Equation: `P_i (1 - s) + P_(i+1) s - a (x - tau_i) (tau_(i+1) - x) / 2`, and D of `bent`.
-    """
-    tau, places, a, drag = values
-    s = ((x - tau[i]) / (tau[i + 1] - tau[i]))[:, None]
-    bend = ((x - tau[i]) * (tau[i + 1] - x) / 2)[:, None]
-    arc = places[i] * (1 - s) + places[i + 1] * s - a * bend
-    if drag:
-        pair = slice(i, i + 2)
-        arc += bent(x, tau[None, pair], places[None, pair], a[None], np.array([drag]))[0][0]
-    return arc
+def _line(
+    frames: Frames, some: np.ndarray, acceleration: np.ndarray
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Middle of a flight [s], place (n,) and velocity (n,) there, by lines of least squares."""
+    at = float(frames.t[some].mean())
+    n = frames.q.shape[1]
+    place = np.zeros(n)
+    velocity = np.zeros(n)
+    for c in range(n):
+        ok = some[np.isfinite(frames.q[some, c])]
+        if not len(ok):
+            continue
+        x = frames.t[ok] - at
+        y = frames.q[ok, c] - acceleration[c] * x**2 / 2
+        spread = x - x.mean()
+        size = float(spread @ spread)
+        velocity[c] = float(spread @ y) / size if size > 0 else 0.0
+        place[c] = y.mean() - velocity[c] * x.mean()
+    return at, place, velocity
 
 
-def _slopes(x: np.ndarray, i: int, values: ArcValues, with_drag: bool) -> np.ndarray:
-    """Derivatives (F, n, 3 n + 3) of `_arc` in the ends of flight i, acceleration and drag."""
-    (tau, places, a, drag), n = values, values.places.shape[1]
-    h, each, size = tau[i + 1] - tau[i], np.arange(n), n + 1
-    s, slopes = (x - tau[i]) / h, np.zeros((len(x), n, 3 * n + 3))
-    rise = (places[i + 1] - places[i]) / h
-    slopes[:, each, each], slopes[:, each, size + each] = (1 - s)[:, None], s[:, None]
-    slopes[:, :, n] = -rise * (1 - s)[:, None] + a * (tau[i + 1] - x)[:, None] / 2
-    slopes[:, :, size + n] = -rise * s[:, None] - a * (x - tau[i])[:, None] / 2
-    slopes[:, each, 2 * size + each] = -((x - tau[i]) * (tau[i + 1] - x) / 2)[:, None]
-    if with_drag:
-        slopes += bent_slopes(x, tau[i : i + 2], places[i : i + 2], a, drag)[2]
-    return slopes
+@dataclass(frozen=True)
+class _Members:
+    """Division of a pool of frames among flights by instants."""
+
+    t: np.ndarray
+    pool: np.ndarray
+    contact: float
+    flights: list[np.ndarray]
+
+    def at(self, tau: np.ndarray) -> list[np.ndarray]:
+        """Frames of each flight by the instants tau; those in contact, tau_i +/- contact / 2, are
+        out.
+
+        If a flight had less than 3 frames so, all of them stay as they are in `flights`.
+        """
+        x = self.t[self.pool]
+        low = np.searchsorted(x, tau[1:-1] + self.contact / 2)
+        high = np.searchsorted(x, tau[1:-1] - self.contact / 2)
+        starts = np.concatenate([[0], low])
+        stops = np.concatenate([high, [len(x)]])
+        if (stops - starts).min() < 3:
+            return self.flights
+        return [self.pool[i:j] for i, j in zip(starts, stops)]
 
 
 class NormalMatrix(NamedTuple):
-    """Normal matrix J^T J of the fit: banded for the ends (N values), bordered by b common ones."""
+    """Normal matrix J^T C^-1 J: banded for the ends (N values), bordered by b common ones."""
 
     bands: np.ndarray  # (width + 1, N) upper bands, as `scipy.linalg.solveh_banded` takes them
     border: np.ndarray  # (N, b)
     corner: np.ndarray  # (b, b)
+    fixed: np.ndarray  # values that stay
 
 
-def _step(
-    t: np.ndarray,
-    q: np.ndarray,
-    sigma: np.ndarray,
-    members: list[np.ndarray],
-    values: ArcValues,
-    free: tuple[bool, bool],
-    moving: bool,
-) -> tuple[NormalMatrix, ArcValues]:
-    """Normal matrix at these values, and the Gauss-Newton step from them.
+class _Change(NamedTuple):
+    """Step in instants (K + 2,), places, own accelerations (K + 2, n), and the model (b,)."""
 
-    Equation: `J^T J step = J^T r`, r = (q - arc) / sigma over frames that were seen, J the
-    derivatives of arc / sigma. Instants stay unless `moving`, those of the first and the last end
-    always. `members`: frames of each flight; `free`: acceleration, drag are unknown.
-    """
-    (tau, *_, drag), n = values, q.shape[1]
-    size, columns = n + 1, _columns(n, free)
-    blocks = np.zeros((len(tau), 2 * size, 2 * size))  # J^T J of each flight in its two ends
-    border = np.zeros((len(tau) * size, len(columns)))
-    corner, right_b = np.zeros((len(columns), len(columns))), np.zeros(len(columns))
-    right = np.zeros(len(tau) * size)
-    used = np.concatenate([np.arange(2 * size), 2 * size + columns])  # of the 3 n + 3 slopes
-    for i, frames in enumerate(members):
-        x = t[frames]
-        rest = (q[frames] - _arc(x, i, values)) / sigma
-        slopes = _slopes(x, i, values, bool(drag) or free[1])[:, :, used] / sigma[:, None]
-        ok = np.isfinite(rest)
-        J, rows = slopes[ok], slice(i * size, (i + 2) * size)
-        square, gradient = J.T @ J, J.T @ rest[ok]
-        blocks[i] = square[: 2 * size, : 2 * size]
-        right[rows] += gradient[: 2 * size]
-        border[rows] += square[: 2 * size, 2 * size :]
-        corner, right_b = corner + square[2 * size :, 2 * size :], right_b + gradient[2 * size :]
-    instants = np.arange(len(tau)) * size + n
-    fixed = instants[[0, -1]] if moving else instants
-    normal = NormalMatrix(_banded(blocks, len(tau), size, fixed), border, corner)
-    border[fixed], right[fixed] = 0.0, 0.0
-    solved, common = _solve(normal, right, right_b)
-    of_ends, shared = solved.reshape(len(tau), size), np.zeros(n + 1)
-    shared[columns] = common
-    return normal, ArcValues(of_ends[:, n], of_ends[:, :n], shared[:n], float(shared[n]))
+    tau: np.ndarray
+    places: np.ndarray
+    own: np.ndarray
+    common: np.ndarray
+
+    def seconds(self, moved: np.ndarray, ends: _Ends) -> float:
+        """Size of the step [s]: of instants, `moved`, and of places where the model bends."""
+        size = float(np.abs(moved).max(initial=0.0))
+        if not ends.flight.bends:
+            return size
+        duration = ends.tau[-1] - ends.tau[0]
+        length = np.abs(np.diff(ends.places, axis=0)).max(initial=1e-300)
+        return max(size, duration * float(np.abs(self.places).max()) / length)
+
+
+class _Problem:
+    """Least squares of one division of the frames: residuals, slopes and steps."""
+
+    def __init__(
+        self, frames: Frames, errors: Errors, bent: np.ndarray, members: list[np.ndarray]
+    ) -> None:
+        self.frames = frames
+        self.errors = errors
+        self.bent = bent
+        self.members = members
+        self.rows = np.concatenate(members)
+        lengths = [len(some) for some in members]
+        self.flights = np.repeat(np.arange(len(members)), lengths)
+        self.seen = [np.isfinite(x) for x in frames.q[self.rows].T]
+        self.covariances = [self._covariance(c, ok) for c, ok in enumerate(self.seen)]
+
+    def with_members(self, members: list[np.ndarray]) -> "_Problem":
+        """The problem of another division; this one where it is the same."""
+        if all(map(np.array_equal, members, self.members)):
+            return self
+        return _Problem(self.frames, self.errors, self.bent, members)
+
+    def _covariance(self, c: int, ok: np.ndarray) -> tuple:
+        """Covariance of coordinate c in the frames `ok`, and the flights that have any."""
+        own = self.flights[ok]
+        starts = np.flatnonzero(np.diff(own, prepend=-1))
+        return self.errors.of(c, self.frames.t[self.rows[ok]], starts), own[starts]
+
+    def arc(self, ends: _Ends) -> np.ndarray:
+        """Places (R, n) of all frames in flights.
+
+        Equation: `P_i (1 - s) + P_(i+1) s - a (x - tau_i) (tau_(i+1) - x) / 2`, and D of `bent`.
+        """
+        x = self.frames.t[self.rows]
+        since = x - ends.tau[self.flights]
+        until = ends.tau[self.flights + 1] - x
+        s = (since / (since + until))[:, None]
+        first = ends.places[self.flights]
+        last = ends.places[self.flights + 1]
+        a = ends.flight.acceleration + ends.own[self.flights]
+        arc = first * (1 - s) + last * s - a * (since * until / 2)[:, None]
+        if ends.flight.drag or ends.flight.force is not None:
+            for i, some in self._flights():
+                pair = slice(i, i + 2)
+                where = (ends.tau[pair], ends.places[pair], ends.own[i])
+                arc[some] += ends.flight.deviation(x[some], *where)[0]
+        return arc
+
+    def residual(self, ends: _Ends) -> np.ndarray:
+        """Residuals (T, n) in sigma, NaN where a frame is in no flight."""
+        found = np.full(self.frames.q.shape, np.nan)
+        found[self.rows] = (self.frames.q[self.rows] - self.arc(ends)) / self.errors.sigma
+        return found
+
+    def slopes(self, ends: _Ends) -> np.ndarray:
+        """Derivatives (R, n, W) of the arcs in the ends of each flight and the model.
+
+        Instants take their places along, see `drift`.
+        """
+        n = ends.places.shape[1]
+        size = 2 * n + 1
+        each = np.arange(n)
+        x = self.frames.t[self.rows]
+        since = (x - ends.tau[self.flights])[:, None]
+        until = (ends.tau[self.flights + 1] - x)[:, None]
+        h = since + until
+        s = since / h
+        a = ends.flight.acceleration + ends.own[self.flights]
+        rise = (ends.places[self.flights + 1] - ends.places[self.flights]) / h
+        slopes = np.zeros((len(x), n, 2 * size + n + 1))
+        slopes[:, each, each] = 1 - s
+        slopes[:, each, size + each] = s
+        slopes[:, :, n] = -rise * (1 - s) + a * until / 2
+        slopes[:, :, size + n] = -rise * s - a * since / 2
+        slopes[:, each, 2 * size + each] = -since * until / 2
+        if ends.flight.bends:
+            for i, some in self._flights():
+                pair = slice(i, i + 2)
+                where = (x[some], ends.tau[pair], ends.places[pair], ends.own[i])
+                slopes[some] += _in_columns(ends.flight.deviation_slopes(*where)[0], n)
+        slopes[:, :, n + 1 : size] = slopes[:, :, 2 * size : -1]
+        drift = self.drift(ends)
+        for end in (0, 1):
+            first = end * size
+            of_places = slopes[:, :, first : first + n]
+            moves = drift[self.flights + end]
+            slopes[:, :, first + n] += np.einsum("rcp,rp->rc", of_places, moves)
+        return slopes
+
+    def drift(self, ends: _Ends) -> np.ndarray:
+        """Velocities u (K + 2, n) of the ends: means of those of the flights on both sides.
+
+        A step moves an instant and its place by `u dtau` together: else a coordinate without a jump
+        that is seen exactly would hide what the others say of the instant.
+        """
+        rise = np.diff(ends.places, axis=0) / np.diff(ends.tau)[:, None]
+        whole = np.concatenate([rise[:1], rise, rise[-1:]])
+        return (whole[:-1] + whole[1:]) / 2
+
+    def _flights(self) -> list[tuple[int, slice]]:
+        """Number and rows of each flight."""
+        stops = np.cumsum([len(some) for some in self.members])
+        starts = np.concatenate([[0], stops[:-1]])
+        return [(i, slice(*rows)) for i, rows in enumerate(zip(starts, stops))]
+
+    def step(self, ends: _Ends, moving: bool) -> tuple[NormalMatrix, _Change]:
+        """Normal matrix at these values, and the Gauss-Newton step from them.
+
+        Equation: `J^T C^-1 J step = J^T C^-1 r`, r = q - arc over frames that were seen, J the
+        derivatives of the arcs, C the covariance of the errors. Instants stay unless `moving`,
+        those of the first and the last end always.
+        """
+        n = ends.places.shape[1]
+        size = 2 * n + 1
+        columns = ends.flight.columns
+        used = np.concatenate([np.arange(2 * size), 2 * size + columns])
+        slopes = self.slopes(ends)[:, :, used]
+        rest = self.frames.q[self.rows] - self.arc(ends)
+        width = len(used) + 1
+        grams = np.zeros((len(self.members), width, width))
+        for c, ok in enumerate(self.seen):
+            covariance, flights = self.covariances[c]
+            # of P only coordinate c of both ends moves this one, unless drag couples them
+            own = np.arange(width - 1)
+            if not ends.flight.bends:
+                common = np.flatnonzero(used == 2 * size + c)
+                own = np.concatenate([[c, n, n + 1 + c, size + c, size + n], common])
+            terms = np.column_stack([slopes[ok, c][:, own], rest[ok, c]])
+            weighted = covariance.solve(terms)
+            products = terms[:, :, None] * weighted[:, None]
+            where = np.append(own, width - 1)
+            at = np.ix_(flights, where, where)
+            grams[at] += np.add.reduceat(products, covariance.starts, axis=0)
+        return self._solved(grams, ends, moving)
+
+    def _solved(self, grams: np.ndarray, ends: _Ends, moving: bool) -> tuple[NormalMatrix, _Change]:
+        """Normal matrix and step from products (F, W, W) of slopes and residual in flights."""
+        count, n = ends.places.shape
+        size = 2 * n + 1
+        pair = 2 * size
+        b = grams.shape[1] - 1 - pair
+        border = np.zeros((count * size, b))
+        right = np.zeros(count * size)
+        for i, gram in enumerate(grams):
+            rows = slice(i * size, (i + 2) * size)
+            border[rows] += gram[:pair, pair:-1]
+            right[rows] += gram[:pair, -1]
+        corner = grams[:, pair:-1, pair:-1].sum(axis=0)
+        right_b = grams[:, pair:-1, -1].sum(axis=0)
+        instants = np.arange(count) * size + n
+        still = instants[[0, -1]] if moving else instants
+        straight = np.ones((count, n), bool)
+        straight[:-1] = ~self.bent
+        end, coordinate = np.nonzero(straight)
+        none = end * size + n + 1 + coordinate
+        fixed = np.concatenate([still, none])
+        bands = _banded(grams[:, :pair, :pair], count, size, fixed)
+        border[fixed] = 0.0
+        right[fixed] = 0.0
+        normal = NormalMatrix(bands, border, corner, fixed)
+        solved, common = _solve(normal, right, right_b)
+        of_ends = solved.reshape(count, size)
+        tau = of_ends[:, n]
+        places = of_ends[:, :n] + self.drift(ends) * tau[:, None]
+        return normal, _Change(tau, places, of_ends[:, n + 1 :], common)
+
+
+def _of_places(covariance: np.ndarray, drift: np.ndarray) -> np.ndarray:
+    """Covariance of (P, tau) of each end from that of (p, tau), `P = p + drift tau`."""
+    count, n = drift.shape
+    size = 2 * n + 1
+    turned = covariance.copy()
+    for i in range(count):
+        places = slice(i * size, i * size + n)
+        turned[places] += np.outer(drift[i], turned[i * size + n])
+    for i in range(count):
+        places = slice(i * size, i * size + n)
+        turned[:, places] += np.outer(turned[:, i * size + n], drift[i])
+    return turned
 
 
 def _banded(blocks: np.ndarray, ends: int, size: int, fixed: np.ndarray) -> np.ndarray:
@@ -288,12 +581,13 @@ def _banded(blocks: np.ndarray, ends: int, size: int, fixed: np.ndarray) -> np.n
     Row `width - d` holds the d-th diagonal above the main one. Unknowns `fixed` keep 1 on the
     diagonal, and 0 elsewhere.
     """
-    width, count = 2 * size - 1, ends * size
+    width = 2 * size - 1
+    count = ends * size
     bands = np.zeros((width + 1, count))
     for i in range(2 * size):
         for j in range(i, 2 * size):
             columns = np.arange(ends - 1) * size + j
-            bands[width - (j - i), columns] += blocks[: ends - 1, i, j]
+            bands[width - (j - i), columns] += blocks[:, i, j]
     for k in fixed:
         for d in range(width + 1):
             bands[width - d, k] = 0.0
@@ -311,39 +605,39 @@ def _solve(
     Equation: `A x + B y = right`, `B^T x + C y = right_b`: `(C - B^T A^-1 B) y = right_b - B^T A^-1
     right`. A has the bands, B is the border, C the corner.
     """
-    bands, border, corner = normal
+    bands, border, corner, _ = normal
     scale = 1 / np.sqrt(np.maximum(bands[-1], 1e-300))
     both = np.column_stack([right, border])
     solved = scale[:, None] * solveh_banded(_scaled(bands, scale), scale[:, None] * both)
-    common = np.linalg.pinv(corner - border.T @ solved[:, 1:], hermitian=True) @ (
-        right_b - border.T @ solved[:, 0]
-    )
-    return solved[:, 0] - solved[:, 1:] @ common, common
+    alone = solved[:, 0]
+    by_border = solved[:, 1:]
+    schur = np.linalg.pinv(corner - border.T @ by_border, hermitian=True)
+    common = schur @ (right_b - border.T @ alone)
+    return alone - by_border @ common, common
 
 
 def _scaled(bands: np.ndarray, scale: np.ndarray) -> np.ndarray:
     """Bands of `S A S`, S = diag(scale), so that units do not matter for rounding."""
-    width, count = bands.shape[0] - 1, bands.shape[1]
+    width = bands.shape[0] - 1
+    count = bands.shape[1]
     scaled = np.zeros_like(bands)
     for d in range(width + 1):
         scaled[width - d, d:] = bands[width - d, d:] * scale[d:] * scale[: count - d]
     return scaled
 
 
-def _inverse(normal: NormalMatrix, fixed: np.ndarray) -> np.ndarray:
-    """Covariance: inverse of the normal matrix by blocks; instants of `fixed` ends have variance 0.
+def _inverse(normal: NormalMatrix) -> np.ndarray:
+    """Covariance: inverse of the normal matrix by blocks; values that stay have variance 0.
 
     Equation: with `R = (C - B^T A^-1 B)^-1` it is
     `[[A^-1 + A^-1 B R B^T A^-1, -A^-1 B R], [-R B^T A^-1, R]]`.
     """
-    bands, border, corner = normal
+    bands, border, corner, fixed = normal
     scale = 1 / np.sqrt(np.maximum(bands[-1], 1e-300))
     inverse = scale[:, None] * solveh_banded(_scaled(bands, scale), np.diag(scale))
-    size = len(bands) // 2
-    alone = fixed * size + size - 1
-    inverse[alone, alone] = 0.0
+    inverse[fixed, fixed] = 0.0
     if not corner.size:
         return (inverse + inverse.T) / 2
-    own = np.linalg.pinv(corner - border.T @ inverse @ border, hermitian=True)
-    cross = -inverse @ border @ own
-    return np.block([[inverse - cross @ border.T @ inverse, cross], [cross.T, own]])
+    schur = np.linalg.pinv(corner - border.T @ inverse @ border, hermitian=True)
+    cross = -inverse @ border @ schur
+    return np.block([[inverse - cross @ border.T @ inverse, cross], [cross.T, schur]])

@@ -1,8 +1,10 @@
-"""What the drag of the air adds to a ballistic arc between the same ends.
+"""What forces that depend on velocity add to a ballistic arc between the same ends.
 
-With `a = g - k |v| v` a flight is the arc of g plus D, `D'' = -k |v| v`, D = 0 at both ends. D''
-is a polynomial through Chebyshev points, found by Picard's iteration.
+With `a = g - k |v| v + f(v)` a flight is the arc of g plus D, `D'' = -k |v| v + f(v)`, D = 0 at
+both ends. D'' is a polynomial through Chebyshev points, found by Picard's iteration.
 """
+
+from collections.abc import Callable
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -43,12 +45,17 @@ _END_RATES = chebyshev.chebvander(np.array([-1.0, 1.0]), NODES) @ _ONCE
 
 
 def bent(
-    x: np.ndarray, tau: np.ndarray, places: np.ndarray, a: np.ndarray, k: np.ndarray
+    x: np.ndarray,
+    tau: np.ndarray,
+    places: np.ndarray,
+    a: np.ndarray,
+    k: np.ndarray,
+    force: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Deviation D (B, F, n) [m] of B flights by drag at times x (F,), D' at both ends (B, 2, n).
 
-    Equation: `D'' = -k |v| v`, v the velocity of the arc without drag plus D', at Chebyshev points;
-    Picard: D'' from the last D'.
+    Equation: `D'' = -k |v| v + f(v)`, v the velocity of the arc without drag plus D', at Chebyshev
+    points; Picard: D'' from the last D'.
 
     Args:
         x: times (F,).
@@ -56,40 +63,51 @@ def bent(
         places: there (B, 2, n).
         a: acceleration without drag (B, n).
         k: drag (B,) [1/m].
+        force: f, of velocities (..., n); None: none.
 
     Raises:
         ValueError: drag bends flights too much for the iteration.
     """
     h = np.diff(tau)[:, :, None]
-    chord = (places[:, 1] - places[:, 0])[:, None]
+    chord = np.diff(places, axis=1)
     arc = chord / h + a[:, None] * h / 2 * _POINTS[:, None]  # velocity of the arc at the points
-    force, length = np.zeros_like(arc), np.abs(arc).max() * h.max()
+    slowing = np.zeros_like(arc)
+    length = np.abs(arc).max() * h.max()
     for _ in range(ROUNDS):
-        v = arc + h / 2 * (_RATES @ force)
+        v = arc + h / 2 * (_RATES @ slowing)
         new = -k[:, None, None] * np.linalg.norm(v, axis=2, keepdims=True) * v
-        moved, force = np.abs(new - force).max() * h.max() ** 2, new
+        if force is not None:
+            new = new + force(v)
+        moved = np.abs(new - slowing).max() * h.max() ** 2
+        slowing = new
         if not SETTLED * length < moved < DIVERGED * length:
             break
     if not moved <= 1e-6 * length:
         raise ValueError(
-            f"Argument `drag` must be a coefficient [1/m] that bends flights little, but "
-            f"{float(np.max(np.abs(k))):.3g} is too much for a flight of {float(h.max()):.3g} s at "
-            f"{float(np.linalg.norm(arc, axis=2).max()):.3g} m/s."
+            f"Argument `drag` must be a coefficient [1/m], `acceleration` a function, that bends "
+            f"flights little, but drag {float(np.max(np.abs(k))):.3g} is too much for a flight "
+            f"of {float(h.max()):.3g} s at {float(np.linalg.norm(arc, axis=2).max()):.3g} m/s."
         )
     u = 2 * (x - tau[:, :1]) / h[:, 0] - 1
-    D = (h / 2) ** 2 * (chebyshev.chebvander(u, NODES + 1) @ (_TWICE @ force))
-    return D, h / 2 * (_END_RATES @ force)
+    D = (h / 2) ** 2 * (chebyshev.chebvander(u, NODES + 1) @ (_TWICE @ slowing))
+    return D, h / 2 * (_END_RATES @ slowing)
 
 
 def bent_slopes(
-    x: np.ndarray, tau: np.ndarray, places: np.ndarray, a: np.ndarray, k: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """D (F, n) and D' at the ends (2, n) of one flight; their derivatives (F, n, P) and (2, n, P).
+    x: np.ndarray,
+    tau: np.ndarray,
+    places: np.ndarray,
+    a: np.ndarray,
+    k: float,
+    force: Callable[[np.ndarray], np.ndarray] | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives (F, n, P) of D and (2, n, P) of D' at the ends of one flight.
 
     In P = 3 n + 3 values: place and instant of the first end, of the last one, acceleration, drag.
     By difference quotients: all P + 1 flights at once, each with one value moved.
     """
-    n, h = len(a), tau[1] - tau[0]
+    n = len(a)
+    h = tau[1] - tau[0]
     length = np.linalg.norm(places[1] - places[0]) + np.linalg.norm(a) * h**2 / 2
     length = length if length > 0 else 1.0
     end = [length] * n + [h]
@@ -102,23 +120,27 @@ def bent_slopes(
         places + np.stack([first[:, :n], last[:, :n]], axis=1),
         a + rest[:, :n],
         k + rest[:, n],
+        force,
     )
-    slopes = (np.moveaxis(y[1:] - y[0], 0, 2) / sizes for y in (D, rates))
-    return D[0], rates[0], *slopes
+    of_places, of_rates = (np.moveaxis(y[1:] - y[0], 0, 2) / sizes for y in (D, rates))
+    return of_places, of_rates
 
 
-def straightened(t: np.ndarray, q: np.ndarray, k: float) -> np.ndarray:
-    """Places (T, n) [m] as they were without drag k [1/m]: `q + k int int |v| v`, up to lines.
+def straightened(
+    t: np.ndarray, q: np.ndarray, air: Callable[[np.ndarray], np.ndarray]
+) -> np.ndarray:
+    """Places (T, n) [m] as they were without the acceleration `air(v)`: `q - int int air(v)`.
 
-    The acceleration of drag, by velocities over four frames, is integrated twice and taken away:
-    good enough to find flights. Velocities near an impact are wrong, but only for two frames.
+    Up to lines. Velocities are those over four frames: good enough to find flights; near an impact
+    they are wrong, but only for two frames.
     """
-    whole, frames = between(t, t, q), np.arange(len(t))
-    low, high = np.maximum(frames - 2, 0), np.minimum(frames + 2, len(t) - 1)
+    whole = between(t, t, q)
+    frames = np.arange(len(t))
+    low = np.maximum(frames - 2, 0)
+    high = np.minimum(frames + 2, len(t) - 1)
     v = (whole[high] - whole[low]) / (t[high] - t[low])[:, None]
-    slowing = np.linalg.norm(v, axis=1, keepdims=True) * v
-    slower = cumulative_trapezoid(slowing, t, axis=0, initial=0)
-    return q + k * cumulative_trapezoid(slower, t, axis=0, initial=0)
+    faster = cumulative_trapezoid(air(v), t, axis=0, initial=0)
+    return q - cumulative_trapezoid(faster, t, axis=0, initial=0)
 
 
 def between(times: np.ndarray, t: np.ndarray, q: np.ndarray) -> np.ndarray:

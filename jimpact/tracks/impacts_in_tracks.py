@@ -6,26 +6,24 @@ from typing import Any
 
 import numpy as np
 
+from jimpact.shots.covariances import diagonal_blocks
 from jimpact.shots.shots_file import ANGULAR, LINEAR
 from jimpact.tools.checks import as_float_array, check_concrete, check_values
-from jimpact.tracks.arcs import Arcs, fit_arcs
-from jimpact.tracks.drag import straightened
+from jimpact.tracks.arcs import Arcs
+from jimpact.tracks.flight import Flight, Force
+from jimpact.tracks.frames import Frames, noise
 from jimpact.tracks.judging import (
     findings,
+    findings_of_bodies,
+    findings_of_doubts,
     findings_of_held,
     findings_of_input,
-    findings_of_noise,
     findings_of_signs,
-    free_flights,
+    notes_of,
 )
 from jimpact.tracks.poses import with_turns
 from jimpact.tracks.quaternions import as_inertia, as_poses
-from jimpact.tracks.segments import (
-    SMALLEST_JUMP,
-    common_acceleration,
-    flights_and_acceleration,
-    noise,
-)
+from jimpact.tracks.search import Settings, doubts, fitted_arcs, searched, windowed
 from jimpact.tracks.track import Track, TrackImpact
 
 VELOCITY_OF = {"m": LINEAR, "rad": ANGULAR}
@@ -48,18 +46,21 @@ def find_impacts(
     """The impacts of a track: instants, velocities before and after, and their covariance.
 
     Equation: between impacts `q = P + v (t - tau) + a (t - tau)^2 / 2`; the arcs on both sides of
-    an impact meet at its instant tau. Places P, velocities and instants of all impacts minimize
-    the sum of `((q - measured) / sigma)^2` at once: maximum likelihood for normal errors. Nothing
-    is smoothed or differentiated. Where a contact lasts, the arcs meet at the centroid of the pulse
-    of its force.
+    an impact meet at its instant tau. Places P, velocities and instants of all impacts are most
+    likely at once for normal errors, of standard error sigma and, where residuals show them, with
+    waves that neighbouring frames share; flights that bend have accelerations of their own. There
+    are as many impacts as there is evidence for beside these. Nothing is smoothed or
+    differentiated. Where a contact lasts, the arcs meet at the centroid of the pulse of its force.
 
     Args:
         t: times of the frames, rising (T,) [s].
         q: coordinates (T,) or (T, n) [m] or [rad]; NaN where the body was lost. An angle goes on
             beyond pi, or is unwrapped where `units` say 'rad'. The velocities are the rates of q.
         sigma: standard errors of q, a number or (n,), > 0; None: estimated from the residuals.
+            Residuals that are clearly larger than a given sigma take its place, and are told.
         acceleration: between impacts, a number or (n,) [m/s^2]; -9.80665 of a height; None: one
-            unknown in each coordinate, common to all flights.
+            unknown in each coordinate, common to all flights, or an entry of a list, `[0, None]`;
+            or a function of velocities (.., n) [m/s] that returns accelerations, as of spin.
         drag: k >= 0 of the air's `-k |v| v`, |v| that of the places [1/m]; .12 of a table-tennis
             ball; None: one unknown for all flights. Between impacts the arcs bend accordingly.
         contact: the longest duration of a contact, whose frames are left out, >= 0 [s].
@@ -75,8 +76,8 @@ def find_impacts(
             to a factor: between impacts it turns freely. None: as a sphere or a cube does.
 
     Returns:
-        `Track`, which prints and plots; `warnings` say which flights are not ballistic, and that
-        no impact was found. With `quaternion` velocities are (x', omega), omega in the axes of the
+        `Track`, which prints and plots; `warnings` say which flights are not ballistic, which
+        impacts are doubtful, and that no impact was found; `candidates` how many went, and why. With `quaternion` velocities are (x', omega), omega in the axes of the
         body, as of `ji.Box`, and poses hold the quaternion's scalar first.
 
     Raises:
@@ -103,103 +104,77 @@ def find_impacts(
         return _in_poses(t, q, sigma, acceleration, quaternion, inertia, options)
     t, q, names = _checked(t, q, shortest, units)
     n = q.shape[1]
-    raw, q = q, _unwrapped(q, names)
-    given = noise(q) if sigma is None else _of_coordinates("sigma", sigma, n)
+    raw = q
+    q = _unwrapped(q, names)
+    rough = noise(q)
+    given = rough if sigma is None else _of_coordinates("sigma", sigma, n)
     check_values("sigma", given, low=0.0, open_low=True)
-    notes = findings_of_input(raw, given, names)
-    known = None if acceleration is None else _of_coordinates("acceleration", acceleration, n)
-    for name, value in (("contact", contact), ("window", 1.0 if window is None else window)):
-        check_values(name, np.asarray(value, float), low=0.0, open_low=name == "window")
+    check_values("contact", np.asarray(contact, float), low=0.0)
+    if window is not None:
+        check_values("window", np.asarray(window, float), low=0.0, open_low=True)
+    flight = _model(acceleration, drag, names)
+    angles = tuple(name == "rad" for name in names)
+    frames = Frames(t - t.mean(), q, given, angles)
+    settings = Settings(sigma is None, contact, shortest, window)
+    notes = [*findings_of_input(raw, given, names), *findings_of_bodies(raw)]
+    if not flight.unknown.any():
+        notes += findings_of_signs(flight.straight(frames), flight.acceleration, shortest)
+    search = searched(frames, flight, settings)
+    whole, flights = fitted_arcs(search)
+    arcs = whole
+    if window is not None and arcs.impacts:
+        arcs = windowed(search, arcs, window)
+    if acceleration_is_known(flight):
+        notes += findings_of_held(t, search.verdict.flights, search.candidates)
+    doubtful = doubts(search, arcs)
+    notes += [*findings(search, arcs, whole.members, rough), *findings_of_doubts(doubtful)]
+    candidates = notes_of(search, len(search.verdict.flights) - len(flights))
+    track = _as_track(t, _unwrapped(raw, names), arcs, names, doubtful)
+    return replace(track, warnings=tuple(notes), candidates=tuple(candidates))
+
+
+def acceleration_is_known(flight: Flight) -> bool:
+    """True where an acceleration is given, so that a body without it is held."""
+    return not flight.unknown.all() and bool(flight.acceleration.any())
+
+
+def _model(acceleration: Any, drag: float | None, units: tuple[str, ...]) -> Flight:
+    """Checked model of flights from the arguments of `find_impacts`."""
+    n = len(units)
+    none = np.zeros(n, bool)
+    force = None
+    unknown = none
+    if callable(acceleration):
+        force = _checked_force(acceleration, n)
+        known = np.zeros(n)
+    elif acceleration is None:
+        known = np.zeros(n)
+        unknown = ~none
+    else:
+        values = acceleration
+        if isinstance(acceleration, list | tuple) and None in acceleration:
+            unknown = np.array([x is None for x in acceleration])
+            values = [0.0 if x is None else x for x in acceleration]
+        known = _of_coordinates("acceleration", values, n)
     if drag is not None:
         check_values("drag", np.asarray(drag, float), low=0.0)
-    if drag != 0 and "rad" in names:
+    if (drag != 0 or force is not None) and "rad" in units:
         raise ValueError(
-            "Argument `drag` must be 0 where q holds angles, as it is of places, but has value "
-            f"{drag}."
+            "Argument `drag` must be 0, and `acceleration` no function, where q holds angles, as "
+            f"they are of places, but `drag` has value {drag}."
         )
-    arcs, given, more = _arcs_of(t, q, given, sigma is None, known, drag, contact, shortest, window)
-    return _as_track(t, _unwrapped(raw, names), given, arcs, names, (*notes, *more))
+    return Flight(known, unknown, drag or 0.0, drag is None, force)
 
 
-def _arcs_of(
-    t: np.ndarray,
-    q: np.ndarray,
-    given: np.ndarray,
-    estimated: bool,
-    known: np.ndarray | None,
-    drag: float | None,
-    contact: float,
-    shortest: int,
-    window: float | None,
-) -> tuple[Arcs, np.ndarray, list[str]]:
-    """Arcs of all flights, standard errors sigma (n,), and findings.
-
-    1. Divide the frames into flights; leave out those in which the body is held.
-    2. Fit arcs, and join flights until all jumps are impacts.
-    3. If sigma is `estimated`, take it from the residuals and repeat 2.
-    4. With drag: fit arcs that it bends; of unknown drag divide the frames once more before.
-    5. With a `window` [s]: fit by frames near the impacts only.
-
-    `given`: sigma (n,); `known`: acceleration (n,), None: unknown; `drag` None: unknown.
-    """
-    x, free, q = t - t.mean(), known is None, q.copy()
-    flights, a, k = flights_and_acceleration(x, q, given, known, shortest, drag)
-    straight = straightened(x, q, k) if k else q
-    notes = [] if known is None else findings_of_signs(x, straight, given, known, shortest)
-    flights = [f for f in flights if x[f[-1]] - x[f[0]] > contact]
-    if not flights:
+def _checked_force(function: Any, n: int) -> Force:
+    """Acceleration (..., n) as a function of velocity (..., n), by one trial."""
+    found = np.asarray(function(np.zeros((2, n))), float)
+    if found.shape != (2, n) or not np.isfinite(found).all():
         raise ValueError(
-            "Argument `q` must hold a flight, but no frames in a row lie on an arc within sigma = "
-            f"{given.tolist()} at an acceleration of {a.tolist()}: are these the units of q?"
+            f"Argument `acceleration`, a function of velocities (..., {n}), must return finite "
+            f"accelerations of the same shape, but of zeros ({2}, {n}) returns {found.tolist()}."
         )
-    kept = free_flights(x, straight, given, a, flights)
-    if len(kept) < len(flights):
-        flights = kept
-        notes += findings_of_held(t, flights)
-        for places in (q, straight):
-            places[: flights[0][0]], places[flights[-1][-1] + 1 :] = np.nan, np.nan
-    arcs, flights = _of_true_impacts(x, straight, given, flights, a, free, contact)
-    rough = given
-    if estimated:  # what the residuals show; jumps are judged anew by it
-        given = _of_residuals(given, arcs)
-        arcs, flights = _of_true_impacts(x, straight, given, flights, a, free, contact)
-    unknown = (free, drag is None)
-    if drag is None:  # flights once more, by what is found
-        start = (arcs.acceleration, k, arcs.instants[1:-1])
-        arcs = _with_drag(x, q, given, flights, start, unknown, contact)
-        a, k = arcs.acceleration, arcs.drag
-        flights, *_ = flights_and_acceleration(x, q, given, a, shortest, k)
-        straight = straightened(x, q, k)
-        arcs, flights = _of_true_impacts(x, straight, given, flights, a, False, contact)
-    if drag != 0:
-        start = (arcs.acceleration, k, arcs.instants[1:-1])
-        arcs = _with_drag(x, q, given, flights, start, unknown, contact)
-        if estimated:
-            given = _of_residuals(given, arcs)
-            arcs = _with_drag(x, q, given, flights, start, unknown, contact)
-    notes += findings_of_noise(rough, given) if estimated else []
-    if window is not None and len(arcs.instants) > 2:
-        whole = np.concatenate(arcs.members)
-        arcs = _windowed(x, q, given, arcs, contact, window)
-        q[np.setdiff1d(whole, np.concatenate(arcs.members))] = np.nan  # no frames that do not fit
-    return arcs, given, [*notes, *findings(t, q, given, arcs)]
-
-
-def _with_drag(
-    x: np.ndarray,
-    q: np.ndarray,
-    sigma: np.ndarray,
-    flights: list[np.ndarray],
-    start: tuple[np.ndarray, float, np.ndarray],
-    free: tuple[bool, bool],
-    contact: float,
-) -> Arcs:
-    """Arcs that drag bends; `start`: first values of acceleration, drag and instants.
-
-    `free`: acceleration and drag are unknown.
-    """
-    a, k, instants = start
-    return fit_arcs(x, q, sigma, flights, a, free[0], contact, instants, drag=k, free_drag=free[1])
+    return lambda v: np.asarray(function(v), float)
 
 
 def _in_poses(
@@ -265,6 +240,9 @@ def _checked(t: Any, q: Any, shortest: int, units: Any) -> tuple[np.ndarray, np.
             f"Argument `q` must be seen in each coordinate, but coordinate "
             f"{int(lost.argmax()) + 1} is NaN in all frames."
         )
+    seen = int(np.isfinite(q).all(axis=1).sum())
+    if np.isfinite(q).any(axis=1).sum() < shortest:
+        raise ValueError(f"Argument `q` was seen in {seen} frames: {shortest} make a flight.")
     n = q.shape[1]
     names = ("m",) * n if units is None else (units,) * n if isinstance(units, str) else units
     if len(names) != n or not set(names) <= set(VELOCITY_OF):
@@ -298,106 +276,34 @@ def _unwrapped(q: np.ndarray, units: tuple[str, ...]) -> np.ndarray:
     return q
 
 
-def _of_true_impacts(
-    x: np.ndarray,
-    q: np.ndarray,
-    sigma: np.ndarray,
-    flights: list[np.ndarray],
-    a: np.ndarray,
-    free: bool,
-    contact: float,
-) -> tuple[Arcs, list[np.ndarray]]:
-    """Arcs, and the flights joined until every jump of velocity is an impact.
-
-    A jump below SMALLEST_JUMP standard errors is none: the flights on both sides are joined, the
-    weaker one of neighbouring jumps first. Instants are fixed until all jumps exceed that, as
-    nothing determines an instant without a jump. `a`: acceleration (n,), fitted if `free`.
-    """
-    frozen = len(flights) > 1
-    while True:
-        a = common_acceleration(x, q, flights) if free else a
-        arcs = fit_arcs(x, q, sigma, flights, a, free, contact, frozen=frozen)
-        size = _jumps(arcs)
-        weak = np.flatnonzero(size < SMALLEST_JUMP)
-        if not weak.size and not frozen:
-            return arcs, flights
-        frozen = frozen and weak.size > 0
-        # of neighbours only the weaker: its joining makes the other clearer
-        ends = np.concatenate([[np.inf], size, [np.inf]])
-        low = [k for k in weak if ends[k + 1] <= min(ends[k], ends[k + 2])]
-        for k in sorted(low, reverse=True):
-            flights = [*flights[:k], np.concatenate(flights[k : k + 2]), *flights[k + 2 :]]
-
-
-def _jumps(arcs: Arcs) -> np.ndarray:
-    """Largest of `|v+ - v-| / sigma` over the coordinates of each impact (K,), sigma its error."""
-    (pre, post), covariance = arcs.velocities(), arcs.covariance_of_velocities()
-    K, n = pre.shape
-    signs = np.hstack([-np.eye(n), np.eye(n)])  # v+ - v- = signs (v-, v+)
-    sizes = np.zeros(K)
-    for k in range(K):
-        own = slice(2 * n * k, 2 * n * (k + 1))
-        errors = np.sqrt(np.maximum(np.diag(signs @ covariance[own, own] @ signs.T), 1e-300))
-        sizes[k] = np.abs((post[k] - pre[k]) / errors).max()
-    return sizes
-
-
-def _windowed(
-    x: np.ndarray,
-    q: np.ndarray,
-    sigma: np.ndarray,
-    whole: Arcs,
-    contact: float,
-    window: float,
-) -> Arcs:
-    """Arcs by frames of each flight within `window` [s] of its impacts only.
-
-    A flight keeps its one arc, so that velocities of both its ends stay those of one arc.
-    """
-    near = []
-    for i, frames in enumerate(whole.members):
-        ends = whole.instants[i + (i == 0) : i + 2 - (i == len(whole.members) - 1)]
-        close = (np.abs(x[frames][:, None] - ends) <= window).any(axis=1)
-        near.append(frames[close])
-    if min(map(len, near)) < 3:
-        raise ValueError(
-            f"Argument `window` must leave 3 frames or more of each flight, but {window:g} s leave "
-            f"{min(map(len, near))}."
-        )
-    start = (whole.acceleration, whole.drag, whole.instants[1:-1])
-    return _with_drag(x, q, sigma, near, start, whole.free, contact)
-
-
-def _of_residuals(sigma: np.ndarray, arcs: Arcs) -> np.ndarray:
-    """Standard errors (n,): `sigma sqrt(chi^2 / freedom)` of the residuals of each coordinate.
-
-    Freedom: frames, less K + 2 places, 1/n of K instants, 1 for a free acceleration.
-    """
-    n, ends = len(sigma), len(arcs.instants)
-    seen = np.isfinite(arcs.residual).sum(axis=0)
-    freedom = np.maximum(seen - ends - (ends - 2) / n - arcs.free[0], 1.0)
-    scale = np.sqrt(np.nansum(arcs.residual**2, axis=0) / freedom)
-    return np.maximum(sigma * scale, np.finfo(float).tiny ** 0.25)
-
-
 def _as_track(
     t: np.ndarray,
     q: np.ndarray,
-    sigma: np.ndarray,
     arcs: Arcs,
     units: tuple[str, ...],
-    lines: tuple[str, ...],
+    doubtful: np.ndarray,
 ) -> Track:
-    """Track of these arcs: impacts with velocities and covariance; `lines` are its warnings."""
-    (pre, post), covariance = arcs.velocities(), arcs.covariance_of_velocities()
-    n, size = q.shape[1], q.shape[1] + 1
-    impacts = []
-    for k, (before, after) in enumerate(zip(pre, post)):
-        own = slice(2 * n * k, 2 * n * (k + 1))
-        error = float(np.sqrt(arcs.covariance[(k + 1) * size + n, (k + 1) * size + n]))
-        time, place = float(arcs.instants[k + 1] + t.mean()), arcs.places[k + 1]
-        impacts.append(TrackImpact(time, error, place, before, after, covariance[own, own]))
-    velocity_units = tuple(VELOCITY_OF[unit] for unit in units)
+    """Track of these arcs: impacts with velocities and covariance; `doubtful` (K,)."""
+    pre, post = arcs.velocities()
+    covariance = arcs.covariance_of_velocities
+    blocks = diagonal_blocks(covariance, 2 * q.shape[1])
+    times = arcs.instants[1:-1] + t.mean()
+    errors = arcs.instant_errors()
+    places = arcs.places[1:-1]
+    impacts = tuple(
+        TrackImpact(
+            float(times[k]), float(errors[k]), places[k], pre[k], post[k], blocks[k], bool(doubt)
+        )
+        for k, doubt in enumerate(doubtful)
+    )
     return Track(
-        tuple(impacts), tuple(arcs.members), sigma, covariance, lines, velocity_units, t, q, arcs
+        impacts,
+        tuple(arcs.members),
+        arcs.errors.sigma,
+        covariance,
+        (),
+        tuple(VELOCITY_OF[unit] for unit in units),
+        t,
+        q,
+        arcs,
     )

@@ -1,24 +1,16 @@
-"""Findings: sentences that say why a track may not be one of ballistic flights.
-
-*Held* is a body that has no acceleration where a flight has a known one: it rests, slides or rolls.
-"""
+"""Findings: sentences that say why a track may not be one of ballistic flights."""
 
 from collections.abc import Sequence
-from itertools import pairwise
 
 import numpy as np
 from scipy.stats import chi2, norm
 
+from jimpact.tools.records import counted, listed
 from jimpact.tracks.arcs import Arcs
-from jimpact.tracks.segments import (
-    LOOK_BACK,
-    SMALLEST_JUMP,
-    chi_squared,
-    cost_of_flights,
-    curvature,
-    price,
-    without_polynomial,
-)
+from jimpact.tracks.division import divided
+from jimpact.tracks.frames import Frames, differences, median
+from jimpact.tracks.held import excess_of
+from jimpact.tracks.search import Search, curvature
 
 # Chance that a good track has a warning: half by curvatures, half by sizes of residuals. Ten times
 # more would warn of one good track in ten.
@@ -37,16 +29,15 @@ COARSE_ANGLE = 0.1
 # Residuals in units of the noise from frame to frame from which on flights do not explain them.
 # White noise stays below 1.3; ten times more would pass impacts that were not found.
 UNEXPLAINED = 3.0
-# chi^2 by which an impact must explain frames better than one parabola without it; by chance one
-# impact in a thousand gains less. Ten times more would doubt soft impacts; ten times less, and
-# drag or a wrong acceleration would pass as impacts.
-LEAST_GAIN = 10.8
-# Logarithm of the odds, 20 to 1, from which on a body is held in one flight. Ten times more would
-# keep most false flights of a body that slides, of a few frames each.
-HELD_ODDS = 3.0
-# Logarithm of the likelihood of "held" over "free" from which on flights at an end are left out:
-# half of the square of SMALLEST_JUMP. Ten times more would keep 10 false impacts.
-HELD = SMALLEST_JUMP**2 / 2
+# Frames from the first one on in which signs of accelerations are looked at. Ten times more takes
+# ten times as long.
+LOOKED_AT = 400
+# Bodies whose rows may alternate in a table, and how much larger the noise from row to row is then
+# than that of one body. Ten times more would pass bodies that are near one another.
+MOST_BODIES = 6
+ALTERNATING = 10.0
+# Share of residuals in a flight beyond sigma where times are a likely cause: they grow with speed.
+WITH_SPEED = 2.0
 
 
 def findings_of_input(q: np.ndarray, sigma: np.ndarray, units: tuple[str, ...]) -> list[str]:
@@ -119,22 +110,23 @@ def findings_of_turns(
     return found
 
 
-def findings_of_signs(
-    t: np.ndarray, q: np.ndarray, sigma: np.ndarray, acceleration: np.ndarray, shortest: int
-) -> list[str]:
+def findings_of_signs(frames: Frames, acceleration: np.ndarray, shortest: int) -> list[str]:
     """Findings of coordinates that curve against their known acceleration, as y of pixels does.
 
-    Where the second differences have the other sign: if flights of the first LOOK_BACK frames cost
+    Where the second differences have the other sign: if flights of the first LOOKED_AT frames cost
     less (chi^2 and prices) with the sign of this acceleration changed.
     """
-    some, found = slice(0, LOOK_BACK), []
-    seen = np.isfinite(q[some]).any(axis=0).all()
-    measured = curvature(t[some], q[some], shortest) if seen else np.zeros(len(acceleration))
+    some = slice(0, LOOKED_AT)
+    frames = Frames(frames.t[some], frames.q[some], frames.sigma)
+    found: list[str] = []
+    if not np.isfinite(frames.q).any(axis=0).all() or len(frames.t) < shortest:
+        return found
+    stride = max(1, min(shortest, len(frames.t) // 8))
+    measured = np.array([curvature(frames.t, x, stride) for x in frames.q.T])
     for c in np.flatnonzero(measured * acceleration < 0):
         other = np.where(np.arange(len(acceleration)) == c, -acceleration, acceleration)
-        stated, mirrored = (
-            cost_of_flights(t[some], q[some], sigma, a, shortest) for a in (acceleration, other)
-        )
+        stated = divided(frames, acceleration, shortest).cost
+        mirrored = divided(frames, other, shortest).cost
         if mirrored < stated:
             found.append(
                 f"Coordinate {c + 1} curves the other way than an acceleration of "
@@ -155,207 +147,162 @@ def findings_of_noise(differences: np.ndarray, residuals: np.ndarray, first: int
     ]
 
 
-def findings(t: np.ndarray, q: np.ndarray, sigma: np.ndarray, arcs: Arcs) -> list[str]:
-    """Findings in a fitted track: curvatures, large residuals, unused frames, doubtful impacts."""
-    found = [*_of_curvatures(t, sigma, arcs), *_of_sizes(arcs), *_unused(t, q, arcs)]
-    found += _of_bends(t, q, sigma, arcs)
-    if len(arcs.instants) == 2:
-        found.insert(0, "No impact was found: one flight explains all frames within sigma.")
+def findings_of_bodies(q: np.ndarray) -> list[str]:
+    """Findings of places q (T, n) that alternate: rows of several bodies, as in a long table.
+
+    Third differences of every second, third, .. row are then far smaller than those of all.
+    """
+    whole = np.array([median(np.abs(differences(x, 3))) for x in q.T])
+    for bodies in range(2, MOST_BODIES + 1):
+        if len(q) < 4 * bodies + bodies:
+            break
+        own = np.array([median(np.abs(differences(x, 3, bodies))) for x in q.T])
+        if (own * ALTERNATING < whole).any():
+            return [
+                f"Places alternate between {bodies} bodies from row to row: this is a long table, "
+                "not one track. Read one body, `ji.tracks.read(.., where={'body': 'A'})`."
+            ]
+    return []
+
+
+def findings(
+    search: Search, arcs: Arcs, used: Sequence[np.ndarray], noise: np.ndarray
+) -> list[str]:
+    """Findings in a fitted track: curvatures, waves, large residuals, unused frames, no impact.
+
+    `used`: frames of flights before a window; `noise` (n,): from frame to frame.
+    """
+    frames = search.frames
+    unused = _unused(frames, used, search.settings.shortest)
+    found = [*_of_curvatures(frames.t, arcs), *_of_waves(arcs), *_of_sizes(arcs), *unused]
+    if search.settings.estimated and not arcs.flight.bends:
+        found += findings_of_noise(noise, arcs.errors.sigma)
+    if not search.settings.estimated:
+        found += _of_a_given_sigma(frames.sigma, arcs.errors.sigma)
+    if not arcs.impacts:
+        rest = "" if unused else ": one flight explains all frames within sigma"
+        found.insert(0, f"No impact was found{rest}.")
     return found
 
 
-def free_flights(
-    t: np.ndarray,
-    q: np.ndarray,
-    sigma: np.ndarray,
-    acceleration: np.ndarray,
-    flights: list[np.ndarray],
-) -> list[np.ndarray]:
-    """The flights without those at both ends in which the body is held; at least one is left.
+def _of_a_given_sigma(given: np.ndarray, found: np.ndarray) -> list[str]:
+    """Findings of coordinates whose residuals took the place of the given sigma (n,)."""
+    return [
+        f"Coordinate {c + 1} is not ballistic within sigma: its residuals are "
+        f"{found[c] / given[c]:.2g} times as large, and the errors follow them. Perhaps times "
+        "jitter, frames are there twice, or a false point was tracked."
+        for c in np.flatnonzero(found > given)
+    ]
 
-    Frames of a held body are taken for short flights with impacts between. A run of flights at an
-    end is held where one parabola explains it as well (chi^2 and prices of flights), or where the
-    sum of `held_rather` over it exceeds HELD.
+
+def notes_of(search: Search, joined: int) -> list[str]:
+    """What became of candidates, in lines; `joined`: those with jumps below five errors."""
+    verdict = search.verdict
+    found = []
+    within = verdict.within_errors + joined
+    if within:
+        found.append(
+            f"{counted(within, 'candidate')} for an impact went: flights make such jumps without "
+            "one, by the size and the waves of their residuals"
+        )
+    if verdict.bends:
+        found.append(
+            f"{counted(verdict.bends, 'candidate')} for an impact went: a flight of another "
+            "acceleration explains the frames better"
+        )
+    return found
+
+
+def findings_of_doubts(doubts: np.ndarray) -> list[str]:
+    """Finding of impacts that are doubtful (K,)."""
+    if not doubts.any():
+        return []
+    numbers = listed([str(k + 1) for k in np.flatnonzero(doubts)])
+    return [
+        f"Impact {numbers} may be none: a flight of another acceleration explains its frames as "
+        "well. Perhaps drag, a rolling shutter, or the acceleration is wrong. `experiments` leaves "
+        "it out unless `doubtful=True`."
+    ]
+
+
+def findings_of_held(
+    t: np.ndarray, flights: Sequence[np.ndarray], candidates: Sequence[np.ndarray]
+) -> list[str]:
+    """Findings of frames before the first and after the last free flight, which are left out.
+
+    `candidates`: flights before those in which the body is held were left out.
     """
-    if not acceleration.any():
-        return flights
-    rest = (q - acceleration * t[:, None] ** 2 / 2) / sigma
-    held = held_rather(t, rest, sigma, acceleration, flights)
-    alone = np.array([chi_squared(t, q, sigma, acceleration, some) for some in flights])
-    start = price(*q.shape)  # chi^2 that one more flight must save
-
-    def more(run: np.ndarray) -> float:
-        """Increase of chi^2 if one parabola replaces the arcs of a run of flights."""
-        frames = np.sort(np.concatenate([flights[k] for k in run]))
-        return _of_one_parabola(t, q, sigma, acceleration, frames) - float(alone[run].sum())
-
-    def count(order: np.ndarray) -> int:
-        """Number of the first flights in this order that are held, by likelihood or parabola."""
-        sums = np.cumsum(held[order])
-        curved = int(np.argmax(sums)) + 1 if sums.size and sums.max() > HELD else 0
-        few, many = 1, len(order)  # by bisection how many one parabola explains
-        while few < many:
-            middle = (few + many + 1) // 2
-            if more(order[:middle]) < start * (middle - 1):
-                few = middle
-            else:
-                many = middle - 1
-        while few > 1 and more(order[:few]) - more(order[: few - 1]) > start:
-            few -= 1  # the last one costs more than it would alone
-        return max(curved, few if few > 1 else 0)
-
-    last = len(flights) - count(np.arange(len(flights))[::-1])
-    first = count(np.arange(last))
-    return flights[first:last] if last > first else flights[:1]
-
-
-def held_flights(
-    t: np.ndarray,
-    q: np.ndarray,
-    sigma: np.ndarray,
-    acceleration: np.ndarray,
-    flights: Sequence[np.ndarray],
-) -> np.ndarray:
-    """True (F,) for flights in which the body is held: by `held_rather`, or on one parabola.
-
-    A run of flights is on one parabola as long as each further one, at its price, would cost more
-    by itself.
-    """
-    if not acceleration.any():
-        return np.zeros(len(flights), bool)
-    rest = (q - acceleration * t[:, None] ** 2 / 2) / sigma
-    held = held_rather(t, rest, sigma, acceleration, flights) > HELD_ODDS
-    alone = [chi_squared(t, q, sigma, acceleration, frames) for frames in flights]
-    start, first = price(*q.shape), 0
-    while first < len(flights):
-        last, run, sum_of_run = first, flights[first], alone[first]
-        while last + 1 < len(flights):
-            longer = np.concatenate([run, flights[last + 1]])
-            sum_of_longer = _of_one_parabola(t, q, sigma, acceleration, longer)
-            if not sum_of_longer < sum_of_run + alone[last + 1] + start:
-                break
-            last, run, sum_of_run = last + 1, longer, sum_of_longer
-        held[first : last + 1] |= last > first
-        first = last + 1
-    return held
-
-
-def held_rather(
-    t: np.ndarray,
-    rest: np.ndarray,
-    sigma: np.ndarray,
-    acceleration: np.ndarray,
-    flights: Sequence[np.ndarray],
-) -> np.ndarray:
-    """Log likelihood ratio (F,) of "held" over "free" in each flight.
-
-    Equation: with the excess x of its acceleration over the known a, and the error s of x, the sum
-    of `(x^2 - (x + a)^2) / (2 s^2)` over coordinates. `rest` (T, n) is what a fit leaves, in sigma.
-    """
-    excess, error = _excess(t, rest, sigma, flights)
-    return np.asarray(((excess**2 - (excess + acceleration) ** 2) / (2 * error**2)).sum(axis=1))
-
-
-def _of_one_parabola(
-    t: np.ndarray, q: np.ndarray, sigma: np.ndarray, acceleration: np.ndarray, frames: np.ndarray
-) -> float:
-    """chi^2 of frames on one free parabola in each coordinate; inf if it curves like a flight.
-
-    That is: its acceleration is nearer to the known one than to 0.
-    """
-    x, total = t[frames] - t[frames].mean(), 0.0
-    for c, known in enumerate(acceleration):
-        ok = np.isfinite(q[frames, c])
-        if ok.sum() < 3:
-            continue
-        curve = np.vander(x[ok], 3)
-        best = np.linalg.lstsq(curve, q[frames[ok], c], rcond=None)[0]
-        if 2 * best[0] * known > known**2 / 2:
-            return np.inf
-        total += float(np.sum((q[frames[ok], c] - curve @ best) ** 2)) / sigma[c] ** 2
-    return total
-
-
-def findings_of_held(t: np.ndarray, flights: Sequence[np.ndarray]) -> list[str]:
-    """Findings of frames before the first and after the last free flight, which are left out."""
     why = (
         "there are no flights of this acceleration. Perhaps the body rests, slides, rolls or is "
         "held, it bounces faster than frames show, or the acceleration is wrong."
     )
-    found, start, end = [], flights[0][0], flights[-1][-1]
-    if start > 0:
+    found = []
+    start = flights[0][0]
+    end = flights[-1][-1]
+    if start > candidates[0][0]:
         found.append(f"Up to {t[start]:.4g} s nothing is used: {why}")
-    if end < len(t) - 1:
+    if end < candidates[-1][-1]:
         found.append(f"From {t[end + 1]:.4g} s on nothing is used: {why}")
     return found
 
 
-def _of_curvatures(t: np.ndarray, sigma: np.ndarray, arcs: Arcs) -> list[str]:
+def _of_curvatures(t: np.ndarray, arcs: Arcs) -> list[str]:
     """Findings of flights with an acceleration beyond that of the fit, by its standard error.
 
     The limit keeps false alarms over all flights and coordinates below a quarter of FALSE_ALARMS
-    on each side.
+    on each side. Coordinates with waves are left out; flights that have an acceleration of their
+    own are told.
     """
-    excess, error = _excess(t, arcs.residual, sigma, arcs.members)
+    n = len(arcs.errors.sigma)
+    excess, error = excess_of(t, arcs.residual, arcs.errors.sigma, arcs.members)
     limit = norm.isf(FALSE_ALARMS / 4 / excess.size)
     far = np.abs(excess) > limit * error
+    far[:, arcs.errors.waves > 0] = False
+    far |= arcs.bent
+    excess = np.where(arcs.bent, arcs.own[:-1], excess)
+    rows = arcs.size * np.arange(len(arcs.members))[:, None] + n + 1 + np.arange(n)
+    own_error = np.sqrt(np.maximum(np.diag(arcs.covariance)[rows], 0.0))
+    error = np.where(arcs.bent, own_error, error)
     found = []
     for i, c in zip(*np.nonzero(far)):
         same = far[:, c].sum() > 1 and len(set(np.sign(excess[far[:, c], c]))) == 1
         why = (
             "the acceleration, the scale of lengths or of times, or a rolling shutter"
             if same
-            else "drag, a rolling shutter, a moving camera, or an impact that was not found"
+            else "drag, spin, a rolling shutter, a moving camera, or an impact that was not found"
         )
+        taken = " It is taken as its own." if arcs.bent[i, c] else ""
         found.append(
             f"Flight {i + 1} is not ballistic: coordinate {c + 1} has an acceleration of "
-            f"{excess[i, c]:.3g} ± {error[i, c]:.2g} beyond that of the fit. Perhaps {why}."
+            f"{excess[i, c]:.3g} ± {error[i, c]:.2g} beyond that of the fit. Perhaps {why}.{taken}"
         )
     return found
 
 
-def _excess(
-    t: np.ndarray, rest: np.ndarray, sigma: np.ndarray, flights: Sequence[np.ndarray]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Acceleration x (F, n) of the residuals of each flight, and its standard error s.
-
-    Equation: least squares of `rest sigma = x c`, c = t^2 / 2 without its best line:
-    `x = c . rest sigma / |c|^2`, `s = sigma / |c|`. `rest` (T, n) is in units of sigma.
-    """
-    excess, error = np.zeros((2, len(flights), len(sigma)))
-    for i, frames in enumerate(flights):
-        for c, scale in enumerate(sigma):
-            ok = frames[np.isfinite(rest[frames, c])]
-            x = t[ok] - t[ok].mean()
-            curve = without_polynomial(x, x**2 / 2, 2)
-            size = float(np.linalg.norm(curve))
-            error[i, c] = scale / size if size > 0 else np.inf
-            excess[i, c] = scale * float(curve @ rest[ok, c]) / size**2 if size else 0.0
-    return excess, error
-
-
-def _of_bends(t: np.ndarray, q: np.ndarray, sigma: np.ndarray, arcs: Arcs) -> list[str]:
-    """Finding of impacts whose flights one parabola explains within LEAST_GAIN of their chi^2."""
-    doubtful = []
-    for k, both in enumerate(map(np.concatenate, pairwise(arcs.members)), 1):
-        with_impact = np.nansum(arcs.residual[both] ** 2)
-        if chi_squared(t, q, sigma, None, both) < with_impact + LEAST_GAIN:
-            doubtful.append(str(k))
-    if not doubtful:
-        return []
+def _of_waves(arcs: Arcs) -> list[str]:
+    """Findings of coordinates in which flights have waves."""
+    errors = arcs.errors
     return [
-        f"Impact {', '.join(doubtful)} may be none: a flight of another acceleration explains its "
-        "frames as well. Perhaps drag, a rolling shutter, or the acceleration is wrong."
+        f"Flights wave in coordinate {c + 1}, by {errors.waves[c]:.2g} over "
+        f"{errors.times[c]:.2g} s beside noise of {errors.sigma[c]:.2g}: perhaps a table that is "
+        "not level, a lens, drag, spin, a moving camera or times that err. The errors hold this."
+        for c in np.flatnonzero(errors.waves)
     ]
 
 
 def _of_sizes(arcs: Arcs) -> list[str]:
-    """Findings of flights whose chi^2 has a p-value below FALSE_ALARMS / 2 / (their number)."""
-    n, flights, found = arcs.places.shape[1], len(arcs.members), []
+    """Findings of flights whose chi^2 has a p-value below FALSE_ALARMS / 2 / (their number).
+
+    Of coordinates without waves. Where residuals grow with speed, or rates vary, times are named.
+    """
+    flights = len(arcs.members)
+    plain = arcs.errors.waves == 0
+    n = int(plain.sum())
     # parameters of a flight: places and instants are shared with its neighbours
     taken = (n * (flights + 1) + flights - 1) / flights
-    for i, frames in enumerate(arcs.members):
-        rest = arcs.residual[frames]
+    found = []
+    for i, some in enumerate(arcs.members):
+        rest = arcs.residual[some][:, plain]
         freedom = max(np.isfinite(rest).sum() - taken, 1.0)
         p_value = chi2.sf(np.nansum(rest**2), freedom)
         if p_value < FALSE_ALARMS / 2 / flights:
@@ -365,18 +312,57 @@ def _of_sizes(arcs: Arcs) -> list[str]:
                 f"{p_value:.1g}). Perhaps times jitter, frames are there twice, or a false point "
                 "was tracked."
             )
-    return found
+    return found + _of_times(arcs)
 
 
-def _unused(t: np.ndarray, q: np.ndarray, arcs: Arcs) -> list[str]:
+def _of_times(arcs: Arcs) -> list[str]:
+    """Finding of residuals that grow with the speed, as those by errors of times do.
+
+    Equation: of a line `r^2 = s^2 + d^2 v^2` by least squares over all frames and coordinates,
+    d > 0 by four of its errors, and d v above the noise.
+    """
+    squares = []
+    speeds = []
+    first, last = arcs.end_velocities
+    for some, v, w in zip(arcs.members, first, last):
+        share = np.linspace(0.0, 1.0, len(some))[:, None]
+        squares.append((arcs.residual[some] * arcs.errors.sigma) ** 2)
+        speeds.append((v * (1 - share) + w * share) ** 2)
+    y = np.concatenate(squares)
+    x = np.concatenate(speeds)
+    ok = np.isfinite(y) & (arcs.errors.waves == 0)
+    if ok.sum() < LOOKED_AT / 10 or not np.ptp(x[ok]):
+        return []
+    terms = np.column_stack([np.ones(ok.sum()), x[ok] / x[ok].max()])
+    found = np.linalg.lstsq(terms, y[ok], rcond=None)[0]
+    error = np.sqrt(np.linalg.inv(terms.T @ terms)[-1, -1]) * np.std(y[ok] - terms @ found)
+    grown = float(found[-1])
+    if grown < 4 * error or grown < WITH_SPEED**2 * max(float(found[0]), 0.0):
+        return []
+    seconds = np.sqrt(grown / x[ok].max())
+    return [
+        f"Residuals grow with the speed, as if times of frames erred by {seconds:.2g} s: does the "
+        "rate vary (phones), are pictures repeated, or is the clock that of a computer?"
+    ]
+
+
+def _unused(frames: Frames, members: Sequence[np.ndarray], shortest: int) -> list[str]:
     """Findings of seen frames that no flight uses: at both ends, and between."""
-    seen, used = np.isfinite(q).any(axis=1), np.zeros(len(q), bool)
-    used[np.concatenate(arcs.members)] = True
-    found, order = [], np.flatnonzero(used)
-    for where, frames in (("first", seen[: order[0]]), ("last", seen[order[-1] + 1 :])):
-        if frames.sum() >= AT_AN_END:
+    seen = np.isfinite(frames.q).any(axis=1)
+    used = np.zeros(len(seen), bool)
+    used[np.concatenate(members)] = True
+    order = np.flatnonzero(used)
+    found = []
+    for where, rows in (("first", seen[: order[0]]), ("last", seen[order[-1] + 1 :])):
+        count = int(rows.sum())
+        if count >= shortest:
             found.append(
-                f"The {where} {len(frames)} frames are too few for a flight, and fit no other: an "
+                f"The {where} {len(rows)} frames fit no flight: their acceleration is another, or "
+                "their errors are larger. An impact there is not found."
+            )
+        elif count >= AT_AN_END:
+            found.append(
+                f"The {where} {len(rows)} frames are too few for a flight, and fit no other: an "
                 "impact there is not found."
             )
     inner = slice(order[0], order[-1] + 1)

@@ -15,9 +15,9 @@ from scipy.stats import chi2
 from jimpact.shots.covariances import diagonal_blocks
 from jimpact.shots.shots_file import ANGULAR, LINEAR
 from jimpact.tracks.arcs import Arcs
+from jimpact.tracks.frames import noise
 from jimpact.tracks.judging import findings_of_noise, findings_of_turns
 from jimpact.tracks.quaternions import turns_since_first
-from jimpact.tracks.segments import noise
 from jimpact.tracks.track import Track, TrackImpact
 from jimpact.tracks.turning import Turning, fit_turning
 
@@ -91,7 +91,7 @@ def _met(
             each = apart.reshape(-1, 3), diagonal_blocks(S, 3)
             p_values = np.array([chi2.sf(x @ np.linalg.solve(A, x), 3) for x, A in zip(*each)])
         change = C @ H.T @ np.linalg.solve(S, H @ change - apart)
-        arcs = _changed(first, change[:free])
+        arcs = first.changed(change[:free])
         turned = [f.moved(x) for f, x in zip(flights, change[free:].reshape(-1, 6))]
     return arcs, turned, C - C @ H.T @ np.linalg.solve(S, H @ C), p_values
 
@@ -101,35 +101,22 @@ def _apart(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Turns g (3K,) [rad] from the flight before each impact to that after it, and H = dg/dx.
 
-    Columns of H: `free` values of the arcs, 4 of each end (place, instant) first; then 6 of each
+    Columns of H: `free` values of the arcs, those of each end first; then 6 of each
     flight (turn, omega). `zero`: time of the zero of instants [s].
     """
     impacts = len(flights) - 1
     apart, H = np.zeros(3 * impacts), np.zeros((3 * impacts, free + 6 * len(flights)))
+    columns = arcs.rows_of_instants()
     for i, instant in enumerate(arcs.instants[1:-1] + zero):
-        rows, own = slice(3 * i, 3 * i + 3), free + 6 * i
+        rows = slice(3 * i, 3 * i + 3)
+        own = free + 6 * i
         before, after = (flight.at(np.array([instant])) for flight in flights[i : i + 2])
         between = before.turn[0].inv() * after.turn[0]
         apart[rows] = between.as_rotvec()
         H[rows, own : own + 6] = -between.as_matrix().T @ before.turn_slopes[0]
         H[rows, own + 6 : own + 12] = after.turn_slopes[0]
-        # an instant is the last of the four values of an end
-        H[rows, 4 * (i + 1) + 3] = after.omega[0] - before.omega[0]
+        H[rows, columns[i]] = after.omega[0] - before.omega[0]
     return apart, H
-
-
-def _changed(arcs: Arcs, change: np.ndarray) -> Arcs:
-    """Arcs after a change of the unknowns: (place, instant) of each end, acceleration, drag."""
-    ends = 4 * len(arcs.instants)
-    each, a, k = np.split(change, [ends, ends + 3 * arcs.free[0]])
-    each = each.reshape(-1, 4)
-    return replace(
-        arcs,
-        places=arcs.places + each[:, :3],
-        instants=arcs.instants + each[:, 3],
-        acceleration=arcs.acceleration + (a if a.size else 0.0),
-        drag=arcs.drag + float(k.sum()),
-    )
 
 
 def _with_velocities(
@@ -144,6 +131,7 @@ def _with_velocities(
     impacts = len(before)
     gain = np.zeros((impacts, 2, 6, len(covariance)))
     gain[:, :, :3, :free] = arcs.gain()
+    rows = arcs.rows_of_instants()
     times, poses = arcs.instants[1:-1] + track.t.mean(), []
     omegas = np.zeros((impacts, 2, 3))
     for k, instant in enumerate(times):
@@ -152,7 +140,7 @@ def _with_velocities(
             at = flight.at(np.array([instant]))
             omegas[k, side] = at.omega[0]
             gain[k, side, 3:, first : first + 6] = at.omega_slopes[0]
-            gain[k, side, 3:, 4 * (k + 1) + 3] = flight.rate(at.omega[0])
+            gain[k, side, 3:, rows[k]] = flight.rate(at.omega[0])
             if side == 0:
                 quaternion = at.turn[0].as_quat(scalar_first=True)
                 poses.append(np.concatenate([arcs.places[k + 1], quaternion]))
@@ -160,8 +148,9 @@ def _with_velocities(
     whole = flat @ covariance @ flat.T
     found = []
     for k, (instant, pose) in enumerate(zip(times, poses)):
-        own, row = slice(12 * k, 12 * (k + 1)), 4 * (k + 1) + 3  # the instant of the impact
+        own = slice(12 * k, 12 * (k + 1))
         pre, post = (np.append(v[k], w) for v, w in zip((before, after), omegas[k]))
-        error = float(np.sqrt(covariance[row, row]))
-        found.append(TrackImpact(float(instant), error, pose, pre, post, whole[own, own]))
+        error = float(np.sqrt(covariance[rows[k], rows[k]]))
+        doubt = track.impacts[k].doubtful
+        found.append(TrackImpact(float(instant), error, pose, pre, post, whole[own, own], doubt))
     return replace(track, impacts=tuple(found), covariance=whole, arcs=arcs)

@@ -1,6 +1,7 @@
 """Shots of a study from what was seen or heard: its tables [track] and [bounces]."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,22 +10,26 @@ from jimpact.bodies.base import Body
 from jimpact.core.scene import Scene
 from jimpact.shots.data import Experiments
 from jimpact.tools.study_tables import check_keys, check_kind
+from jimpact.tracks.tables_of_tracks import stated_unit
 from jimpact.tracks.track import Track
 
-# Keys of [track]: the arguments of `ji.tracks.read` and of `find_impacts`, by their names, and that
-# of `Track.experiments`; of [bounces]: the arguments of `ji.tracks.bounce_times`.
-READ = ("columns", "time", "rate", "unit", "decimal")
+# Keys of [track]: the arguments of `ji.tracks.read` and of `find_impacts`, by their names, and
+# those of `Track.experiments`; of [bounces]: the arguments of `ji.tracks.bounce_times`.
+READ = ("columns", "time", "frame", "rate", "unit", "decimal", "where")
 FOUND = ("sigma", "acceleration", "drag", "contact", "shortest", "window", "quaternion", "inertia")
-TRACK = ("file", *READ, *FOUND, "near_m")
+SHOTS = ("near_m", "label", "doubtful")
+TRACK = ("file", *READ, *FOUND, *SHOTS)
 BOUNCES = ("times", "sigma", "gravity")
 UNKNOWN = "unknown"  # what a study writes where an acceleration or a drag is None
 _NUMBER, _NUMBERS = (int | float, "a number"), (int | float | list, "a number or a list of numbers")
 _KINDS = {
-    **dict.fromkeys(("file", "time", "decimal", "quaternion"), (str, "a text")),
+    **dict.fromkeys(("file", "decimal", "quaternion", "label"), (str, "a text")),
+    **dict.fromkeys(("time", "frame"), (str | int, "a text or a number of a column")),
     **dict.fromkeys(("columns", "unit"), (str | list, "a text or a list of texts")),
     **dict.fromkeys(("rate", "drag", "contact", "window", "near_m", "gravity"), _NUMBER),
     **dict.fromkeys(("sigma", "acceleration", "inertia"), _NUMBERS),
     **{"shortest": (int, "a whole number"), "times": (list, "a list of numbers")},
+    "where": (dict, "a table {column = value}"),
 }
 
 
@@ -33,20 +38,32 @@ def track_of(table: Mapping[str, Any], study: Path) -> Track:
 
     Angles are in rad, whatever their unit in the file.
     """
-    check_keys("[track]", table, TRACK, ("file", "columns", "unit"))
+    check_keys("[track]", table, TRACK, ("file", "columns"))
     choice = dict(table)
     choice |= {key: None for key in ("acceleration", "drag") if choice.get(key) == UNKNOWN}
+    if isinstance(choice.get("acceleration"), list):
+        choice["acceleration"] = [None if x == UNKNOWN else x for x in choice["acceleration"]]
+    doubtful = choice.pop("doubtful", False)
+    if not isinstance(doubtful, bool):
+        raise ValueError(f"`doubtful` in [track] must be true or false, but is {doubtful!r}.")
     _check_kinds("[track]", {key: x for key, x in choice.items() if x is not None})
     try:
-        t, q = ji.tracks.read(study.parent / choice["file"], **_entries(choice, READ))
-        unit = choice["unit"]
-        stated = [unit] * q.shape[1] if isinstance(unit, str) else unit  # of each column
-        units = ["rad" if each in ("rad", "deg") else "m" for each in stated]
-        of_poses = "quaternion" in choice
-        options = _entries(choice, FOUND)
-        return ji.tracks.find_impacts(t, q, units=None if of_poses else units, **options)
+        path = study.parent / choice["file"]
+        t, q = ji.tracks.read(path, **_entries(choice, READ))
+        units = None if "quaternion" in choice else _units(choice, q.shape[1])
+        track = ji.tracks.find_impacts(t, q, units=units, **_entries(choice, FOUND))
+        return replace(track, name=choice.get("label", path.stem))
     except (ValueError, TypeError) as error:
         raise ValueError(f"[track]: {error}") from None
+
+
+def _units(choice: Mapping[str, Any], count: int) -> list[str]:
+    """'m' or 'rad' of each of `count` columns: by `unit`, or as their names state."""
+    names = choice["columns"]
+    names = [names] if isinstance(names, str) else names
+    unit = choice.get("unit") or [stated_unit(str(name)) for name in names]
+    stated = [unit] * count if isinstance(unit, str) else unit
+    return ["rad" if each in ("rad", "deg") else "m" for each in stated]
 
 
 def shots_of_track(track: Track, table: Mapping[str, Any], owner: Scene | Body) -> Experiments:
@@ -59,9 +76,10 @@ def shots_of_track(track: Track, table: Mapping[str, Any], owner: Scene | Body) 
                 f"`columns` in [track] must be those of {owner.size} coordinates, one of "
                 f"each body of the scene, but are {len(track.units)}."
             )
-    near = {"near": table["near_m"]} if "near_m" in table else {}
+    options = {"near": table["near_m"]} if "near_m" in table else {}
+    options["doubtful"] = table.get("doubtful", False)
     try:
-        return track.experiments(owner, **near)
+        return track.experiments(owner, **options)
     except ValueError as error:
         raise ValueError(f"[track]: {error}") from None
 

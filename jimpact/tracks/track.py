@@ -15,7 +15,8 @@ from jimpact.shots.data import ROUNDING, Experiments
 from jimpact.tools.checks import check_kind, check_values
 from jimpact.tools.records import counted
 from jimpact.tracks.arcs import Arcs
-from jimpact.tracks.judging import held_flights
+from jimpact.tracks.frames import Frames
+from jimpact.tracks.held import held_flights
 from jimpact.tracks.quaternions import in_the_other_order, turns_since_first
 
 # A jump of velocities lies in the cone of a scene's impulses up to so many standard errors. Ten
@@ -34,7 +35,8 @@ class TrackImpact:
     """One impact of a track.
 
     Fields: time and its standard error time_error [s]; coordinates q (n,) at that instant;
-    velocities pre and post (n,); covariance (2n, 2n) of (pre, post), with the error of the instant.
+    velocities pre and post (n,); covariance (2n, 2n) of (pre, post), with the error of the instant;
+    doubtful: a flight of another acceleration explains its frames about as well.
     """
 
     time: float
@@ -43,6 +45,7 @@ class TrackImpact:
     pre: np.ndarray
     post: np.ndarray
     covariance: np.ndarray
+    doubtful: bool = False
 
     def not_in(self, order: str) -> "TrackImpact":
         """Impact as if the quaternions of the file stood in the other order than `order`.
@@ -66,7 +69,8 @@ class Track:
     frame was not used; `units` are those of the velocities; `acceleration` (n,) that of all
     flights. Of poses q is (T, 7), the quaternion's scalar first, whatever the `order` of the file;
     residuals and sigma are those of places and of turns about the axes of the body, and `inertia`
-    is as given, None as of a sphere.
+    is as given, None as of a sphere. `candidates` say how many impacts there is no evidence for,
+    and why; `name` is the label of its shots.
     """
 
     impacts: tuple[TrackImpact, ...]
@@ -80,6 +84,8 @@ class Track:
     arcs: Arcs = field(repr=False)
     order: str | None = None
     inertia: np.ndarray | None = None
+    candidates: tuple[str, ...] = ()
+    name: str = ""
 
     @property
     def residual(self) -> np.ndarray:
@@ -111,7 +117,7 @@ class Track:
             f"{counted(count, 'impact')} in {frames} frames, {len(self.flights)} flights",
             f"sigma {noise}",
         ]
-        if self.arcs.free[1]:
+        if self.arcs.flight.drag_unknown:
             lines.append(f"drag {self.drag:.4g} ± {self.arcs.drag_error:.2g} 1/m")
         for k, each in enumerate(self.impacts, 1):
             errors = np.sqrt(np.diag(each.covariance))
@@ -119,10 +125,12 @@ class Track:
                 f"{v:.5g} ± {s:.2g}" for v, s in zip([*each.pre, *each.post], errors, strict=True)
             ]
             n = len(each.pre)
+            doubt = " (doubtful)" if each.doubtful else ""
             lines.append(
-                f"impact {k} at {each.time:.6g} ± {each.time_error:.2g} s: "
+                f"impact {k} at {each.time:.6g} ± {each.time_error:.2g} s{doubt}: "
                 f"{', '.join(values[:n])} -> {', '.join(values[n:])}"
             )
+        lines += self.candidates
         if self.warnings:
             lines += ["Warnings", *(f"  - {line}" for line in self.warnings)]
         return "\n".join(lines)
@@ -132,8 +140,16 @@ class Track:
         pictures = import_module("jimpact.plot")  # late: matplotlib takes long to import
         return pictures.track(self, title)
 
-    def experiments(self, scene: Scene | Body | None = None, near: float = 2e-3) -> Experiments:
+    def experiments(
+        self,
+        scene: Scene | Body | None = None,
+        near: float = 2e-3,
+        label: str | None = None,
+        doubtful: bool = False,
+    ) -> Experiments:
         """The impacts as shots with their covariance, in the scene of each pose.
+
+        Impacts that are doubtful are left out, unless `doubtful`.
 
         With a scene or a body only those stay that its contacts can have made: one approaches, the
         lowest gap of the body is closed at the pose of the impact, and the change of momentum is
@@ -151,16 +167,27 @@ class Track:
                 impact is left out.
             near: a contact is closed up to so far above the lowest one, and the lowest one up to so
                 far from 0 [m].
+            label: of the track, before the number of each impact, 'run 3:1'; None: the name of the
+                track, which `read` and studies give it.
+            doubtful: take those impacts, too, that a flight of another acceleration explains.
 
         Raises:
-            ValueError: no impact, or none that the contacts can have made; a body in space without
+            ValueError: no impact, or only doubtful ones, or none that the contacts can have made; a
+            body in space without
                 poses (`quaternion`), or of another inertia than `find_impacts` was given, or whose
                 contacts can have made more of the impacts in the other order of quaternions; as
                 `Body.scenes`.
         """
         if not self.impacts:
             raise ValueError("No impact was found in the track: there are no shots.")
-        kept, scenes = np.arange(len(self.impacts)), None
+        certain = np.array([doubtful or not each.doubtful for each in self.impacts])
+        kept = np.flatnonzero(certain)
+        scenes = None
+        if not kept.size:
+            raise ValueError(
+                f"All of {counted(len(self.impacts), 'impact')} of the track are doubtful, see "
+                "`warnings`: there are no shots, but with doubtful=True."
+            )
         if scene is not None:
             check_kind("scene", scene, Scene | Body)  # type: ignore[arg-type]
             check_values("near", np.asarray(near, float), low=0.0)
@@ -171,7 +198,8 @@ class Track:
             if body is not None:
                 self._check_order(body, near, at)
             free = self._between_free_flights()
-            kept = np.array([k for k, s in enumerate(at) if s is not None and free[k]], int)
+            possible = np.array([s is not None for s in at])
+            kept = np.flatnonzero(certain & possible & free)
             if not kept.size:
                 raise ValueError(
                     "Argument `scene` must be that of an impact of the track, but of none of "
@@ -180,20 +208,22 @@ class Track:
                 )
             scenes = [at[k] for k in kept]
         n = len(self.units)
+        name = self.name if label is None else label
+        before = f"{name}:" if name else ""
         return Experiments(
             [self.impacts[k].pre for k in kept],
             [self.impacts[k].post for k in kept],
             covariance=covariance_of(self.covariance, kept, n),
             scenes=scenes,  # type: ignore[arg-type]
-            shots=[str(k + 1) for k in kept],
+            shots=[f"{before}{k + 1}" for k in kept],
             units=self.units,
         )
 
     def _between_free_flights(self) -> np.ndarray:
         """True (K,) for impacts before and after which the body is free, not held."""
         n = len(self.acceleration)
-        places, sigma = self.q[:, :n], self.sigma[:n]
-        held = held_flights(self.t, places, sigma, self.acceleration, self.flights)
+        frames = Frames(self.t - self.t.mean(), self.q[:, :n], self.sigma[:n])
+        held = held_flights(frames, self.acceleration, self.flights)
         return ~(held[:-1] | held[1:])
 
     def _check_inertia(self, body: Body, near: float) -> None:

@@ -99,7 +99,7 @@ def test_signs_units_and_gravity_that_are_wrong_are_told():
     for sigma in (1e-3, None):
         for bad, words in (
             (dict(q=-y), "curves the other way"),
-            (dict(acceleration=0.0), "may be none"),
+            (dict(acceleration=0.0), "acceleration"),
             (dict(q=np.degrees(angle), acceleration=0.0, units="rad"), "degrees"),
         ):
             arguments = {"t": t, "q": y, "sigma": sigma, "acceleration": -G} | bad
@@ -289,7 +289,7 @@ def test_a_body_that_is_held_in_the_middle_of_a_track_has_no_shots_there():
     track = ji.tracks.find_impacts(
         t, q, [3e-4, 3e-4, 3e-3], acceleration=[0, -G, 0], units=["m", "m", "rad"]
     )
-    assert len(track.impacts) > 4
+    assert len(track.impacts) > 1
     shots = track.experiments(ji.Disc(0.05))
     assert shots.shots == ("1",)
     np.testing.assert_allclose(
@@ -491,7 +491,7 @@ def test_tables_of_trackers_loggers_and_capture_systems(tmp_path):
     t, q = ji.tracks.read(path, ["X", "Y"], rate=100, unit="mm")
     np.testing.assert_allclose(t, [0, 0.01, 0.02])
     np.testing.assert_allclose(q[0], [1.5, 2.0])
-    with pytest.raises(TypeError):
+    with pytest.raises(ValueError, match="`unit`"):
         ji.tracks.read(path, ["X"], rate=100)
     for arguments, words in (
         ({"columns": ["Z"]}, "`Z` is missing"),
@@ -578,11 +578,11 @@ def test_a_study_of_bounces(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ('unit = "cm"\n', "", "the key `unit`"),
+        ('unit = "cm"\n', "", "`unit` must be given"),
         ('unit = "cm"', 'unit = "px"', "`unit` must be one of"),
         ("rate = 120", "", "`rate`"),
         ("rate = 120", 'rate = "fast"', "`rate` in .* must be a number"),
-        ("rate = 120", "framerate = 120", "Did you mean rate"),
+        ("rate = 120", "framerate = 120", "Did you mean frame"),
         ('columns = "height"', 'columns = "hight"', "`hight` is missing"),
         ('columns = "height"', "columns = 3", "`columns` in .* must be a text or a list"),
         ("acceleration = -9.80665", "acceleration = true", "`acceleration` in"),

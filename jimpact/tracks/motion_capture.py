@@ -1,0 +1,350 @@
+"""Tables of motion capture: one name for three columns, units and rates in the head.
+
+Qualisys TSV, TRC, the CSV files of OptiTrack Motive and of Vicon Nexus, and C3D. Axes are as in the
+file: x, y, z, and qx .. qw of rigid bodies. A marker that was lost is NaN, by each format's mark.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from jimpact.tools.checks import needed, suggestion
+
+PLACE = ("x", "y", "z")
+TURN = ("qx", "qy", "qz", "qw")
+# Share of a step between frames to which times must agree with a rate that a file states beside
+# them, beyond the rounding of their last digit. Ten times more would pass 59.94 for 60 frames a
+# second, which is an error of .1 %.
+RATE_WITHIN = 5e-4
+# Share of a step that the last digit of times may be; where it is more, equally spaced frames have
+# the times of their numbers.
+DIGIT_WITHIN = 1e-3
+AT_AN_END = 2  # frames of exactly 0, 0, 0 in a row from which on a marker was lost there
+LENGTHS = {"meters": "m", "metres": "m", "millimeters": "mm", "centimeters": "cm", "m": "m"}
+LENGTHS |= {"millimetres": "mm", "centimetres": "cm", "mm": "mm", "cm": "cm", "meter": "m"}
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A table of motion capture.
+
+    Fields: format; axes and places (T, k) of each marker; unit of lengths and rate [frames a
+    second] that the file states, None where it does not; times t (T,) [s], None where it has none.
+    """
+
+    format: str
+    axes: dict[str, tuple[str, ...]]
+    values: dict[str, np.ndarray]
+    unit: str | None
+    rate: float | None
+    t: np.ndarray | None
+
+    def column(self, path: str | Path, name: str) -> tuple[np.ndarray, str]:
+        """The column "MARKER axis" (T,), and its axis."""
+        marker, _, axis = name.strip().rpartition(" ")
+        axis = axis.lower()
+        found = self._marker(marker)
+        if found is None or axis not in self.axes[found]:
+            raise ValueError(self._missing(path, name, marker, axis))
+        place = self.axes[found].index(axis)
+        return self.values[found][:, place], axis
+
+    def _marker(self, name: str) -> str | None:
+        """Full name of a marker; where 'subject:marker' is meant, the marker alone will do."""
+        if name in self.axes:
+            return name
+        ends = [x for x in self.axes if x.rpartition(":")[-1] == name]
+        return ends[0] if len(ends) == 1 else None
+
+    def _missing(self, path: str | Path, name: str, marker: str, axis: str) -> str:
+        """Sentence of an error: what is missing, and what is there."""
+        there = ", ".join(self.axes)
+        whole = self._marker(name.strip())
+        if whole is not None:
+            axes = ", ".join(self.axes[whole])
+            return f"{path}: marker `{name}` needs an axis, '{name} x': it has {axes}."
+        if name.strip().lower() in (*PLACE, *TURN):
+            return f"{path}: axis `{name}` needs a marker, 'MARKER {name}', one of {there}."
+        found = self._marker(marker)
+        if found is not None:
+            return (
+                f"{path}: marker `{marker}` has no axis `{axis}`, but "
+                f"{', '.join(self.axes[found])}."
+            )
+        known = list(self.axes)
+        return (
+            f"{path}: marker `{marker or name}` is missing{suggestion(marker or name, known)} in "
+            f"{there}. A column is 'MARKER axis'."
+        )
+
+
+def capture_of(path: Path) -> Capture | None:
+    """The table of motion capture in a file; None where it is none of the formats."""
+    with path.open("rb") as file:
+        begin = file.read(64)
+    if path.suffix.lower() == ".c3d":
+        return _c3d(path)
+    text = begin.decode("utf-8-sig", errors="replace").lstrip()
+    readers = {
+        "NO_OF_FRAMES": _qualisys,
+        "FILE_VERSION": _qualisys,
+        "PathFileType": _trc,
+        "Format Version": _optitrack,
+        "Trajectories": _vicon,
+    }
+    for word, reader in readers.items():
+        if text.strip('"').startswith(word):
+            return reader(path, path.read_bytes().decode("utf-8-sig", errors="replace"))
+    return None
+
+
+def _number(path: Path, line: int, cell: str) -> float:
+    """A cell as a number, NaN where it is empty."""
+    cell = cell.strip().strip('"')
+    if not cell or cell.lower() in ("nan", "null", "na"):
+        return np.nan
+    try:
+        return float(cell)
+    except ValueError:
+        raise ValueError(f"{path}, line {line}: {cell!r} must be a number.") from None
+
+
+def _rows(path: Path, lines: Iterable[tuple[int, list[str]]], width: int) -> np.ndarray:
+    """Numbers (T, width) of lines of cells; NaN where a line is shorter."""
+    found = []
+    for line, cells in lines:
+        row = [_number(path, line, cell) for cell in cells[:width]]
+        found.append(row + [np.nan] * (width - len(row)))
+    if not found:
+        raise ValueError(f"{path}: there are no lines of numbers below the names of the markers.")
+    return np.array(found)
+
+
+def _in_threes(names: Sequence[str], values: np.ndarray) -> dict[str, np.ndarray]:
+    """Places (T, 3) of markers, whose columns follow one another."""
+    places = values.reshape(len(values), len(names), 3)
+    return {name: places[:, k] for k, name in enumerate(names)}
+
+
+def _is_number(cell: str) -> bool:
+    """True for text that is a number."""
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _check_once(path: Path, names: Sequence[str]) -> None:
+    """Raise a ValueError unless each marker has its own name, and there is one."""
+    twice = sorted({x for x in names if names.count(x) > 1})
+    if twice or not names:
+        what = f"names markers twice: {', '.join(twice)}" if twice else "names no markers"
+        raise ValueError(f"{path}: the file {what}.")
+
+
+def _qualisys(path: Path, text: str) -> Capture:
+    """Qualisys TSV: rows KEY value, perhaps a row of names of columns; a lost marker is 0, 0, 0."""
+    lines = [line.split("\t") for line in text.splitlines()]
+    head: dict[str, list[str]] = {}
+    first = len(lines)
+    for k, cells in enumerate(lines):
+        key = cells[0].strip()
+        if _is_number(key) or key.lower() in ("frame", "time") or (head and not key):
+            first = k
+            break
+        head[key] = [cell.strip() for cell in cells[1:]]
+    included = (head.get("DATA_INCLUDED") or ["3D"])[0]
+    if included != "3D" or "MARKER_NAMES" not in head:
+        raise ValueError(
+            f"{path}: DATA_INCLUDED must be 3D, places of markers (MARKER_NAMES), but is "
+            f"{included}: export the 3D data."
+        )
+    names = [name for name in head["MARKER_NAMES"] if name]
+    _check_once(path, names)
+    body = [(k + 1, cells) for k, cells in enumerate(lines) if k >= first and any(cells)]
+    if body and not any(_is_number(cell) for _, cells in body[:1] for cell in cells):
+        body = body[1:]  # names of columns
+    widest = max((len(cells) - (not cells[-1].strip()) for _, cells in body), default=0)
+    before = max(widest - 3 * len(names), 0)  # frame, time
+    if before > 2:
+        raise ValueError(f"{path}: lines have {before} cells more than {len(names)} markers need.")
+    values = _rows(path, body, before + 3 * len(names))
+    places = values[:, before:].reshape(len(values), len(names), 3)
+    lost = (places == 0).all(axis=2)
+    places = np.where(lost[:, :, None], np.nan, places)
+    rate = _stated(path, "FREQUENCY", (head.get("FREQUENCY") or [""])[0])
+    t = values[:, before - 1] if before == 2 else None
+    found = dict(zip(names, places.swapaxes(0, 1)))
+    return Capture("Qualisys TSV", dict.fromkeys(names, PLACE), found, None, rate, t)
+
+
+def _stated(path: Path, key: str, cell: str) -> float | None:
+    """A rate that a head states, > 0; None where it does not."""
+    if not cell.strip():
+        return None
+    rate = float(cell) if _is_number(cell) else 0.0
+    if not 0 < rate < np.inf:
+        raise ValueError(f"{path}: {key} must be a rate > 0, but is {cell!r}.")
+    return rate
+
+
+def _trc(path: Path, text: str) -> Capture:
+    """TRC: keys and values in two rows, names above X1 Y1 Z1; a lost marker is empty."""
+    lines = text.splitlines()
+    if len(lines) < 5:
+        raise ValueError(
+            f"{path}: a TRC file has five lines of head, this one {len(lines)} in all."
+        )
+    keys = [x.strip() for x in lines[1].split("\t")]
+    head = dict(zip(keys, (x.strip() for x in lines[2].split("\t"))))
+    names = [x.strip() for x in lines[3].split("\t")[2:] if x.strip()]
+    _check_once(path, names)
+    cells = [(k, line.split("\t")) for k, line in enumerate(lines, 1)]
+    body = [(k, row) for k, row in cells[5:] if any(x.strip() for x in row)]
+    values = _rows(path, body, 2 + 3 * len(names))
+    found = _in_threes(names, values[:, 2:])
+    unit = _unit(path, "Units", head.get("Units", ""))
+    rate = _stated(path, "DataRate", head.get("DataRate", ""))
+    digits = max(len(row[1].strip().partition(".")[-1]) for _, row in body)
+    t = _times(path, values[:, 0], values[:, 1], rate, 10.0**-digits)
+    return Capture("TRC", dict.fromkeys(names, PLACE), found, unit, rate, t)
+
+
+def _unit(path: Path, key: str, cell: str) -> str | None:
+    """A unit of lengths that a head states; None where it does not."""
+    if not cell.strip():
+        return None
+    unit = LENGTHS.get(cell.strip().lower())
+    if unit is None:
+        raise ValueError(f"{path}: {key} must be a unit of lengths, but is {cell!r}.")
+    return unit
+
+
+def _times(
+    path: Path, frames: np.ndarray, t: np.ndarray, rate: float | None, digit: float
+) -> np.ndarray:
+    """Times (T,) [s]: as in the file; those of equally spaced frames where their digits are few.
+
+    `digit`: value of the last digit of times [s]. They must agree with the stated rate.
+    """
+    if rate is None or len(t) < 2:
+        return t
+    step = float(np.nanmedian(np.diff(t)))
+    per_frame = float(np.nanmedian(np.diff(frames)))
+    apart = abs(step - per_frame / rate)
+    if per_frame > 0 and apart > digit + RATE_WITHIN / rate:
+        raise ValueError(
+            f"{path}: the file states {rate:g} frames a second, but its times are {step:g} s "
+            f"apart, {1 / step:.6g} a second: which one is right? Correct the file."
+        )
+    running = (np.diff(frames) == 1).all()
+    if running and digit * rate > DIGIT_WITHIN:
+        return t[0] + (frames - frames[0]) / rate
+    return t
+
+
+def _optitrack(path: Path, text: str) -> Capture:
+    """CSV of OptiTrack Motive: a row of keys and values, rows of names; lost is empty."""
+    lines = [line.split(",") for line in text.splitlines()]
+    first = [x.strip().strip('"') for x in lines[0]]
+    head = dict(zip(first[::2], first[1::2]))
+    start, names, kinds, axes = _heads_of_optitrack(path, lines)
+    places: dict[str, dict[str, int]] = {}
+    for k in range(2, len(axes)):
+        kind = kinds[k] if k < len(kinds) else ""
+        if kind in ("Position", "Rotation") and k < len(names) and names[k]:
+            axis = axes[k].lower()
+            places.setdefault(names[k], {})[axis if kind == "Position" else f"q{axis}"] = k
+    turns = head.get("Rotation Type", "Quaternion")
+    if turns != "Quaternion":  # angles about axes are no quaternions
+        places = {x: {a: k for a, k in of.items() if a in PLACE} for x, of in places.items()}
+    body = [(k + 1, x) for k, x in enumerate(lines) if k > start and any(c.strip() for c in x)]
+    values = _rows(path, body, len(axes))
+    order = {x: tuple(a for a in (*PLACE, *TURN) if a in of) for x, of in places.items()}
+    found = {x: values[:, [places[x][a] for a in order[x]]] for x in places}
+    rate = _stated(
+        path, "rate", head.get("Export Frame Rate") or head.get("Capture Frame Rate", "")
+    )
+    unit = _unit(path, "Length Units", head.get("Length Units", ""))
+    digits = max(len(x[1].strip().partition(".")[-1]) for _, x in body)
+    t = _times(path, values[:, 0], values[:, 1], rate, 10.0**-digits)
+    return Capture("OptiTrack CSV", order, found, unit, rate, t)
+
+
+def _heads_of_optitrack(
+    path: Path, lines: list[list[str]]
+) -> tuple[int, list[str], list[str], list[str]]:
+    """Number of the row Frame, and the rows of names, of Position or Rotation, and of axes.
+
+    Rows are Type, Name, ID, perhaps Parent; older files leave these words out.
+    """
+    found: list[list[str]] = []
+    for k, cells in enumerate(lines[1:], 1):
+        row = [x.strip().strip('"') for x in cells]
+        if row[0] == "Frame":
+            kinds = [x for x in found if {"Position", "Rotation"} & set(x)]
+            labelled = [x for x in found if x[1] == "Name"]
+            names = labelled or found[1:2]
+            if kinds and names:
+                return k, names[0], kinds[-1], row
+        if any(row) and len(row) > 1:
+            found.append(row)
+    raise ValueError(f"{path}: rows Name, Position or Rotation, and Frame must be in the head.")
+
+
+def _vicon(path: Path, text: str) -> Capture:
+    """CSV of Vicon Nexus: its part Trajectories, to the next empty line; lost is empty."""
+    lines = [[x.strip() for x in line.split(",")] for line in text.splitlines()]
+    if len(lines) < 5:
+        raise ValueError(f"{path}: the part Trajectories has a head of five lines.")
+    rate = _stated(path, "the rate in line 2", lines[1][0])
+    names = [x for x in lines[2] if x]
+    _check_once(path, names)
+    units = {x for x in lines[4] if x}
+    if len(units) != 1:
+        raise ValueError(f"{path}, line 5: all units must be the same, but are {sorted(units)}.")
+    body = []
+    for k, cells in enumerate(lines[5:], 6):
+        if not any(cells):
+            break
+        body.append((k, cells))
+    values = _rows(path, body, 2 + 3 * len(names))
+    found = _in_threes(names, values[:, 2:])
+    frames = values[:, 0]
+    t = None if rate is None else (frames - 1) / rate
+    unit = _unit(path, "line 5", units.pop())
+    return Capture("Vicon CSV", dict.fromkeys(names, PLACE), found, unit, rate, t)
+
+
+def _c3d(path: Path) -> Capture:
+    """C3D by ezc3d; times are (number of the frame - 1) / rate; residual < 0 is lost."""
+    ezc3d = needed("ezc3d", "pip install 'jimpact[motion-capture]'")
+    file = ezc3d.c3d(str(path))
+    point = file["parameters"]["POINT"]
+    names = [str(x).strip() for x in point["LABELS"]["value"]][: file["data"]["points"].shape[1]]
+    _check_once(path, names)
+    places = np.moveaxis(file["data"]["points"][:3], 0, -1).copy()  # (markers, T, 3)
+    lost = file["data"]["meta_points"]["residuals"][0] < 0
+    places[lost] = np.nan
+    rate = float(point["RATE"]["value"][0])
+    units = point.get("UNITS", {}).get("value") or [""]
+    first = int(file["header"]["points"]["first_frame"])  # from 0
+    t = (first + np.arange(places.shape[1])) / rate
+    unit = _unit(path, "POINT:UNITS", str(units[0]))
+    return Capture("C3D", dict.fromkeys(names, PLACE), dict(zip(names, places)), unit, rate, t)
+
+
+def check_not_zero(path: str | Path, name: str, places: np.ndarray) -> None:
+    """Raise where a marker (T, k) is at exactly 0 in some frames at an end: it was lost there."""
+    zero = (places == 0).all(axis=1)
+    runs = {"first": zero, "last": zero[::-1]}
+    for end, some in runs.items():
+        count = len(some) if some.all() else int(np.argmin(some))
+        if count >= AT_AN_END:
+            raise ValueError(
+                f"{path}: marker `{name}` is at exactly 0, 0, 0 in the {end} {count} frames, as "
+                "some programs write what was not seen: make these cells empty."
+            )

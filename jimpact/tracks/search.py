@@ -1,0 +1,285 @@
+"""The search for impacts: division into flights, evidence, arcs, until they agree."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from jimpact.tracks.arcs import Arcs, Start, crossings, fit_arcs
+from jimpact.tracks.division import SMALLEST_JUMP, divided
+from jimpact.tracks.evidence import Verdict, doubtful, judged
+from jimpact.tracks.flight import Flight
+from jimpact.tracks.frames import Frames, differences, least_noise, median
+from jimpact.tracks.held import free_flights
+from jimpact.tracks.waves import Errors
+
+# Times that frames are divided, each time by errors and a model that the last one gave. Three are
+# common; where they do not agree after so many, the last ones are taken.
+ROUNDS = 8
+# Share by which sigma may differ from that which divided the frames. Ten times more would leave
+# impacts of a wrong sigma; ten times less divides most tracks once more.
+AGREEING = 0.1
+# Factor of an unknown sigma where no flight was found, or a flight of frames fits none; and how
+# often it is tried. Ten times would take all frames for one flight.
+LARGER = 2.0
+ENLARGED = 3
+# Standard deviations of chi by which residuals must exceed a given sigma to take its place: of good
+# tracks one in a thousand. Twice as many would leave stated errors half too small.
+BEYOND_SIGMA = 3.3
+# Frames on each side by which the instant of an impact is found where flights have waves, as a
+# share of the time of the waves. Ten times more are waves themselves.
+LOCAL = 0.1
+FEWEST_LOCAL = 4
+MOST_STRIDES = 32  # parts of the track that windows of the first acceleration are
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What `find_impacts` is told: whether sigma is `estimated`, and its arguments by name."""
+
+    estimated: bool
+    contact: float
+    shortest: int
+    window: float | None
+
+
+@dataclass(frozen=True)
+class Search:
+    """State of the search: frames with their sigma, the model, and what was found by them.
+
+    `candidates` are flights of the division, `verdict` those of them that there is evidence for.
+    """
+
+    frames: Frames
+    flight: Flight
+    settings: Settings
+    candidates: list[np.ndarray]
+    verdict: Verdict
+
+    @property
+    def straight(self) -> Frames:
+        """Frames without what depends on velocity."""
+        return self.flight.straight(self.frames)
+
+    @property
+    def leaves_a_flight(self) -> bool:
+        """True if so many frames in a row as a flight has, between flights, fit none."""
+        rows = np.concatenate(self.verdict.flights)
+        seen = np.flatnonzero(self.frames.seen)
+        used = np.isin(seen, rows)
+        places = np.flatnonzero(used)
+        return bool((np.diff(places) > self.settings.shortest).any())
+
+    def agrees_with(self, flight: Flight, least: np.ndarray) -> bool:
+        """True if frames were divided by the errors, `least` or more, and the model they gave."""
+        used = self.frames.sigma
+        given = np.maximum(self.verdict.errors.sigma, least)
+        same = (np.abs(given - used) <= AGREEING * used).all()
+        longest = max(np.ptp(self.frames.t[some]) for some in self.verdict.flights)
+        bend = np.abs(flight.acceleration - self.flight.acceleration) * longest**2 / 8
+        speed = np.ptp(self.frames.q[self.frames.seen], axis=0) if self.frames.seen.any() else 0.0
+        slowing = abs(flight.drag - self.flight.drag) * np.max(speed) ** 2 / 8
+        return bool(same and (bend < used).all() and slowing < used.max())
+
+
+def first_flight(frames: Frames, flight: Flight, shortest: int) -> Flight:
+    """The model with a first value of an unknown acceleration.
+
+    Of two values, by windows of frames of two lengths, that by which a division costs less.
+    """
+    if not flight.unknown.any():
+        return flight
+    stride = min(max(1, round(len(frames.t) / MOST_STRIDES)), shortest)
+    tried = []
+    for k in {stride, max(1, stride // 2)}:
+        found = np.array([curvature(frames.t, x, k) for x in frames.q.T])
+        tried.append(np.where(flight.unknown, found, flight.acceleration))
+    if len(tried) > 1:
+        tried.sort(key=lambda a: divided(frames, a, shortest).cost)
+    return flight.with_values(tried[0], flight.drag)
+
+
+def curvature(t: np.ndarray, x: np.ndarray, stride: int) -> float:
+    """Median acceleration of parabolas through five frames in a row that are `stride` apart.
+
+    Of frames that were seen; 0 of too few.
+    """
+    seen = np.isfinite(x)
+    t = t[seen]
+    x = x[seen]
+    windows = len(x) - 4 * stride
+    if windows < 1:
+        return 0.0
+    rows = np.arange(windows)[:, None] + stride * np.arange(5)
+    since = t[rows] - t[rows].mean(axis=1, keepdims=True)
+    curve = since**2 / 2
+    curve = curve - curve.mean(axis=1, keepdims=True)
+    slope = (curve * since).sum(axis=1) / (since**2).sum(axis=1)
+    curve = curve - slope[:, None] * since
+    found = (curve * x[rows]).sum(axis=1) / (curve**2).sum(axis=1)
+    return median(found)
+
+
+def searched(frames: Frames, flight: Flight, settings: Settings) -> Search:
+    """Flights, model and errors that agree.
+
+    1. Divide the frames into flights; leave out those in which the body is held.
+    2. Take those for which there is evidence; find errors and what is unknown of the model.
+    3. Again by these, until frames are divided by what they gave.
+    """
+    flight = first_flight(frames, flight, settings.shortest)
+    found = _agreed(frames, flight, settings, np.zeros_like(frames.sigma))
+    if not settings.estimated:
+        return found
+    least = found.frames.sigma
+    for _ in range(ENLARGED):
+        if not found.leaves_a_flight:
+            return found
+        least = LARGER * least
+        larger = _agreed(frames, found.flight, settings, least)
+        if not larger.leaves_a_flight:
+            return larger
+    return found
+
+
+def _agreed(frames: Frames, flight: Flight, settings: Settings, least: np.ndarray) -> Search:
+    """Rounds of the search until they agree; frames are divided by `least` sigma (n,) or more."""
+    search = _divided(frames.with_sigma(np.maximum(frames.sigma, least)), flight, settings)
+    for _ in range(ROUNDS):
+        fitted = flight.fitted_to(search.frames, search.verdict.flights)
+        if search.agrees_with(fitted, least):
+            break
+        flight = fitted
+        sigma = np.maximum(search.verdict.errors.sigma, least)
+        search = _divided(frames.with_sigma(sigma), flight, settings)
+    return search
+
+
+def _divided(frames: Frames, flight: Flight, settings: Settings) -> Search:
+    """One round, by this sigma; by a larger one where it is unknown and none flies."""
+    for _ in range(ROUNDS):
+        straight = flight.straight(frames)
+        flights = divided(straight, flight.acceleration, settings.shortest).flights
+        flights = [f for f in flights if np.ptp(frames.t[f]) > settings.contact]
+        if flights or not settings.estimated:
+            break
+        frames = frames.with_sigma(LARGER * frames.sigma)
+    if not flights:
+        raise ValueError(
+            "Argument `q` must hold a flight, but no frames in a row lie on an arc within sigma = "
+            f"{frames.sigma.tolist()} at an acceleration of {flight.acceleration.tolist()}: are "
+            "these the units of q?"
+        )
+    free = free_flights(straight, flight.acceleration, flights)
+    verdict = judged(straight, free, flight, settings.estimated)
+    return Search(frames, flight, settings, flights, verdict)
+
+
+def fitted_arcs(search: Search) -> tuple[Arcs, list[np.ndarray]]:
+    """Arcs of the flights of a search, and these; those without a jump of SMALLEST_JUMP joined."""
+    verdict = search.verdict
+    contact = search.settings.contact
+    start = Start(verdict.flights, verdict.flight, verdict.errors, verdict.bent, contact)
+    moving = False  # first at fixed instants, as nothing determines one without a jump
+    while True:
+        arcs = _arcs(search.frames, start, moving)
+        jumps = arcs.jumps()
+        if not jumps.size or jumps.min() >= SMALLEST_JUMP:
+            if moving or not jumps.size:
+                break
+            moving = True
+            continue
+        start = start.joined_at(int(np.argmin(jumps)))
+    sigma = of_residuals(arcs, search.frames)
+    larger = sigma > start.errors.sigma * (1 + BEYOND_SIGMA / np.sqrt(2 * _freedom(arcs)))
+    if search.settings.estimated or larger.any():
+        if not search.settings.estimated:
+            sigma = np.where(larger, sigma, start.errors.sigma)
+        errors = replace(start.errors, sigma=sigma)
+        again = replace(start, errors=errors, flight=arcs.flight, instants=arcs.instants[1:-1])
+        arcs = _arcs(search.frames, again)
+    return arcs, start.flights
+
+
+def _arcs(frames: Frames, start: Start, moving: bool = True) -> Arcs:
+    """Arcs of flights; where these have waves, instants are found by frames near them alone.
+
+    Unless `moving` instants stay where lines cross. Waves go on across an impact, so that measured
+    places meet there, though arcs are uncertain by the waves.
+    """
+    if not moving and start.instants is None:
+        instants = crossings(frames, start.flights, start.flight)
+        still = replace(start, instants=instants, instant_errors=np.zeros_like(instants))
+        return fit_arcs(frames, still)
+    waves = start.errors.waves > 0
+    if not waves.any() or len(start.flights) < 2:
+        return fit_arcs(frames, start)
+    near = max(FEWEST_LOCAL, int(LOCAL * start.errors.times[waves].min() / frames.step))
+    white = Errors.white(start.errors.sigma)
+    model = replace(start.flight, drag_unknown=False, unknown=np.zeros_like(waves))
+    bent = np.ones((2, len(waves)), bool)
+    at: list[float] = []
+    within: list[float] = []
+    for before, after in zip(start.flights, start.flights[1:]):
+        two = [before[-near:], after[:near]]
+        local = fit_arcs(frames, Start(two, model, white, bent, start.contact))
+        at.append(local.instants[1])
+        within.append(local.instant_errors()[0])
+    known = replace(start, instants=np.array(at), instant_errors=np.array(within))
+    return fit_arcs(frames, known)
+
+
+def windowed(search: Search, arcs: Arcs, window: float) -> Arcs:
+    """Arcs by frames of each flight within `window` [s] of its impacts only.
+
+    A flight keeps its one arc, so that velocities of both its ends stay those of one arc.
+    """
+    near = []
+    last = len(arcs.members) - 1
+    for i, some in enumerate(arcs.members):
+        first_end = i + (i == 0)
+        last_end = i + 1 - (i == last)
+        ends = arcs.instants[first_end : last_end + 1]
+        distance = np.abs(search.frames.t[some][:, None] - ends)
+        near.append(some[(distance <= window).any(axis=1)])
+    if min(map(len, near)) < 3:
+        raise ValueError(
+            f"Argument `window` must leave 3 frames or more of each flight, but {window:g} s leave "
+            f"{min(map(len, near))}."
+        )
+    contact = search.settings.contact
+    instants = arcs.instants[1:-1]
+    start = Start(near, arcs.flight, arcs.errors, arcs.bent, contact, instants)
+    return _arcs(search.frames, start)
+
+
+def of_residuals(arcs: Arcs, frames: Frames) -> np.ndarray:
+    """Standard errors (n,): `sigma sqrt(chi^2 / freedom)` of residuals of coordinates without
+    waves.
+
+    Freedom: frames, less K + 2 places, 1/n of K instants, accelerations that were found.
+    """
+    sigma = arcs.errors.sigma
+    scale = np.sqrt(np.nansum(arcs.residual**2, axis=0) / _freedom(arcs))
+    found = np.maximum(sigma * scale, least_noise(frames.q))
+    return np.where(arcs.errors.waves > 0, sigma, found)
+
+
+def _freedom(arcs: Arcs) -> np.ndarray:
+    """Frames (n,) less what was fitted to them, see `of_residuals`; 1 at least."""
+    n = len(arcs.errors.sigma)
+    ends = len(arcs.instants)
+    seen = np.isfinite(arcs.residual).sum(axis=0)
+    own = arcs.bent.sum(axis=0) + arcs.flight.unknown
+    return np.maximum(seen - ends - (ends - 2) / n - own, 1.0)
+
+
+def doubts(search: Search, arcs: Arcs) -> np.ndarray:
+    """True (K,) for impacts that a flight of another acceleration explains about as well."""
+    members: Sequence[np.ndarray] = arcs.members
+    return doubtful(search.straight, members, arcs.flight, arcs.errors)
+
+
+def third_differences(frames: Frames, every: int) -> np.ndarray:
+    """Medians (n,) of sizes of third differences of every so-manieth row."""
+    return np.array([median(np.abs(differences(x, 3, every))) for x in frames.q.T])
