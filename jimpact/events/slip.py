@@ -379,6 +379,7 @@ class SlipFlow(FrictionFlow):
             tangential_force=motion.sliding + motion.holding,
             tangential_impulse=y[5 * m : 7 * m],
             slip=flat(jnp.where(loaded[:, None], cartesian, q)),
+            tangential_energy=y[:0],
             rate=const.frozen.unit / motion.haste,
         )
 
