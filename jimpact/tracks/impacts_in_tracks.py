@@ -77,8 +77,9 @@ def find_impacts(
 
     Returns:
         `Track`, which prints and plots; `warnings` say which flights are not ballistic, which
-        impacts are doubtful, and that no impact was found; `candidates` how many went, and why. With `quaternion` velocities are (x', omega), omega in the axes of the
-        body, as of `ji.Box`, and poses hold the quaternion's scalar first.
+        impacts are doubtful, and that no impact was found; `candidates` how many went, and why.
+        With `quaternion` velocities are (x', omega), omega in the axes of the body, as of `ji.Box`,
+        and poses hold the quaternion's scalar first.
 
     Raises:
         ValueError: fewer frames than a flight and a half, times that do not rise or are not finite,
