@@ -13,7 +13,6 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from jimpact.tracks.division import price
 from jimpact.tracks.flight import Flight
@@ -44,6 +43,13 @@ WAVED = (
 # Least time of waves, in frames: shorter ones are white. Ten times more is a flight.
 LEAST_TIME = 15.0
 LEAST_MEANS = 4.0  # of means of frames; ten times more would miss waves of half a flight
+# Share of the frames in flights that are not held from which on those that bend make all bend. A
+# tenth of it would free all flights of a body that slides at times.
+MOSTLY = 0.4
+TURNS = 2  # of white errors beside waves; more change them by less than a hundredth
+# Share of the diagonal of normal matrices by which they are kept from being singular where a flight
+# has one frame. Ten times more is still far below noise.
+ROUNDED = 1e-12
 # Frames by which waves are looked for; more are taken together. Ten times more take ten times as
 # long, and waves are slow.
 MOST_FRAMES = 150
@@ -198,8 +204,8 @@ def _rest(grams: np.ndarray, terms: int) -> np.ndarray:
     scale = 1 / np.sqrt(np.maximum(np.diagonal(normal, axis1=1, axis2=2), 1e-300))
     normal = normal * scale[:, :, None] * scale[:, None]
     right = right * scale
-    inverse = np.linalg.pinv(normal, hermitian=True)
-    explained = np.einsum("fi,fij,fj->f", right, inverse, right)
+    normal = normal + ROUNDED * np.eye(terms)
+    explained = (right * np.linalg.solve(normal, right[:, :, None])[:, :, 0]).sum(axis=1)
     return np.maximum(grams[:, -1, -1] - explained, 0.0)
 
 
@@ -228,6 +234,7 @@ def likely_errors(
     least = least_noise(frames.q)
     held = held_rather(frames, flights, flight)
     likely: dict[int, Likelihood] = {}
+    mostly = np.zeros(n, bool)
     for c in range(n):
         some = Coordinate.of(frames, flights, flight, c)
         if len(some.t) <= 2 * len(some.starts):
@@ -239,8 +246,10 @@ def likely_errors(
         on_lines = Likelihood(some, known, least[c], WAVE_SPEED * speeds[c], none)
         found = on_lines.most_likely(frames.step)
         curved = on_lines.curved()
-        if (curved & ~held[some.flights]).any():
-            curved = some.counts > 3  # what bends one flight, a table or drag, bends all
+        free = ~held[some.flights]
+        if some.counts[curved & free].sum() > MOSTLY * some.counts[free].sum():
+            curved = some.counts > 3  # what bends most, a table or drag, bends all
+            mostly[c] = True
         if curved.any():
             other = replace(on_lines, bent=curved).most_likely(frames.step)
             price_of_curves = curved.sum() * price_of_bend(len(some.t))
@@ -253,9 +262,9 @@ def likely_errors(
         likely[c] = on_lines
     angles = np.array(frames.angles or (False,) * n)
     for kind in (angles, ~angles):
-        if not bent[np.ix_(~held, kind)].any():
+        if not (mostly & bent.any(axis=0))[kind].any():
             continue
-        for c in map(int, np.flatnonzero(kind & ~bent[~held].any(axis=0))):
+        for c in map(int, np.flatnonzero(kind & ~mostly)):
             if c in likely:  # drag and spin bend all places, though one by little
                 curved = likely[c].some.counts > 3
                 found = replace(likely[c], bent=curved).most_likely(frames.step)
@@ -443,24 +452,14 @@ class Likelihood:
         return Likely(float(cost), sigma, ratio * sigma, time, float(evidence) + of_waves)
 
     def _beside(self, best: Likely) -> Likely:
-        """White errors beside the waves `best`, between .4 and 2.7 times those of differences."""
-        wave = best.wave
-        time = best.time
+        """White errors beside the waves `best`, by turns from those of differences on."""
         if self.sigma is not None:
-            return self.at(wave / self.sigma, time)
-
-        def of(logarithm: float) -> Likely:
-            """Cost of a sigma."""
-            sigma = float(np.exp(logarithm))
-            return replace(self, sigma=sigma).at(wave / sigma, time)
-
-        differences = float(noise(self.some.rest[:, None])[0])  # which waves hardly enter
-        middle = np.log(max(differences, self.least))
-        bounds = (middle - 1.0, middle + 1.0)
-        found = minimize_scalar(
-            lambda x: of(x).cost, bounds=bounds, method="bounded", options={"xatol": 0.02}
-        )
-        return of(max(float(found.x), float(np.log(self.least))))
+            return self.at(best.wave / self.sigma, best.time)
+        free = replace(self, sigma=None)
+        sigma = max(float(noise(self.some.rest[:, None])[0]), self.least)
+        for _ in range(TURNS):
+            sigma = free.at(best.wave / sigma, best.time).sigma
+        return replace(self, sigma=sigma).at(best.wave / sigma, best.time)
 
 
 # ------------------------------------------------------------------------------ which are impacts
