@@ -138,7 +138,9 @@ class LZB(Law):
 
     Derivatives, forward and reverse, in all parameters, W and gamma-; one-sided at e = 0 and
     e = 1, at touching contacts, and at grazing events (e.g. k2/k1 = 6.1713 for three equal
-    linear balls), and where slip stops just as a contact opens. In `initial_energy` at 0 the true
+    linear balls), and where slip stops just as a contact opens. Where several contacts end together
+    with e = 0 (a block that lands flat), slopes in e depend on the direction, and those returned
+    need not be those of any. In `initial_energy` at 0 the true
     slope may be infinite; 0 is returned. Method 'implicit' has first derivatives only, of what it
     computes: at the default `rtol` they are right to 1e-3 or 5e-3; second ones raise.
 
