@@ -24,7 +24,7 @@ GENERATED = DOCS / "generated"
 # ------------------------------------------------------------------------------------ the API
 
 API = {  # a page, and the modules whose public names it holds: the longest match decides
-    "Impacts": ("core.impacts", "core.audits", "laws.histories", "tools.status"),
+    "Impacts": ("core.impacts", "core.audits", "laws.histories", "tools"),
     "Scenes": (
         "core.scene",
         "bodies.functions.scene_from_gaps",

@@ -19,11 +19,7 @@ from .bodies.shapes import (
 )
 from .cli.study import read_study as read_study
 from .core.audits import audit as audit, summary as summary
-from .core.contact import (
-    Contact as Contact,
-    delassus_matrix as delassus_matrix,
-    kinetic_angles as kinetic_angles,
-)
+from .core.contact import Contact as Contact, delassus_matrix as delassus_matrix
 from .core.distributions import Normal as Normal, RandomLaw as RandomLaw, Uniform as Uniform
 from .core.impacts import Impact as Impact, impact as impact, raise_on_failure as raise_on_failure
 from .core.law import (
@@ -117,6 +113,7 @@ from .motion.system import (
 from .saved import load as load
 from .shots.data import Experiments as Experiments, read_experiments as read_experiments
 from .theory.han_gilmore_tree import han_gilmore as han_gilmore
+from .tools.kept_programs import keep_programs as keep_programs
 from .tools.status import STATUS as STATUS
 
 __version__: str

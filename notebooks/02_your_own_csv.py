@@ -56,11 +56,18 @@ before, after = np.array([0.5, 0.0, 0.0]), np.array([-0.163, 0.130, 0.390])  # m
 places = np.where(since < 0, before, after) * since + 0.03 * since**2 / 2 + [0.0, 0.1, 0.2]
 places += 5e-5 * np.random.default_rng(0).normal(size=places.shape)
 folder = Path(mkdtemp())
-head = ["NO_OF_FRAMES\t160", "FREQUENCY\t200", "DATA_INCLUDED\t3D", "MARKER_NAMES\tleft\tmiddle\tright"]
+head = [
+    "NO_OF_FRAMES\t160",
+    "FREQUENCY\t200",
+    "DATA_INCLUDED\t3D",
+    "MARKER_NAMES\tleft\tmiddle\tright",
+]
 rows = []
 for k, row in enumerate(1000 * places):  # mm
     hidden = [78 <= k < 86, False, False]
-    cells = [f"{0 if lost else x:.3f}\t{0 if lost else 5:.3f}\t0.000" for x, lost in zip(row, hidden)]
+    cells = [
+        f"{0 if lost else x:.3f}\t{0 if lost else 5:.3f}\t0.000" for x, lost in zip(row, hidden)
+    ]
     rows.append("\t".join(cells))
 recording = folder / "shot_a.tsv"
 recording.write_text("\n".join([*head, *rows]))

@@ -67,6 +67,7 @@ def optimize(fully):
 def pytest_configure(config):
     """Compiled programs are kept for this run only, by the first process (not one of xdist's)."""
     optimize(False)
+    os.environ.setdefault("JIMPACT_CACHE", "")  # commands keep nothing in the user's folder
     if hasattr(config, "workerinput"):
         return
     flags = os.environ.get("XLA_FLAGS", "")

@@ -199,7 +199,7 @@ class Dimer(_PlanarBody):
     >>> dimer.scene(dimer.touching(0.1)).closed.tolist()
     [False, True]
     >>> dimer = ji.Dimer(radius=5 / 24, length=1.0)  # where the kinetic angle is least
-    >>> round(float(ji.kinetic_angles(dimer.scene())[0, 1]), 6)
+    >>> round(float(ji.theory.kinetic_angles(dimer.scene())[0, 1]), 6)
     1.424204
     """
 
@@ -377,7 +377,7 @@ class SpatialDimer(_SpatialBody):
 
     >>> import jimpact as ji
     >>> dimer = ji.SpatialDimer(radius=5 / 24, length=1.0)
-    >>> round(float(ji.kinetic_angles(dimer.scene())[0, 1]), 6)
+    >>> round(float(ji.theory.kinetic_angles(dimer.scene())[0, 1]), 6)
     1.424204
     """
 

@@ -453,7 +453,8 @@ def stability(command: options.StabilityCommand, steps: Steps) -> CommandResult:
 
 # ----------------------------------------------------------------------------------------- advise
 
-_ADVISE_PARAMETERS = ("restitution", "stiffness", "exponent", "friction")  # that `ji.advise` takes
+# that `ji.advise` takes
+_ADVISE_PARAMETERS = ("restitution", "stiffness", "exponent", "friction", "tangential_stiffness")
 _ADVISE_REFUSED = ("tangential_restitution", "initial_energy")  # these would change the outcome
 
 

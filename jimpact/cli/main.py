@@ -138,7 +138,12 @@ def run_command(call: Call, arguments: list[str]) -> int:
     command.check()
     if command.light:
         return command.run()
-    keep_programs(command.no_cache)
+    folder = cache_folder(command.no_cache)
+    if folder is not None:
+        from jimpact.tools.kept_programs import keep_programs
+
+        with contextlib.suppress(OSError):  # a folder that cannot be made: compiled anew
+            keep_programs(folder)
     from jimpact.cli.commands import run
     from jimpact.tools.progress import Steps
 
@@ -173,17 +178,17 @@ def parse(arguments: list[str]) -> Any:
     )
 
 
-def keep_programs(no_cache: bool) -> None:
-    """Tell JAX, before it is imported, in which folder to keep compiled programs.
+def cache_folder(no_cache: bool) -> str | None:
+    """The folder of compiled programs, ours and those that JAX keeps of itself; None: none.
 
-    A folder that the user has set for JAX stays. Ours is in the folder `JIMPACT_CACHE` (empty:
-    nowhere), else in the user's cache folder.
+    JAX is told before it is imported; a folder that the user has set for it stays. Ours is in the
+    folder `JIMPACT_CACHE` (empty: none), else in the user's cache folder.
     """
     root = os.environ.get("JIMPACT_CACHE")
     if no_cache:
         os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"
     if no_cache or root == "":
-        return
+        return None
     from jimpact.tools.checks import needed
 
     platformdirs = needed("platformdirs", "pip install platformdirs")
@@ -192,6 +197,7 @@ def keep_programs(no_cache: bool) -> None:
     folder = os.path.join(root, f"programs-{_processor()}")
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", folder)
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", LEAST_COMPILE_TIME)
+    return folder
 
 
 def _processor() -> str:

@@ -464,7 +464,7 @@ def kinetic_angles(scene: Scene) -> jax.Array:
     Source: Brogliato (2016), (6.66), with the W of the constrained bodies.
 
     >>> import jimpact as ji
-    >>> float(ji.kinetic_angles(ji.chain([1.0, 2.0, 3.0]))[0, 1].round(4))
+    >>> float(ji.theory.kinetic_angles(ji.chain([1.0, 2.0, 3.0]))[0, 1].round(4))
     1.1071
     """
     return _angles(delassus_matrix(scene))

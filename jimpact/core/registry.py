@@ -64,7 +64,7 @@ class Row(NamedTuple):
 REGISTRY: dict[str, Row] = {}
 
 # Parameters of contacts that `advise` knows.
-ADVISED = ("restitution", "stiffness", "exponent", "friction")
+ADVISED = ("restitution", "stiffness", "exponent", "friction", "tangential_stiffness")
 
 
 def simplest_first() -> tuple[str, ...]:

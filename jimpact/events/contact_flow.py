@@ -274,6 +274,7 @@ class ContactStates(NamedTuple):
     tangential_force: Float[Array, "t B"]  # lambda
     tangential_impulse: Float[Array, "t B"]  # its integral
     slip: Float[Array, "t B"]  # u
+    tangential_energy: Float[Array, "_ B"]  # twice that of tangential springs (m), or none
     rate: Float[Array, "1 B"]  # of time, in the flow's own time
 
 
@@ -544,7 +545,7 @@ class ContactFlow(Flow):
         const, none = self.normal_constants(modes), y[:0]
         x, g, p = self.rows(y)
         force = self.force(const, x, g)
-        return ContactStates(force, x, p, const.scale * g, none, none, none, const.unit)
+        return ContactStates(force, x, p, const.scale * g, none, none, none, none, const.unit)
 
     def change(self, y: Float[Array, "n B"]) -> Float[Array, "m B"]:
         """Change `G p` of the gap velocities by the impulses of a state."""

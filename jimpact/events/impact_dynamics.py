@@ -31,6 +31,7 @@ from jimpact.events.implicit_steps import ImplicitSteps
 from jimpact.events.plastic_limit import final_impulses, inspect
 from jimpact.events.run import run
 from jimpact.events.slip import SlipFlow
+from jimpact.events.tangential_spring import SpringFlow
 from jimpact.numerics.dense import unit
 from jimpact.numerics.derive import Arrays, Kind, in_lanes, without_derivatives
 from jimpact.numerics.sparse import Neighbours
@@ -91,6 +92,7 @@ class Tangential(NamedTuple):
 
     block: TangentialBlock  # K_nt (m, t), K_tt (t, t), u- (t,)
     friction: Float[Array, "m *B"]  # mu
+    stiffness: Float[Array, "m *B"] | None = None  # kappa; None: contacts stick rigidly
 
 
 class ImpactUnits(NamedTuple):
@@ -157,12 +159,17 @@ def dimensionless(
 
 
 def tangential_of(
-    contact: Contact, friction: Float[Array, ""] | Float[Array, " m"], units: ImpactUnits
+    contact: Contact,
+    friction: Float[Array, ""] | Float[Array, " m"],
+    stiffness: Float[Array, ""] | Float[Array, " m"] | None,
+    units: ImpactUnits,
 ) -> Tangential:
-    """The tangential block of the contacts in the units of the normal one, and mu."""
+    """The tangential block of the contacts in the units of the normal one, mu, kappa or None."""
     assert contact.tangential_block is not None  # see `check_law`
     block = contact.tangential_block.scaled(units.root, units.velocity)
-    return Tangential(block, friction * jnp.ones_like(units.root))
+    ones = jnp.ones_like(units.root)
+    kappa = None if stiffness is None else stiffness * ones
+    return Tangential(block, friction * ones, kappa)
 
 
 def normal_coupling(problem: Problem, structure: Structure) -> Float[Array, "m m B"]:
@@ -215,9 +222,13 @@ def flow_of(
     if problem.tangential is None:
         flow = ContactFlow(**parts, watches=tighten < 1 and problem.exponent is not None)
         return flow, *flow.start(problem.gamma, x)
-    (normal_tangent, tangent, slip), friction = problem.tangential
+    (normal_tangent, tangent, slip), friction, kappa = problem.tangential
+    parts |= dict(normal_tangent=normal_tangent, tangent=tangent, friction=friction)
+    if kappa is not None:
+        springs = SpringFlow(**parts, tangential_stiffness=kappa)
+        return springs, *springs.start_with(problem.gamma, x, slip)
     kind = FrictionFlow if len(slip) == m else SlipFlow
-    frictional = kind(**parts, normal_tangent=normal_tangent, tangent=tangent, friction=friction)
+    frictional = kind(**parts)
     return frictional, *frictional.start_with(problem.gamma, x, slip)
 
 
@@ -265,7 +276,7 @@ class ImpulseProgram:
         flow, modes, y = pushforward(lambda problem: self.flow(problem, tighten), problem)
         gamma = value_of(problem.gamma)
         rows = 3 * gamma.shape[0]
-        tangential = slice(rows + self.tangents, rows + 2 * self.tangents)
+        tangential = slice(-1 - self.tangents, -1)  # the rows before the time
         if value_of(flow).at_once:
             state = pushforward(lambda flow, y: flow.finish(modes, y)[1], flow, y)
             results = pushforward(lambda y: (y[rows - 1 : rows], y[tangential], y[-1:]), state)
@@ -296,7 +307,7 @@ class ImplicitProgram(ImpulseProgram):
         friction, velocity = jnp.zeros_like(problem.omega), problem.gamma
         sliding = None
         if problem.tangential is not None:
-            (across, tangent, slip), friction = problem.tangential
+            (across, tangent, slip), friction, _ = problem.tangential
             back, normal = jnp.swapaxes(across, 0, 1), normal_coupling(problem, self.structure)
             rows = [jnp.concatenate(x, axis=1) for x in ((normal, across), (back, tangent))]
             coupling = Dense(jnp.concatenate(rows))
@@ -340,11 +351,14 @@ class ImplicitProgram(ImpulseProgram):
         return jnp.where(busy, CODE["max_steps"], CODE["ok"]).astype(jnp.int32)
 
 
-def method_for(method: str, contact: Contact, friction: bool) -> str:
-    """The method; for 'auto' 'implicit' of several contacts with friction in space, else 'time'."""
+def method_for(method: str, contact: Contact, friction: bool, springs: bool) -> str:
+    """The method; for 'auto' 'implicit' of several contacts with friction in space, else 'time'.
+
+    With tangential `springs` it is 'time', too.
+    """
     if method != "auto":
         return method
-    in_space = friction and contact.tangents == 2
+    in_space = friction and contact.tangents == 2 and not springs
     return "implicit" if in_space and contact.contacts > EXACT_CONTACTS else "time"
 
 

@@ -157,6 +157,7 @@ class ImplicitHistoryProgram(HistoryProgram):
                 tangential_force=s.rate[m:],
                 tangential_impulse=s.impulse[m:],
                 slip=s.velocity[m:],
+                tangential_energy=s.velocity[:0],
                 rate=jnp.ones_like(s.time),  # of time: these steps advance in time itself
             )
             return s.time, flow.energy(x), sample

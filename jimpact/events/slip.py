@@ -379,6 +379,7 @@ class SlipFlow(FrictionFlow):
             tangential_force=motion.sliding + motion.holding,
             tangential_impulse=y[5 * m : 7 * m],
             slip=flat(jnp.where(loaded[:, None], cartesian, q)),
+            tangential_energy=y[:0],
             rate=const.frozen.unit / motion.haste,
         )
 
@@ -543,26 +544,36 @@ class SlipFlow(FrictionFlow):
         towards = angle_of(pairs(towards))
         # stick is (0, 0), creep begins at r = 0
         begins = jnp.stack([jnp.zeros_like(towards), jnp.where(inside, 0.0, towards)], 1)
-        lost = jnp.where((closed & resting & inside)[:, None], q, 0.0)
+        lost = jnp.where((closed & resting)[:, None], q, 0.0)
         q = jnp.where(to_check[:, None], begins, q)
         checked = jnp.where(inside, Slip.STICKS, Slip.CREEPS)
         slip = jnp.where(to_check, checked, slip).astype(modes.dtype)
-        modes, held = jnp.concatenate([modes[: 2 * m], slip]), to_check & inside & (most > 0)
-        return modes, self._stopped(modes, self.with_slip(y, q), flat(lost), held)
+        modes, pressed = jnp.concatenate([modes[: 2 * m], slip]), to_check & (most > 0)
+        held, begun = pressed & inside, pressed & closed & resting & ~inside
+        return modes, self._stopped(modes, self.with_slip(y, q), lost, held, begun)
 
     def _stopped(
         self,
         modes: Int[Array, "modes B"],
         y: Float[Array, "n B"],
-        lost: Float[Array, "t B"],
+        lost: Float[Array, "m 2 B"],
         held: Bool[Array, "m B"],
+        begun: Bool[Array, "m B"],
     ) -> Float[Array, "n B"]:
         """The state after slips `lost`, whose values are 0, have been taken from contacts `held`.
 
-        As in the plane: the tangents of these slips are taken by a tangential impulse.
+        As in the plane: the tangents of these slips are taken by a tangential impulse; of contacts
+        that have `begun` to slide those across their direction, which friction takes at once.
         """
         m, (x, g, p), q = self.contacts, self.rows(y), self.slip(y)
-        side = times(pseudoinverse(self.tangent, twice(held)), -lost)
+        along, across = polar(jnp.where(begun, q[:, 1], 0.0))
+        frame = jnp.stack([along, across], 2)  # of each contact; the tangents where it sticks
+        blocks = self.tangent.reshape(m, 2, m, 2, -1)
+        blocks = jnp.einsum("iaxB,iajbB,jbyB->ixjyB", frame, blocks, frame)
+        rows = flat(jnp.stack([held, held | begun], 1))
+        right = flat(-jnp.einsum("iaxB,iaB->ixB", frame, lost))
+        taken = times(pseudoinverse(blocks.reshape(self.tangent.shape), rows), right)
+        side = flat(jnp.einsum("iaxB,ixB->iaB", frame, pairs(taken)))
         side = side - jax.lax.stop_gradient(side)
         g = g + self.as_rows(modes, times(self.normal_tangent, side))
         du, (_, slips, creeps) = pairs(times(self.tangent, side)), self.sliding(modes)

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.sparse import block_diag, coo_array
 from scipy.special import chdtrc, fdtrc
 
-from jimpact.core.law import free_parameters_of
+from jimpact.core.law import free_parameters_of, value_of
 from jimpact.fits.data_checks import DATA_CHECKS, LISTED, DataBalances
 from jimpact.fits.findings import Finding, findings
 from jimpact.fits.matrices import boundary, encloses
@@ -327,16 +327,31 @@ def _above_sigma(judged: Judged) -> Iterator[Finding]:
             f"Lack of fit: the residuals are {judged.stretch:.2g} times what sigma allows (chi^2 = "
             f"{judged.squares:.4g} with {degrees(judged.freedom)}): the law or "
             "the stated errors are wrong, or the parameters scatter; the standard errors "
-            f"{how}.{_friction_note(judged.problem)}",
+            f"{how}.{_held_notes(judged.problem)}",
             numbers={"ratio": judged.stretch, "chi_squared": judged.squares},
         )
 
 
-def _friction_note(problem: FitProblem) -> str:
-    """A sentence for laws with friction that is not fitted: it may be why the law does not fit."""
-    if "friction" not in free_parameters_of(problem.law) or "friction" in problem.fields:
-        return ""
-    return " The law's `friction` is held at its start: name it in `free` to fit it."
+def _held_notes(problem: FitProblem) -> str:
+    """Sentences for what is held and may be why the law does not fit: what to type to free it.
+
+    Friction that is not fitted; a scalar stiffness of several contacts, whose ratios are not.
+    """
+    notes = []
+    available = free_parameters_of(problem.law)
+    if "friction" in available and "friction" not in problem.fields:
+        notes.append(" The law's `friction` is held at its start: name it in `free` to fit it.")
+    data = problem.experiments
+    is_held = "stiffness" in available and "stiffness" not in problem.fields
+    if is_held and data is not None and np.ndim(value_of(problem.law, "stiffness")) == 0:
+        contacts = data.largest_scene(problem.scene).contacts
+        if contacts > 1:
+            one_each = ", ".join(["1"] * contacts)
+            notes.append(
+                " The law's `stiffness` is one number, held: give it one for each contact, "
+                f"`stiffness=[{one_each}]`, to fit their ratios."
+            )
+    return "".join(notes)
 
 
 def _above_pure_error(judged: Judged) -> Iterator[Finding]:
@@ -360,7 +375,7 @@ def _above_pure_error(judged: Judged) -> Iterator[Finding]:
             "lack_of_fit",
             f"Lack of fit: the residuals are {np.sqrt(ratio):.2g} times the noise that momentum "
             f"and repeated shots show ({law_freedom} and {degrees(error_freedom)}): the law does "
-            f"not fit, and the standard errors mean little.{_friction_note(problem)}",
+            f"not fit, and the standard errors mean little.{_held_notes(problem)}",
             numbers={"ratio": float(np.sqrt(ratio))},
         )
 

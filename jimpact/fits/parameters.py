@@ -239,10 +239,14 @@ def _as_labels(field: str, choice: Any, shape: tuple[int, ...]) -> np.ndarray:
             f"groups (0 is fixed), but has value {choice!r}."
         )
     if mask.shape not in ((), shape):
-        kind = "one value for all contacts" if shape == () else f"of shape {shape}"
+        kind = f"of shape {shape}"
+        advice = ""
+        if shape == ():
+            kind = "one value for all contacts"
+            advice = f" For one value each, give the law {mask.size} of them, `{field}=[...]`."
         raise ValueError(
             f"Argument `free` must have a mask of shape {shape} for `{field}`, which is {kind} "
-            f"in this law, but has a mask of shape {mask.shape}."
+            f"in this law, but has a mask of shape {mask.shape}.{advice}"
         )
     if mask.dtype == bool:  # each free entry is a group of its own
         count = np.arange(1, np.prod(shape, dtype=int) + 1).reshape(shape)

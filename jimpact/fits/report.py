@@ -30,7 +30,8 @@ _CORRELATED = 0.1
 _CORRELATIONS_SHOWN = 6  # the largest ones; 10 parameters have 45
 _MINIMA_SHOWN = 5  # in the list of minima, the lowest first
 _PARAMETERS_NAMED = 6  # in one sentence; of more, the least certain
-OF_A_CONTACT = ("restitution", "friction", "tangential_restitution")  # each may have its own
+# each contact may have its own
+OF_A_CONTACT = ("restitution", "friction", "tangential_restitution", "tangential_stiffness")
 # Degrees of freedom up to which intervals are visibly wider than two standard errors: with ten
 # times more they are wider by 2 %.
 FEW_DEGREES = 8

@@ -19,7 +19,7 @@ from jimpact.events.impact_dynamics import (
     tangential_of,
 )
 from jimpact.laws.forces import Bistiffness, Force, HuntCrossley, KelvinVoigt, KuwabaraKono
-from jimpact.laws.lzb import check_few_contacts, solver_of
+from jimpact.laws.lzb import check_few_contacts, check_spring, solver_of, tangential_spring
 from jimpact.numerics.derive import ADJOINTS
 from jimpact.numerics.tridiagonal import diagonal
 from jimpact.tools.checks import check_choice, check_values
@@ -41,6 +41,9 @@ class Compliant(Law):
             stiffness k [N / m^eta], exponent eta, restitution e, damping c [N s/m], d [s/m],
             dissipative time A [s], yield force F_y [N].
         friction: Coulomb's mu >= 0, scalar or (m,), for a scene with tangents; None: none.
+        tangential_stiffness: kappa > 0, scalar or (m,), of a tangential spring
+            `k_t = kappa dF/dx(x)` with a force of x alone, as in `LZB`; None: contacts stick
+            rigidly.
         initial_energy: U_0j >= 0, scalar or (m,) [J]: precompression of closed contacts; not with
             a viscous force.
         rtol: tolerance on v+ relative to max |v-|; default 1e-8 (float32: 1e-5), with method
@@ -71,6 +74,7 @@ class Compliant(Law):
 
     force: Force
     friction: OptionalValues = parameter(low=0.0, default=None, kw_only=True)
+    tangential_stiffness: OptionalValues = tangential_spring()
     initial_energy: Values = parameter(low=0.0, default=0.0, kw_only=True)
     rtol: float | None = option(None, low=0.0, high=1.0, open_low=True)
     max_steps: int = option(100_000, low=1)
@@ -89,8 +93,15 @@ class Compliant(Law):
                 "Argument `force` must be a contact force such as Hertz(k), "
                 f"but has value {self.force!r}."
             )
+        check_spring(self)
         yields = self.force.bound is not None
         viscous = self.force.bistiffness is None  # no pair of F(x), to load and to unload
+        if self.tangential_stiffness is not None and viscous:
+            raise ValueError(
+                "Argument `tangential_stiffness` must be None with a force that depends on the "
+                "rate of indentation, as k_t = kappa dF/dx(x), but the force is "
+                f"{self.force!r}: PowerLaw, LinearSpring, Hertz and Bistiffness have it."
+            )
         if viscous or yields:
             check_values("initial_energy", self.initial_energy, low=0.0, high=0.0)
         if yields and (self.friction is not None or self.method == "implicit"):
@@ -155,7 +166,8 @@ class Compliant(Law):
             depth = (force.bound / k) ** (1 / jnp.asarray(exponent, k.dtype))
             problem = problem._replace(limit=depth / units.indentation)
         if self.friction is not None:
-            problem = problem._replace(tangential=tangential_of(contact, self.friction, units))
+            tangential = tangential_of(contact, self.friction, self.tangential_stiffness, units)
+            problem = problem._replace(tangential=tangential)
         structure, most = contact.structure, self.max_steps
         return Dynamics(problem, units, exponent, structure, most, method, self.adjoint)
 
@@ -176,6 +188,7 @@ def make_compliant(
     rheology: str = "bistiffness",
     damping: Any = None,
     friction: Any = None,
+    tangential_stiffness: Any = None,
 ) -> Compliant:
     """`Compliant` from plain parameters, as in a study file.
 
@@ -186,6 +199,7 @@ def make_compliant(
         rheology: one of `RHEOLOGIES`.
         damping: of a viscous rheology, in the unit of its force; None for a bistiffness.
         friction: Coulomb's mu; None: none.
+        tangential_stiffness: kappa of a tangential spring; None: contacts stick rigidly.
     """
     viscous: dict[str, Callable[..., Force]] = {
         "kelvin-voigt": KelvinVoigt,
@@ -202,4 +216,4 @@ def make_compliant(
         force: Force = Bistiffness(stiffness, exponent, restitution)
     else:
         force = viscous[rheology](stiffness, damping)
-    return Compliant(force, friction=friction)
+    return Compliant(force, friction=friction, tangential_stiffness=tangential_stiffness)

@@ -22,7 +22,8 @@ class History(eqx.Module):
 
     `time` (s,), `force`, `indentation`, `energy`, `impulse`, `gap_velocity`, `approach` (s, m),
     `velocity` (s, n); with friction `tangential_force`, `tangential_impulse` and `slip` (s, t),
-    else t = 0; `duration` (), `maximum_force` (m,) and `status` of the whole impact.
+    else t = 0; `tangential_energy` (s, m), `k_t xi^2 / 2` of tangential springs, else (s, 0);
+    `duration` (), `maximum_force` (m,) and `status` of the whole impact.
     `indentation` is the effective one, `E = k x^(eta + 1) / (eta + 1)`, of the loading curve: it
     ends at 0. `approach` is the true one, `-int gamma dt`: where the force ends it is the residual
     indentation, and force against it encloses the energy lost (`ji.plot.contact_loop`).
@@ -39,6 +40,7 @@ class History(eqx.Module):
     tangential_force: jax.Array
     tangential_impulse: jax.Array
     slip: jax.Array
+    tangential_energy: jax.Array
     duration: jax.Array
     maximum_force: jax.Array
     status: jax.Array
@@ -140,6 +142,7 @@ def _history(law: Law, scene: Scene, v: jax.Array, samples: int, traced: Traced)
         tangential_force=friction,
         tangential_impulse=tangential,
         slip=sampled(states.slip * (units.velocity * root)[None], slip[None]),
+        tangential_energy=sampled(0.5 * units.velocity**2 * states.tangential_energy),
         duration=sampled(time[-1, 0, 0] * units.time),
         maximum_force=sampled(maximum * unit_force),
         status=traced.status((law, scene, v, NOTHING_GIVEN), sampled(code[0]), size, finite),

@@ -52,7 +52,8 @@ def solver_of(law: Any, contact: Contact) -> tuple[str, Any]:  # law: LZB, Compl
 
     The tolerance is the law's, else the contact's, else the default of the method.
     """
-    method = method_for(law.method, contact, law.friction is not None)
+    springs = law.tangential_stiffness is not None
+    method = method_for(law.method, contact, law.friction is not None, springs)
     if law.rtol is not None:
         return method, law.rtol
     default = default_rtol(method, contact.gap_velocity.dtype)
@@ -65,6 +66,27 @@ def check_few_contacts(scene: Scene) -> None:
         raise ValueError(
             f"Argument `scene` must have at most {MOST_WITH_FRICTION} contacts for impact dynamics "
             f"with friction, but has {scene.contacts}: algebraic laws such as Moreau take more."
+        )
+
+
+def tangential_spring() -> Any:
+    """The parameter kappa > 0 of laws with tangential springs; None: contacts stick rigidly."""
+    return parameter(low=0.0, open_low=True, log=True, default=None, kw_only=True)
+
+
+def check_spring(law: Any) -> None:  # law: LZB, Compliant
+    """Raise a ValueError for a `tangential_stiffness` without friction, or by method 'implicit'."""
+    if law.tangential_stiffness is None:
+        return
+    if law.friction is None:
+        raise ValueError(
+            "Argument `friction` must be given with `tangential_stiffness`, whose force mu limits, "
+            "but has value None."
+        )
+    if law.method == "implicit":
+        raise ValueError(
+            "Argument `method` must be 'time' or 'auto' with `tangential_stiffness`, but has value "
+            "'implicit': its steps know contacts that stick rigidly."
         )
 
 
@@ -88,6 +110,13 @@ class LZB(Law):
         friction: Coulomb's mu >= 0, scalar or (m,), for a scene with tangents (planar or spatial);
             None: none. While a contact slips, the tangential force is `lambda = -mu F u / |u|`;
             while it sticks, u is exactly 0 and `|lambda| <= mu F` (`docs/friction.md`).
+        tangential_stiffness: kappa > 0, scalar or (m,), of a spring along each contact with
+            friction, `k_t = kappa dF/dx`; None: contacts stick rigidly. While it holds `xi' = u`,
+            `lambda = -k_t xi`; while it slides `lambda = -mu F u_s / |u_s|`, `xi = -lambda / k_t`,
+            `u_s = u - xi'`. Each impact begins with xi = 0. In expansion k_t is that of the loading
+            curve at the same F. A linear spring returns what it took but for what slides; with
+            another exponent k_t changes with x, and `k_t' xi^2 / 2` comes from nowhere: a nearly
+            elastic impact may gain energy, status `energy_gain` (`docs/friction.md`).
         rtol: tolerance on v+ relative to max |v-|; default 1e-8 (float32: 1e-5), with method
             'implicit' 1e-5 (float32: 1e-4), in fits 1e-4 where that is a tenth of the noise.
         max_steps: maximum attempted steps.
@@ -109,7 +138,9 @@ class LZB(Law):
 
     Derivatives, forward and reverse, in all parameters, W and gamma-; one-sided at e = 0 and
     e = 1, at touching contacts, and at grazing events (e.g. k2/k1 = 6.1713 for three equal
-    linear balls), and where slip stops just as a contact opens. In `initial_energy` at 0 the true
+    linear balls), and where slip stops just as a contact opens. Where several contacts end together
+    with e = 0 (a block that lands flat), slopes in e depend on the direction, and those returned
+    need not be those of any. In `initial_energy` at 0 the true
     slope may be infinite; 0 is returned. Method 'implicit' has first derivatives only, of what it
     computes: at the default `rtol` they are right to 1e-3 or 5e-3; second ones raise.
 
@@ -133,11 +164,16 @@ class LZB(Law):
     )
     initial_energy: Values = parameter(low=0.0, default=0.0)
     friction: OptionalValues = parameter(low=0.0, default=None, kw_only=True)
+    tangential_stiffness: OptionalValues = tangential_spring()
     rtol: float | None = option(None, low=0.0, high=1.0, open_low=True)
     max_steps: int = option(100_000, low=1)
     method: str = option("auto", METHODS)
     check_conditioning: bool = option(False, (False, True))
     adjoint: str = option("jacobian", ADJOINTS)
+
+    def __check_init__(self) -> None:
+        """Raise a ValueError for a `tangential_stiffness` that does not go with the rest."""
+        check_spring(self)
 
     def check(self, scene: Scene, dtype: jnp.dtype) -> None:
         """Raise a ValueError for an `rtol` below rounding, or too many contacts with friction."""
@@ -179,7 +215,8 @@ class LZB(Law):
             closed=contact.closed,
         )
         if self.friction is not None:
-            problem = problem._replace(tangential=tangential_of(contact, self.friction, units))
+            tangential = tangential_of(contact, self.friction, self.tangential_stiffness, units)
+            problem = problem._replace(tangential=tangential)
         structure, most = contact.structure, self.max_steps
         return Dynamics(problem, units, self.exponent, structure, most, method, self.adjoint)
 

@@ -229,6 +229,7 @@ def make_velocity_dependent(
     stiffness: Any = None,
     exponent: Any = None,
     friction: Any = None,
+    tangential_stiffness: Any = None,
 ) -> VelocityDependent:
     """`VelocityDependent` from plain parameters, as a study gives them; `base` is a law's name."""
     if base not in REGISTRY or "restitution" not in REGISTRY[base].arguments:
@@ -240,6 +241,7 @@ def make_velocity_dependent(
         "stiffness": stiffness,
         "exponent": exponent,
         "friction": friction,
+        "tangential_stiffness": tangential_stiffness,
     }
     parameters = {name: value for name, value in values.items() if value is not None}
     for name in parameters:

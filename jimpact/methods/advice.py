@@ -130,6 +130,7 @@ def advise(
     stiffness: Any = None,
     exponent: Any = 1.5,
     friction: Any = None,
+    tangential_stiffness: Any = None,
     stiffness_range: tuple[float, float] | None = None,
     samples: int = 128,
     seed: int = 0,
@@ -157,6 +158,8 @@ def advise(
         stiffness: k > 0, scalar or (m,) [N / m^eta]; None: only their ratio's range is known.
         exponent: eta >= 1, as in `LZB`.
         friction: Coulomb's mu >= 0, scalar or (m,), of every law (e_t = 0); None: no friction.
+        tangential_stiffness: kappa > 0, scalar or (m,), of `LZB` and `Compliant`, with `friction`;
+            None: contacts stick rigidly.
         stiffness_range: low and high factor on each unknown ratio k_j / k_first within a group of
             coupled contacts, or on each k_j if absolute stiffness matters; default: (0.1, 10)
             if `stiffness` is None, else (1, 1).
@@ -185,6 +188,8 @@ def advise(
     parameters = {"restitution": restitution, "stiffness": k, "exponent": exponent}
     if friction is not None:
         parameters["friction"] = friction
+    if tangential_stiffness is not None:
+        parameters["tangential_stiffness"] = tangential_stiffness
     for name, value in parameters.items():
         check_per_contact(name, value, scene.contacts)
     factors = _checked_range(stiffness_range, stiffness is not None)
@@ -193,7 +198,8 @@ def advise(
     check_values("tolerance", tolerance, low=finest, high=1.0)
     as_whole("samples", samples, 1)
     as_whole("seed", seed, 0)
-    law = LZB(restitution, k, exponent, friction=friction)
+    springs = tangential_stiffness
+    law = LZB(restitution, k, exponent, friction=friction, tangential_stiffness=springs)
     check_law(law, scene, v.dtype)
     situation = situation_of(scene, np.asarray(v), law, stiffness is not None)
     mixed = len(np.unique(np.asarray(exponent, float))) > 1
@@ -448,11 +454,13 @@ def trials(situation: Situation, law: LZB) -> dict[str, Trial]:
     v, m = situation.velocity, situation.scene.contacts
     e, k = (jnp.broadcast_to(x, (m,)).astype(v.dtype) for x in (law.restitution, law.stiffness))
     mu, touching = law.friction, situation.touching
+    kappa = law.tangential_stiffness
     gapped = bool(situation.gapped.any())
-    known = dict(zip(ADVISED, (e, k, law.exponent, mu), strict=True))
+    known = dict(zip(ADVISED, (e, k, law.exponent, mu, kappa), strict=True))
     laws, _ = registered_laws(known, simplest_first())
     laws["binary"] = Binary(e, "earliest" if gapped else "fastest", friction=mu)
-    laws["compliant"] = Compliant(Bistiffness(k, law.exponent, e), friction=mu)
+    bistiffness = Bistiffness(k, law.exponent, e)
+    laws["compliant"] = Compliant(bistiffness, friction=mu, tangential_stiffness=kappa)
     ordered = {name: laws[name] for name in simplest_first()}
     return {
         name: Trial(law, situation.scene if gapped and law.uses_gaps else touching)

@@ -22,7 +22,8 @@ _KNOWN = (  # where nothing was varied
     "`stiffness_range=(0.5, 2)`, `jimpact advise --stiffness-range 0.5 2`."
 )
 _POSITIONAL = ("restitution", "stiffness", "exponent")  # parameters of a law as it is printed
-_KEYWORDS = ("friction", "order", "rtol")  # the same, by name, where they are not the default
+# the same, by name, where they are not the default
+_KEYWORDS = ("friction", "tangential_stiffness", "order", "rtol")
 
 
 class ContactBlock(NamedTuple):

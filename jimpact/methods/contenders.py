@@ -50,6 +50,7 @@ class Contender(NamedTuple):
         label: in pictures; '': the name.
         divides: by e, which must not be 0.
         friction: whether it has Coulomb friction.
+        springs: whether it has tangential springs below Coulomb's limit.
         jax: whether `solve` can be jitted, vmapped and differentiated forward, over the setting
             too; otherwise it gets concrete values.
         duration_apart: whether the duration takes a run of its own.
@@ -62,6 +63,7 @@ class Contender(NamedTuple):
     label: str = ""
     divides: bool = True
     friction: bool = False
+    springs: bool = False
     jax: bool = True
     duration_apart: bool = False
 
@@ -69,6 +71,8 @@ class Contender(NamedTuple):
         """None, or the reason why it cannot integrate this law, to follow the word "it"."""
         if law.friction is not None and not self.friction:
             return "has no friction"
+        if law.tangential_stiffness is not None and not self.springs:
+            return "has no tangential springs"
         refused = self.divides and np.any(law.restitution == 0)
         return "divides by e^2, and a restitution is 0" if refused else None
 
@@ -126,6 +130,7 @@ _ALL = (
         label="event-aligned Dormand-Prince 8 (default)",
         divides=False,
         friction=True,
+        springs=True,
         duration_apart=True,
     ),
     Contender(

@@ -239,7 +239,8 @@ def _simplest_friction(
     law, scene = trial.law, trial.scene
     if getattr(law, "friction", None) is None or scene.tangents is None:
         return {}, trial
-    simpler: Any = replace(law, friction=None)  # type: ignore[call-arg]
+    fields = [name for name in ("friction", "tangential_stiffness") if hasattr(law, name)]
+    simpler: Any = replace(law, **dict.fromkeys(fields))
     ways = {"none": trial._replace(law=simpler, scene=_with_tangents(scene, None))}
     if scene.tangents.shape[1] == 2 * scene.contacts:
         along = _with_tangents(scene, _tangents_along_impulses(scene, reference))

@@ -197,7 +197,7 @@ def field_of(problem: Scaled) -> Field:
     none = jnp.zeros((m, 0), off.dtype)
     cross, tangent, slip, friction = none, none[:0], none[0], jnp.zeros_like(one)
     if inputs.tangential is not None:
-        block, friction = inputs.tangential
+        block, friction, _ = inputs.tangential
         cross, tangent, slip = block.normal_tangent, block.tangent, block.slip
     eta: Any = dynamics.static_exponent if inputs.exponent is None else inputs.exponent
     return Field(

@@ -63,7 +63,8 @@ class MonteCarlo(Tabular):
         resumed: samples that were read from the folder.
         rtol: tolerance of the impacts; None: the law's own, or it needs none.
         rtol_error: estimated error of the means and deviations by a tolerance above the law's
-            default, in standard errors, the largest; 0: it is the default.
+            default, in standard errors, the largest; 0: it is the default, and nothing finer was
+            tried, so that its own error is not estimated.
         description: law, scene and distributions, in words.
         run: the requested run; `replay` needs it.
     """
@@ -171,9 +172,11 @@ class MonteCarlo(Tabular):
         return text + (f", {self.resumed:,} read from the folder" if self.resumed else "")
 
     def _tolerance_lines(self) -> list[str]:
-        """Line on the tolerance of the impacts, if one was chosen for the run."""
-        if not self.rtol_error:
+        """Line on the tolerance of the impacts: of the run, or the law's; none if there is none."""
+        if self.rtol is None:
             return []
+        if not self.rtol_error:
+            return [f"integrated to rtol = {self.rtol:g}, whose error in means was not estimated"]
         text = f"integrated to rtol = {self.rtol:g}: its error in means and deviations is at most"
         return [f"{text} {self.rtol_error:.1g} standard errors"]
 

@@ -97,6 +97,11 @@ def force_of(law: Law) -> Force:
             "Argument `law` must use gaps and have a `contact_force` (Compliant) for "
             f"method='contact_forces', but is {law!r}."
         )
+    if getattr(law, "tangential_stiffness", None) is not None:
+        raise TypeError(
+            "Argument `law` must have no `tangential_stiffness` in a motion by contact forces, but "
+            f"is {law!r}: by events each impact has its springs, which begin with xi = 0."
+        )
     if force.bound is not None:
         raise TypeError(
             "Argument `law` must have a force without bound in a motion: what yields is for "

@@ -1,5 +1,6 @@
 """Public names of `ji.theory` and where they live."""
 
+from jimpact.core.contact import kinetic_angles as kinetic_angles
 from jimpact.motion.accelerations import (
     contact_problem as contact_problem,
     quasi_lagrange as quasi_lagrange,
@@ -48,7 +49,12 @@ from .impulse_ratios import (
 )
 from .materials import (
     hertz_stiffness as hertz_stiffness,
+    mindlin_ratio as mindlin_ratio,
     pair_restitution as pair_restitution,
+)
+from .oblique import (
+    spring_slip as spring_slip,
+    walton_slip as walton_slip,
 )
 from .quasi_velocities import (
     ContactPower as ContactPower,

@@ -73,6 +73,56 @@ def hertz_stiffness(
     return 4 / 3 / (compliance * jnp.sqrt(curvature))
 
 
+def mindlin_ratio(
+    poisson: Any, modulus: Any = None, poisson2: Any = None, modulus2: Any = None
+) -> jax.Array:
+    """Ratio kappa of tangential to normal stiffness of two spheres, before any slip.
+
+    Equation: `kappa = 2 (1 - nu) / (2 - nu)` of one material, 2/3 to 1 for nu from 1/2 to 0. Of
+    two, `kappa = 4 G* / E*`, `1/E* = (1 - nu1^2)/E1 + (1 - nu2^2)/E2`,
+    `1/G* = 2 (1 + nu1) (2 - nu1)/E1 + 2 (1 + nu2) (2 - nu2)/E2`: the `tangential_stiffness` of
+    `LZB` and `Compliant`.
+
+    Args:
+        poisson: Poisson ratio nu1 in [-1, 0.5].
+        modulus: Young's modulus E1 > 0 [Pa]; needed with another material.
+        poisson2: of the other body; None: the same material.
+        modulus2: of the other body [Pa]; None: the same material; `inf`: rigid.
+
+    Returns:
+        kappa, of the common shape.
+
+    Raises:
+        ValueError: Poisson ratio out of range, a modulus not positive, or one of the two without
+            the other.
+
+    Source: Mindlin, J. Appl. Mech. 16 (1949) 259; Johnson, Contact Mechanics (1985), 7.2.
+
+    >>> import jimpact as ji
+    >>> round(float(ji.theory.mindlin_ratio(0.3)), 4)  # steel
+    0.8235
+    >>> round(float(ji.theory.mindlin_ratio(0.25, 70e9, 0.3, 210e9)), 4)  # glass on steel
+    0.8471
+    """
+    nu1 = as_float_array("poisson", poisson)
+    nu2 = nu1 if poisson2 is None else as_float_array("poisson2", poisson2)
+    for name, nu in (("poisson", nu1), ("poisson2", nu2)):
+        check_values(name, nu, low=-1.0, high=0.5)
+    given = {"modulus": modulus, "modulus2": modulus2, "poisson2": poisson2}
+    missing = [name for name, value in given.items() if value is None]
+    if len(missing) == len(given):
+        return 2 * (1 - nu1) / (2 - nu1)
+    if "modulus" in missing:
+        raise ValueError("Argument `modulus` must be given with another material.")
+    e1 = as_float_array("modulus", modulus)
+    e2 = e1 if modulus2 is None else as_float_array("modulus2", modulus2)
+    check_values("modulus", e1, low=0.0, open_low=True)
+    check_values("modulus2", jnp.minimum(e2, jnp.finfo(e2.dtype).max), low=0.0, open_low=True)
+    normal = (1 - nu1**2) / e1 + (1 - nu2**2) / e2
+    tangential = (1 + nu1) * (2 - nu1) / e1 + (1 + nu2) * (2 - nu2) / e2
+    return 2 * normal / tangential
+
+
 def pair_restitution(
     first: Any, second: Any, rule: str, stiffness: Any = None, stiffness2: Any = None
 ) -> jax.Array:

@@ -11,6 +11,8 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from jimpact.tools.kept_programs import keeper
+
 # XLA's newer emitters of fused loops on CPUs make code that runs 4 % faster in large batches, and
 # take twice as long to compile a program of many small loops.
 QUICK = {"xla_cpu_use_fusion_emitters": False}
@@ -34,11 +36,6 @@ def full_precision(function: Function) -> Function:
             return function(*args, **keywords)
 
     return precise  # type: ignore[return-value]
-
-
-def precise_jit(function: Function) -> Function:
-    """`eqx.filter_jit(function)` in full precision."""
-    return full_precision(eqx.filter_jit(function))  # type: ignore[return-value]
 
 
 @functools.cache
@@ -73,13 +70,33 @@ def is_top_level_call(*args: Any) -> bool:
     return True
 
 
+def precise_jit(function: Function) -> Function:
+    """`eqx.filter_jit(function)` in full precision; kept programs are loaded (`kept_programs`)."""
+    return _compiled(function, dict, eqx.is_array)
+
+
 def quick_jit(function: Function) -> Function:
-    """`eqx.filter_jit(function)` in full precision, compiled quickly where called at top level."""
+    """`precise_jit(function)`, compiled quickly where called at top level."""
+    return _compiled(function, known_options, eqx.is_array_like)
+
+
+def _compiled(
+    function: Function,
+    options: Callable[[], dict[str, Any]],
+    becomes_array: Callable[[Any], bool],
+) -> Function:
+    """The function as a program, by itself where called at top level.
+
+    Args:
+        function: to be compiled.
+        options: of the compiler, where called at top level.
+        becomes_array: True for results that are arrays then; others stay as they are.
+    """
     inside = eqx.filter_jit(function)
 
     @functools.cache
-    def program() -> Callable[..., Any]:
-        """The compiled function of (structure, other leaves), arrays."""
+    def program(name: str = function.__name__) -> Any:
+        """The function of (structure, other leaves), arrays, to be compiled under a name."""
 
         def of_arrays(rest: Any, arrays: list[Any]) -> Any:
             """`function` of flattened arguments: `rest` is (structure, other leaves)."""
@@ -87,19 +104,48 @@ def quick_jit(function: Function) -> Function:
             values = iter(arrays)
             leaves = [next(values) if x is None else x[0] for x in fixed]
             args, keywords = jax.tree.unflatten(tree, leaves)
-            return function(*args, **keywords)
+            return _Results(*eqx.partition(function(*args, **keywords), becomes_array))
 
-        of_arrays.__name__ = function.__name__
-        return jax.jit(of_arrays, static_argnums=0, compiler_options=known_options())
+        of_arrays.__name__ = name
+        return jax.jit(of_arrays, static_argnums=0, compiler_options=options())
 
     @full_precision
     @functools.wraps(function)
     def call(*args: Any, **keywords: Any) -> Any:
         """`function`, compiled by itself or as part of the program that calls it."""
-        if not is_top_level_call(args, keywords):
+        if (keeper() is None and options is dict) or not is_top_level_call(args, keywords):
             return inside(*args, **keywords)
         leaves, tree = jax.tree.flatten((args, keywords))
         fixed = tree, tuple(None if eqx.is_array(x) else (x,) for x in leaves)
-        return program()(fixed, [x for x in leaves if eqx.is_array(x)])
+        arrays = [x for x in leaves if eqx.is_array(x)]
+        kept = _kept(function, program, fixed, arrays)
+        results = program()(fixed, arrays) if kept is None else kept(arrays)
+        return eqx.combine(results.arrays, results.others)
 
     return call  # type: ignore[return-value]
+
+
+class _Results(eqx.Module):
+    """The results of a program: arrays, and what is no array as part of the structure."""
+
+    arrays: Any
+    others: Any = eqx.field(static=True)
+
+
+def _kept(
+    function: Callable[..., Any],
+    program: Callable[[str], Any],
+    fixed: Any,
+    arrays: list[Any],
+) -> Callable[[list[Any]], Any] | None:
+    """The program of a folder for these arguments; None where programs are not kept."""
+    folder = keeper()
+    if folder is None or any(isinstance(x, jax.core.Tracer) for x in arrays):
+        return None
+
+    def compiled(suffix: str) -> Callable[[list[Any]], Any]:
+        """The program, compiled under the name of the function and a suffix."""
+        lowered = program(function.__name__ + suffix).lower(fixed, arrays)
+        return lowered.compile()
+
+    return folder.program(function, compiled, fixed, arrays)

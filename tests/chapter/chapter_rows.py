@@ -249,7 +249,7 @@ SECTIONS = {
         Row(
             "(6.35)",
             "kinetic angle of contacts 1-2 and 3-4 of equal balls where v2 = v3: of (1, 2, 1)",
-            "ji.kinetic_angles(ji.Scene([1.0] * 4, [[-1.0, 0], [1, 0], [0, -1], [0, 1]],"
+            "ji.theory.kinetic_angles(ji.Scene([1.0] * 4, [[-1.0, 0], [1, 0], [0, -1], [0, 1]],"
             " constraints=[[0.0], [1.0], [-1.0], [0.0]]))[0, 1]",
             "Schur complement",
             np.arccos(1 / 3),
@@ -298,7 +298,7 @@ SECTIONS = {
             [0.7, 1.0],
         ),
         Row("(6.66)", "kinetic angle of m = (1, 2, 3) [rad]",
-            "ji.kinetic_angles(uneven)[0, 1]", "(6.66)", 1.1071487178),
+            "ji.theory.kinetic_angles(uneven)[0, 1]", "(6.66)", 1.1071487178),
     ],
     "6.3 The law of Liu, Zhao and Brogliato": [
         Row("(6.67)-(6.73)", "three Hertz balls, e = 1, k2/k1 = 4",
@@ -324,7 +324,7 @@ SECTIONS = {
             "pi/2, pi/4", [np.pi / 2, np.pi / 3], "pi/3 for the flat one"),
         Figure("6.8a"),
         Row("Rem. 6.11", "dimer: L = infinity, L = 0, and R/L = 5/24 [rad]",
-            "[ji.kinetic_angles(ji.Dimer(r, length).scene())[0, 1] for r, length in"
+            "[ji.theory.kinetic_angles(ji.Dimer(r, length).scene())[0, 1] for r, length in"
             " ((1e-9, 1.0), (1.0, 0.0), (5.0, 24.0))]",
             "1.445, 1.536, between", [1.4454684956, 1.5363067308, 1.4242044517],
             "not monotone: least at 5/24", slow=True),

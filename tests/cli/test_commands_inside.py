@@ -14,7 +14,7 @@ from jimpact import HarmonicBase
 from jimpact.bodies.study import body_of
 from jimpact.cli import study, study_file
 from jimpact.cli.commands import _per_contact
-from jimpact.cli.main import keep_programs
+from jimpact.cli.main import cache_folder
 from jimpact.montecarlo.study import SAMPLING
 from jimpact.motion import study as motion_keys
 
@@ -40,18 +40,18 @@ def test_where_programs_are_kept(tmp_path, monkeypatch):
         monkeypatch.setenv(name, "")
         monkeypatch.delenv(name)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    keep_programs(no_cache=False)
+    cache_folder(no_cache=False)
     assert os.environ.pop(folder).startswith(str(tmp_path / "jimpact"))
     monkeypatch.setenv("JIMPACT_CACHE", "")
-    keep_programs(no_cache=False)
+    cache_folder(no_cache=False)
     assert folder not in os.environ
     monkeypatch.setenv("JIMPACT_CACHE", "mine")
-    keep_programs(no_cache=False)
+    cache_folder(no_cache=False)
     monkeypatch.setenv("JIMPACT_CACHE", "other")
-    keep_programs(no_cache=False)  # what is set already stays
+    cache_folder(no_cache=False)  # what is set already stays
     assert os.environ[folder].startswith("mine")
     assert enabled not in os.environ
-    keep_programs(no_cache=True)
+    cache_folder(no_cache=True)
     assert os.environ[enabled] == "false"
 
 
@@ -83,7 +83,7 @@ def test_unwritable_places_are_refused_before_anything_is_computed(
 ):
     (tmp_path / "file").write_text("")
     (tmp_path / "folder.html").mkdir()
-    monkeypatch.setattr("jimpact.cli.main.keep_programs", None)  # a command that runs would call it
+    monkeypatch.setattr("jimpact.cli.main.cache_folder", None)  # a command that runs would call it
     code, said = call(capsys, *arguments)
     assert code == 2
     assert f"{arguments[1]} must be" in said.err

@@ -1195,3 +1195,17 @@ def test_a_progress_bar_can_be_asked_for(capsys):
     assert f"{count} of {count} starts done" in capsys.readouterr().err
     ji.fit(ji.Newton(0.9), PAIR, data)  # no terminal: no bar
     assert capsys.readouterr().err == ""
+
+
+def test_lack_of_fit_says_how_to_free_a_scalar_stiffness():
+    """Three balls of unequal stiffness, by a law with one number; by two the report is calm."""
+    balls = ji.chain([1.0, 1.0, 1.0])
+    pre = np.array([[1.0, 0.0, -0.5], [1.2, -0.1, -0.3], [0.8, 0.1, -0.7], [1.1, 0.0, 0.0]])
+    truth = ji.LZB([0.9, 0.9], [1.0, 3.0])
+    post = np.array([ji.impact(truth, balls, v).velocity for v in pre])
+    data = ji.Experiments(pre, post + 0.001 * np.random.default_rng(2).normal(size=(4, 3)), 0.001)
+    held = ji.fit(ji.LZB(0.9), balls, data, starts=1)
+    (finding,) = [each for each in held.findings if each.kind == "lack_of_fit"]
+    assert "`stiffness=[1, 1]`" in finding.line
+    freed = ji.fit(ji.LZB([0.9, 0.9], [1.0, 2.0]), balls, data, starts=1)
+    assert not freed.found("lack_of_fit")

@@ -801,3 +801,23 @@ def test_slope_of_a_block_that_falls_flat():
     steps = np.array([1e-4, 1e-6])
     off = [np.abs((after(v + s * way) - after(v - s * way)) / (2 * s) - slope).max() for s in steps]
     assert off[1] < 0.3 * off[0] < 0.3 * 0.3
+
+
+@pytest.mark.slow
+def test_slip_across_is_taken_at_once():
+    """In space, u- = 0 and slip that begins at once along x: du_y+/du_y- = 0, dp_y/du_y- = -1/b.
+
+    W_nt = (c, 0), W_tt = diag(a, b), c > mu a: a small slip across decays as a power of p.
+    """
+    c, b, mu, e = 0.9, 2.0, 0.15, 0.5
+    normals = jnp.array([[1.0], [0.0], [0.0]])
+    tangents = jnp.array([[c, 0.0], [0.7, 0.0], [0.0, b**0.5]])
+    scene = ji.Scene(jnp.ones(3), normals, tangents=tangents)
+
+    def after(u):
+        v = jnp.stack([-1.0 + 0 * u, -c * -1.0 / 0.7 + 0 * u, u / b**0.5])
+        out = ji.impact(ji.LZB(e, friction=mu), scene, v)
+        return jnp.concatenate([tangents.T @ out.velocity, out.tangential_impulse])
+
+    slope = jax.jit(jax.jacfwd(after))(0.0)
+    close(slope[jnp.array([1, 3])], [0.0, -1 / b], atol=1e-9)

@@ -229,7 +229,7 @@ def test_a_law_is_printed_with_its_numbers():
     law = ji.LZB([0.9, 0.8], 2e9, rtol=1e-6)
     assert str(law) == (
         "LZB(restitution=[0.9, 0.8], stiffness=2e+09, exponent=1.5 (static), initial_energy=0, "
-        "friction=None, rtol=1e-06)"
+        "friction=None, tangential_stiffness=None, rtol=1e-06)"
     )
     slope = jax.grad(lambda law: jnp.sum(law.restitution**2))(law)
     assert "restitution=[1.8, 1.6], stiffness=0, exponent=1.5 (static)" in str(slope)

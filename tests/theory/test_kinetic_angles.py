@@ -17,7 +17,9 @@ def test_normalized_quantities_and_kinetic_angles():
     assert dense(ji.theory.normalized_delassus(chain))[0, 1] == pytest.approx(
         -1 / 5**0.5, abs=1e-15
     )
-    assert float(ji.kinetic_angles(chain)[0, 1]) == pytest.approx(1.1071487177940905, abs=1e-14)
+    assert float(ji.theory.kinetic_angles(chain)[0, 1]) == pytest.approx(
+        1.1071487177940905, abs=1e-14
+    )
     qn = ji.theory.normalized_gap_velocity(ji.chain([2.0] * 4), [0.3, -0.2, 0.5, 0.7])
     np.testing.assert_allclose(qn, [-0.5, 0.7, 0.2], atol=1e-15)
 
@@ -72,10 +74,12 @@ def test_kinetic_angles_of_bodies():
     @jax.jit
     def angles(aspects, ratios):
         block = jax.vmap(
-            lambda a: ji.kinetic_angles(ji.Block(2.0, 2 * a, 3.0, corners="base").scene())[0, 1]
+            lambda a: ji.theory.kinetic_angles(ji.Block(2.0, 2 * a, 3.0, corners="base").scene())[
+                0, 1
+            ]
         )
-        dimer = jax.vmap(lambda r: ji.kinetic_angles(ji.Dimer(2 * r, 2.0).scene())[0, 1])
-        together = ji.kinetic_angles(ji.Dimer(2.0, 0.0).scene())[0, 1]
+        dimer = jax.vmap(lambda r: ji.theory.kinetic_angles(ji.Dimer(2 * r, 2.0).scene())[0, 1])
+        together = ji.theory.kinetic_angles(ji.Dimer(2.0, 0.0).scene())[0, 1]
         cosine = jax.grad(lambda r: ji.theory.normalized_delassus(ji.Dimer(r, 1.0).scene())[0, 1])
         return (
             block(aspects),
@@ -91,7 +95,7 @@ def test_kinetic_angles_of_bodies():
     # least angle at R / L = 5/24: the slope vanishes and rises
     assert abs(float(slope[1])) < 1e-12
     assert float(slope[0]) < -1e-3 < 1e-3 < float(slope[2])
-    corner = jax.jit(jax.vmap(lambda a: ji.kinetic_angles(ji.Corner(a, 2.0).scene())[0, 1]))
+    corner = jax.jit(jax.vmap(lambda a: ji.theory.kinetic_angles(ji.Corner(a, 2.0).scene())[0, 1]))
     np.testing.assert_allclose(corner(np.array([0.1, 1.2, 3.0])), [0.1, 1.2, 3.0], atol=1e-14)
     phi, masses, m0 = np.array([0.3, 1.9, -2.0]), np.array([0.5, 0.7, 2.0]), 1.5
     disc = built(around_a_disc, phi, masses, m0, 0.3, [0.1, 0.2, 0.1])

@@ -66,7 +66,7 @@ def test_check_values():
 
 def test_self_adjoint_matrix():
     """E = G S: the energy of (6.50) in its corrected form."""
-    g = np.asarray(ji.kinetic_angles(CHAIN))
+    g = np.asarray(ji.theory.kinetic_angles(CHAIN))
     g = -np.cos(g)
     e = g @ np.array([[0.5, 0.1], [0.1, 0.3]])
     np.testing.assert_allclose(

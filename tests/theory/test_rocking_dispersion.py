@@ -70,7 +70,7 @@ def test_record_and_words():
 
 def test_kinetic_angle_is_that_of_the_scene():
     scene = ji.Block(0.3, 0.21, 2.0, corners="base").scene()
-    angle = ji.kinetic_angles(scene)[0, 1]
+    angle = ji.theory.kinetic_angles(scene)[0, 1]
     np.testing.assert_allclose(ji.theory.rocking_kinetic_angle(0.7), angle, rtol=1e-12)
 
 

@@ -1,0 +1,435 @@
+"""Contacts with a tangential spring below Coulomb's limit, in the plane and in space.
+
+With the normal force F of the indentation x a contact j has a spring of stiffness
+`k_t = kappa dF/dx(x)` and elongation xi:
+
+    holds    xi' = u,  lambda = -k_t xi,                 while |lambda| <= mu F
+    slides   xi = mu F / k_t n,  lambda = -mu F n,       while n . (u - xi') >= 0
+
+where n is the direction of xi, and u - xi' is the slip. In the units of `contact_flow.py`, with
+F = (eta + 1)/2 omega x^eta and xi in those of x, `k_t = kappa eta F / x`: the cone is
+
+    kappa eta |xi| <= mu x,
+
+linear in the state. So nothing here is singular or redundant: forces follow from x and xi whatever
+the contacts share, and exact events end the modes. A contact that closes with u and gamma slides at
+once if `kappa eta |u| > mu |gamma|`. The cone closes as x falls to 0: a spring that is still loaded
+then slides. A contact closes with xi = 0.
+
+In space n turns while the contact slides: xi' has no component across n but that of u, so
+
+    angle' = A / x sin(phi - angle),   A = kappa eta omega |u| / mu,   phi the angle of u.
+
+This is stiff where x is small. A loaded contact has therefore one of three modes:
+
+    HOLDS    xi is a state
+    SLIDES   the angle is a state, and the whole field advances in a time that is shortened by one
+             and the sum of the rates A / x
+    DRAGS    A / x is so large that n follows u, behind it by phi' x / (A + x'), exact where phi'
+             is steady and x a power of time: a contact that closes while it slides
+
+STATE   x, g, p (m each), u, xi, impulse of lambda (t each), time. In space the rows of xi are 0 and
+        the angle while a contact slides.
+MODES   phase, closings, slip (m each): 0 holds; in the plane +-1, the direction in which it slides;
+        in space 1 slides, 2 drags.
+"""
+
+import dataclasses
+import enum
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jimpact.events.contact_flow import (
+    ContactFlow,
+    ContactStates,
+    Frozen,
+    as_pytree,
+    per_row,
+)
+from jimpact.events.friction_flow import FrictionFlow
+from jimpact.events.slip import (
+    STABLE,
+    angle_of,
+    dot,
+    length,
+    perpendicular_to,
+    towards,
+    turned,
+)
+from jimpact.numerics.dense import times
+from jimpact.numerics.driver import SLOTS, SLOTS_IN_SPACE
+from jimpact.numerics.stepper import total
+
+# Longest step in the time in which a spring moves by one radian. Errors of a spring without load
+# show in derivatives only: ten times more, and these are wrong.
+RADIAN = 1.0
+# Of the tolerance: a contact that holds slides from this far beyond its cone, where the direction
+# of its spring is known also if it began at rest. Ten times more would be seen in the outcome.
+BEYOND = 0.05
+# A contact drags where the rate A / x of its direction is this over the cube root of the tolerance,
+# and slides again from a quarter of that on. Impulses err by its inverse cube times (1 / A)^2. Ten
+# times more: half as many steps again; ten times less: errors of five tolerances.
+SWIFT = 10.0
+QUARTER = 0.25
+
+
+class Slide(enum.IntEnum):
+    """Motion of a contact along its plane, in space."""
+
+    HOLDS = 0
+    SLIDES = 1
+    DRAGS = 2
+
+
+class SpringConstants(NamedTuple):
+    """Factors of the field that do not change while the modes last."""
+
+    frozen: Frozen
+    loaded: Bool[Array, "m B"]
+    slides: Bool[Array, "m B"]
+
+
+class SpringForces(NamedTuple):
+    """Forces of the contacts and how their springs change, b tangents each."""
+
+    normal: Float[Array, "m B"]  # F
+    side: Float[Array, "t B"]  # lambda
+    elongation: Float[Array, "m b B"]  # rates of the rows of xi, in time that is not shortened
+    direction: Float[Array, "m b B"]  # n of those that slide
+    slip: Float[Array, "m B"]  # kappa eta (slip rate along n), of those that slide
+    haste: Float[Array, "1 B"]  # >= 1: by how much time is shortened
+
+
+@as_pytree
+@dataclasses.dataclass(kw_only=True)
+class SpringFlow(FrictionFlow):
+    """The motion of m contacts with tangential springs, b = t / m of each."""
+
+    tangential_stiffness: Float[Array, "m B"]  # kappa
+
+    # ---- the state: x, g, p, slip velocity u, spring xi, impulse of lambda, time
+
+    @property
+    def in_space(self) -> bool:
+        """True with two tangents a contact."""
+        return self.normal_tangent.shape[1] == 2 * self.contacts
+
+    @property
+    def slots(self) -> int:  # type: ignore[override]
+        """Impacts that a CPU computes side by side: in space some take many more passes."""
+        return SLOTS_IN_SPACE if self.in_space else SLOTS
+
+    @property
+    def driving(self) -> tuple[int, ...]:
+        """Sizes of the blocks x, g, p, u and xi."""
+        m, t = self.contacts, self.normal_tangent.shape[1]
+        return m, m, m, t, t
+
+    @property
+    def steep(self) -> Float[Array, "m B"]:
+        """`kappa eta`: k_t over the secant stiffness F / x."""
+        return self.tangential_stiffness * per_row(self.exponent, self.omega)
+
+    @property
+    def swift(self) -> Float[Array, "1 B"]:
+        """Rate A / x of directions above which a contact drags."""
+        return SWIFT / jnp.cbrt(jax.lax.stop_gradient(self.tolerance))
+
+    @property
+    def longest(self) -> Float[Array, "1 B"]:  # type: ignore[override]
+        """One radian of the fastest spring; in space at most the step that is stable."""
+        scale = self.steep * (per_row(self.exponent, self.omega) + 1) / 2 * self.omega
+        rows = jnp.repeat(scale * self.omega, len(self.tangent) // self.contacts, axis=0)
+        square = jnp.max(times(jnp.abs(self.tangent), rows), axis=0, keepdims=True)
+        most = STABLE if self.in_space else jnp.inf
+        return jax.lax.stop_gradient(RADIAN / jnp.sqrt(jnp.maximum(square, (RADIAN / most) ** 2)))
+
+    def by_contact(self, rows: Float[Array, "t B"]) -> Float[Array, "m b B"]:
+        """Tangential rows of each contact side by side."""
+        return rows.reshape(self.contacts, -1, *rows.shape[1:])
+
+    def slip(self, y: Float[Array, "driving B"]) -> Float[Array, "t B"]:
+        """Tangential velocity u."""
+        m, t = self.contacts, self.normal_tangent.shape[1]
+        return y[3 * m : 3 * m + t]
+
+    def spring(self, y: Float[Array, "driving B"]) -> Float[Array, "m b B"]:
+        """Rows of xi."""
+        m, t = self.contacts, self.normal_tangent.shape[1]
+        return self.by_contact(y[3 * m + t : 3 * m + 2 * t])
+
+    def elongation(self, y: Float[Array, "driving B"]) -> Float[Array, "m B"]:
+        """|xi| of contacts that hold, with derivative 0 at 0."""
+        square = jnp.sum(self.spring(y) ** 2, axis=1)
+        some = square > 0
+        return jnp.where(some, jnp.sqrt(jnp.where(some, square, 1.0)), 0.0)
+
+    def with_spring(self, y: Float[Array, "n B"], xi: Float[Array, "m b B"]) -> Float[Array, "n B"]:
+        """The state with these rows of xi."""
+        m, t = self.contacts, self.normal_tangent.shape[1]
+        rows = xi.reshape(t, *xi.shape[2:])
+        return jnp.concatenate([y[: 3 * m + t], rows, y[3 * m + 2 * t :]])
+
+    def start_with(
+        self, gamma: Float[Array, "m B"], x: Float[Array, "m B"], u: Float[Array, "t B"]
+    ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
+        """Modes and state before the impact, from gamma, indentations x and slip u."""
+        m = self.contacts
+        modes, y = self.start(gamma, x)
+        none = jnp.zeros_like(u)
+        modes = jnp.concatenate([modes, jnp.zeros_like(modes[:m])])
+        y = jnp.concatenate([y[: 3 * m], u, none, none, y[3 * m :]])
+        return self.closed(modes, y, self.loaded(modes))
+
+    # ---- the protocol
+
+    def allowance(
+        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]
+    ) -> Float[Array, "n #B"] | float:
+        """Allowed error of each row, in tolerances; the angle of slip may err by more where x is 0.
+
+        Its error counts by the force, so that `1 / x` is allowed.
+        """
+        if not self.in_space:
+            return 1.0
+        m = self.contacts
+        slides = self.loaded(modes) & (modes[2 * m :] == Slide.SLIDES)
+        depth = jnp.clip(y[:m], self.tolerance, 1.0)
+        angle = jnp.where(slides, 1 / depth, 1.0)
+        ones = jnp.ones_like(y)
+        return self.with_spring(ones, jnp.stack([jnp.ones_like(angle), angle], 1))
+
+    def constants(self, modes: Int[Array, "modes B"]) -> Any:
+        """Factors of the normal field, and which contacts are loaded and slide."""
+        loaded = self.loaded(modes)
+        slides = loaded & (modes[2 * self.contacts :] != 0)
+        return SpringConstants(self.normal_constants(modes), loaded, slides)
+
+    def aim(self, y: Float[Array, "driving B"]) -> Float[Array, "m B"]:
+        """`A mu = kappa eta omega |u|`: how fast directions turn towards u, times mu x."""
+        return self.steep * self.omega * length(self.by_contact(self.slip(y)))
+
+    def side(
+        self,
+        const: SpringConstants,
+        y: Float[Array, "driving B"],
+        f: Float[Array, "m B"],
+        n: Float[Array, "m b B"],
+    ) -> Float[Array, "t B"]:
+        """Tangential forces: holding `-kappa eta F / x xi`, sliding `-mu F n`."""
+        x, *_ = self.rows(y)
+        deep = x > 0
+        secant = jnp.where(deep, f / jnp.where(deep, x, 1.0), 0.0)  # F / x
+        held = -(self.steep * secant)[:, None] * self.spring(y)
+        sliding = -(self.friction * f)[:, None] * n
+        return jnp.where(const.slides[:, None], sliding, held).reshape(self.slip(y).shape)
+
+    def slip_acceleration(
+        self, f: Float[Array, "m B"], side: Float[Array, "t B"]
+    ) -> Float[Array, "t B"]:
+        """`u' = K_tn F + K_tt lambda`."""
+        return times(jnp.swapaxes(self.normal_tangent, 0, 1), f) + times(self.tangent, side)
+
+    def direction(
+        self,
+        const: SpringConstants,
+        modes: Int[Array, "modes B"],
+        y: Float[Array, "driving B"],
+        f: Float[Array, "m B"],
+    ) -> Float[Array, "m b B"]:
+        """Directions n of the springs of contacts that slide.
+
+        In the plane the mode; in space of the angle, or, where it drags, that of u turned back by
+        `phi' x / (A + x')`, phi' = u x u' / |u|^2 by forces along u.
+        """
+        slip = modes[2 * self.contacts :]
+        if not self.in_space:
+            return slip[:, None].astype(y.dtype)
+        x, g, _ = self.rows(y)
+        u = self.by_contact(self.slip(y))
+        drags = slip == Slide.DRAGS
+        speed = length(u)
+        moves = drags & (speed > 0)
+        size = jnp.where(moves, speed, 1.0)
+        along = jnp.where(moves[:, None], u / size[:, None], jnp.array([1.0, 0.0])[None, :, None])
+        of_angle = towards(jnp.where(slip == Slide.SLIDES, self.spring(y)[:, 1], 0.0))
+        first = jnp.where(drags[:, None], along, of_angle)
+        rate = self.by_contact(self.slip_acceleration(f, self.side(const, y, f, first)))
+        turns = jnp.where(moves, dot(perpendicular_to(along), rate) / size, 0.0)  # phi'
+        # x' in time: closing g / unit, but 0 where an expansion takes no time
+        unit = const.frozen.unit
+        lasts = unit > 0
+        sinks = jnp.where(lasts, const.frozen.closing * g / jnp.where(lasts, unit, 1.0), 0.0)
+        pace = self.aim(y) + self.friction * sinks
+        behind = moves & (pace > 0)
+        lag = jnp.where(behind, self.friction * x * turns / jnp.where(behind, pace, 1.0), 0.0)
+        return turned((first, perpendicular_to(first)), -lag)[0]
+
+    def forces(  # type: ignore[override]
+        self, const: SpringConstants, modes: Int[Array, "modes B"], y: Float[Array, "driving B"]
+    ) -> SpringForces:
+        """Forces F and lambda in a state, and the rates of the springs.
+
+        Holding: `xi' = omega u`. Sliding: slip is `n . u - (mu x / (kappa eta))' / omega`, and in
+        space `angle' = A / x (n' . u) / |u|`, n' at right angles to n.
+        """
+        frozen = const.frozen
+        x, g, _ = self.rows(y)
+        u = self.by_contact(self.slip(y))
+        f = self.force(frozen, x, g)
+        n = self.direction(const, modes, y, f)
+        slip = self.steep * frozen.unit * jnp.sum(n * u, axis=1)
+        slip = slip + self.friction * frozen.ratio * g
+        holds = const.loaded & ~const.slides
+        rate = jnp.where(holds[:, None], (frozen.unit * self.omega)[:, None] * u, 0.0)
+        haste = jnp.ones_like(frozen.unit)
+        if self.in_space:
+            slides = const.slides & (modes[2 * self.contacts :] == Slide.SLIDES)
+            turns = slides & (self.friction > 0) & (x > 0)
+            depth = jnp.where(turns, self.friction * x, 1.0)
+            swift = jnp.where(turns, self.steep * frozen.unit * self.omega / depth, 0.0)
+            turning = swift * dot(perpendicular_to(n), u)
+            rate = rate + jnp.stack([jnp.zeros_like(turning), turning], 1)
+            haste = haste + total(swift * length(u))
+        return SpringForces(f, self.side(const, y, f, n), rate, n, slip, haste)
+
+    def field(
+        self, const: Any, modes: Int[Array, "modes B"], y: Float[Array, "driving B"]
+    ) -> Float[Array, "n B"]:
+        """Rates of x, g, p, u, xi, its impulse and time, all over `haste`: in shortened time.
+
+        Equation: `g' = ratio (G F + K_nt lambda)`, `u' = unit (K_tn F + K_tt lambda)`.
+        """
+        frozen, forces = const.frozen, self.forces(const, modes, y)
+        side = forces.side
+        pull = self.coupling.times(forces.normal) + times(self.normal_tangent, side)
+        along = self.slip_acceleration(forces.normal, side)
+        rates = [
+            frozen.closing * self.rows(y)[1],
+            frozen.ratio * pull,
+            frozen.unit * forces.normal,
+            frozen.unit * along,
+            forces.elongation.reshape(side.shape),
+            frozen.unit * side,
+            frozen.unit,
+        ]
+        dy = jnp.concatenate(rates)
+        return dy / forces.haste if self.in_space else dy
+
+    def margins(
+        self, const: Any, modes: Int[Array, "modes B"], y: Float[Array, "driving B"]
+    ) -> Float[Array, "k B"]:
+        """Margins of the normal flow; until slip ends; until the spring gives way (m each).
+
+        In space the last ones are also those between sliding and dragging.
+
+
+        slip ends   `kappa eta n . u - mu c gamma`-like: the slip rate, see `forces`
+        gives way   `mu x - kappa eta |xi|`, and BEYOND of the tolerance
+        drags       `A / x` is below `swift`, or, of one that drags, above a quarter of it
+
+        The first two over `mu + kappa eta`; 1 where there is no such end.
+        """
+        mu, steep = self.friction, self.steep
+        x, *_ = self.rows(y)
+        slip = self.forces(const, modes, y).slip
+        ends = const.slides & (mu > 0)
+        room = (mu * x - steep * self.elongation(y)) / (mu + steep) + BEYOND * self.tolerance
+        room = jnp.where(const.loaded & ~const.slides, room, 1.0)
+        if self.in_space:
+            rubs = jnp.where(mu > 0, mu, 1.0)
+            least = self.aim(y) / (self.swift * rubs)  # x below which it drags
+            drags = modes[2 * self.contacts :] == Slide.DRAGS
+            room = jnp.where(ends, jnp.where(drags, least / QUARTER - x, x - least), room)
+        normal = self.normal_margins(const.frozen, modes, y)
+        return jnp.concatenate([normal, jnp.where(ends, slip / (mu + steep), 1.0), room])
+
+    def switch(
+        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"], which: Bool[Array, "k B"]
+    ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
+        """Modes and state after events: slip that ends, springs that give way, openings, closings.
+
+        Slip ends with the spring on its cone, xi = mu x / (kappa eta) n; a contact that opens has
+        xi = 0.
+        """
+        m = self.contacts
+        stopped, ended = which[2 * m : 3 * m], which[3 * m :]
+        const, xi, slip = self.constants(modes), self.spring(y), modes[2 * m :]
+        n = self.forces(const, modes, y).direction
+        ends_slide = const.slides & ended  # in space: it drags from now on, or no more
+        direction = jnp.where(const.slides[:, None], n, xi)
+        cone = (self.friction * self.rows(y)[0] / self.steep)[:, None] * n
+        xi = jnp.where(stopped[:, None], cone, xi)
+        xi, slip = self.sliding_from(ended, direction, y, slip, xi)
+        other = Slide.SLIDES + Slide.DRAGS - modes[2 * m :]
+        slip = jnp.where(stopped, 0, jnp.where(ends_slide, other, slip))
+        after, y = self.normal_switch(modes, y, which[: 2 * m])
+        remains = self.loaded(after)
+        slip = jnp.where(remains, slip, 0)
+        xi = jnp.where(remains[:, None], xi, 0.0)
+        after = jnp.concatenate([after[: 2 * m], slip.astype(after.dtype)])
+        return self.closed(after, self.with_spring(y, xi), remains & ~self.loaded(modes))
+
+    def sliding_from(
+        self,
+        which: Bool[Array, "m B"],
+        direction: Float[Array, "m b B"],
+        y: Float[Array, "n B"],
+        slip: Int[Array, "m B"],
+        xi: Float[Array, "m b B"],
+    ) -> tuple[Float[Array, "m b B"], Int[Array, "m B"]]:
+        """Rows of xi and modes of slip where the contacts `which` slide in these directions."""
+        if not self.in_space:
+            return xi, jnp.where(which, jnp.sign(direction[:, 0]).astype(slip.dtype), slip)
+        angle = angle_of(jnp.where(which[:, None], direction, 0.0))
+        rows = jnp.stack([jnp.zeros_like(angle), angle], 1)
+        swift = self.aim(y) > 2 * QUARTER * self.swift * self.friction * self.rows(y)[0]
+        mode = jnp.where(swift, Slide.DRAGS, Slide.SLIDES)
+        return jnp.where(which[:, None], rows, xi), jnp.where(which, mode, slip)
+
+    def closed(
+        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"], which: Bool[Array, "m B"]
+    ) -> tuple[Int[Array, "modes B"], Float[Array, "n B"]]:
+        """Modes and state where the contacts `which` have closed: they hold, or slide at once.
+
+        At x = 0 the cone widens at the rate mu |gamma|, the spring at kappa eta |u|.
+        """
+        m = self.contacts
+        x, g, _ = self.rows(y)
+        u = self.by_contact(self.slip(y))
+        speed = jnp.sqrt(jnp.sum(jax.lax.stop_gradient(u) ** 2, axis=1))
+        faster = self.steep * speed > self.friction * jnp.abs(g)
+        at_once = which & (speed > 0) & ((faster & (x <= 0)) | (self.friction <= 0))
+        xi, slip = self.sliding_from(at_once, u, y, modes[2 * m :], self.spring(y))
+        modes = jnp.concatenate([modes[: 2 * m], slip.astype(modes.dtype)])
+        return modes, self.with_spring(y, xi)
+
+    def contact_states(self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]) -> ContactStates:
+        """Forces, velocities, slip and energies of the springs in a state."""
+        const = self.constants(modes)
+        forces = self.forces(const, modes, y)
+        states = ContactFlow.contact_states(self, modes, y)
+        t = self.normal_tangent.shape[1]
+        square = jnp.sum(self.by_contact(forces.side) ** 2, axis=1)
+        # twice the energy, omega k_t xi^2 over omega^2: lambda^2 x / (kappa eta omega F)
+        stiffness = self.steep * self.omega * forces.normal
+        some = stiffness > 0
+        depth = jnp.maximum(self.rows(y)[0], 0.0)
+        energy = jnp.where(some, square * depth / jnp.where(some, stiffness, 1.0), 0.0)
+        return states._replace(
+            tangential_force=forces.side,
+            tangential_impulse=y[-1 - t : -1],
+            slip=self.slip(y),
+            tangential_energy=energy,
+            rate=const.frozen.unit / forces.haste,
+        )
+
+    # ---- the end
+
+    @property
+    def at_once(self) -> bool:
+        """False: no impact with a spring is in closed form."""
+        return False
