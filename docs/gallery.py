@@ -396,6 +396,28 @@ def engines() -> Figure:
     return figure
 
 
+@picture
+@styled()
+def oblique_rebounds() -> Figure:
+    """A sphere obliquely on a plane: its tangential spring returns slip at small angles."""
+    normals, tangents = [[0.0], [1.0], [0.0]], [[1.0], [0.0], [1.0]]
+    sphere = ji.Scene([1.0, 1.0, 0.4], normals, tangents=tangents)
+    angles = np.radians(np.linspace(0.5, 80.0, 160))
+    before = np.stack([np.sin(angles), -np.cos(angles), 0 * angles], axis=1)
+    figure, axes = new_figure(3.6)
+    for kappa in (None, 0.4, 0.8, 1.2):
+        law = ji.LZB(0.95, friction=0.15, tangential_stiffness=kappa)
+        run = jax.jit(jax.vmap(lambda v, law=law: ji.impact(law, sphere, v).velocity))
+        slip = run(before) @ np.asarray(tangents)[:, 0]
+        label = "Coulomb alone" if kappa is None else f"kappa = {kappa}"
+        axes.plot(np.tan(angles), slip / np.cos(angles), label=label)
+    axes.axhline(0.0, color=GREY, lw=0.6)
+    axes.set(xlim=(0, 2.0), ylim=(-0.5, 1.0))
+    axes.set(xlabel="tangent of the angle of incidence", ylabel="slip after, over the approach")
+    legend_below(figure, 4)
+    return figure
+
+
 def main(names: list[str]) -> None:
     """Draw these, or all."""
     jax.config.update("jax_enable_x64", True)
