@@ -35,7 +35,7 @@ _KINDS: dict[str, Any] = {
 } | {"Prior": Prior._make}
 # Fields that files of earlier builds may lack. Their fits with errors of v- hold these errors as
 # they were passed on, which `before` = None keeps: profiles belong to what was minimized then.
-_LATER = {"covariance", "curve", "pre", "before"}
+_LATER = {"covariance", "curve", "pre", "before", "tangential_stiffness"}
 # classes of a fit that have no public name, by their own
 _PARTS = {
     kind.__name__: kind
