@@ -375,7 +375,8 @@ class FrictionFlow(ContactFlow):
 
         With the impulses p and q that are left, `gamma + G p + K_nt q = 0` of these contacts, and
         `u + K_tn p + K_tt q = 0` where slip is as small, else `q = -mu p sign(u)`; p = q = 0 of
-        others. What does not stop within its cone slides. The state remains where that needs p < 0 or |q| > mu p.
+        others. What does not stop within its cone slides. The state remains where that needs p < 0
+        or |q| > mu p.
         """
         m, (x, g, p), u = self.contacts, self.rows(y), self.slip(y)
         stops = wedged & (jnp.abs(u) <= WIDENED * self.tolerance)
