@@ -27,6 +27,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jimpact.events.contact_flow import (
     SNAP,
+    WIDENED,
     ContactFlow,
     ContactStates,
     Frozen,
@@ -35,10 +36,10 @@ from jimpact.events.contact_flow import (
     plus_one,
     power,
 )
-from jimpact.numerics.dense import load_shares, regularized_once, times
+from jimpact.numerics.dense import load_shares, regularized_once, solve, times, unit
 from jimpact.numerics.friction import distribute
 from jimpact.numerics.stepper import any_of
-from jimpact.tools.loops import fori_loop
+from jimpact.tools.loops import cond, fori_loop
 from jimpact.tools.precision import precision
 
 # part of the unit of time. At the first touch forces are 0 and cannot decide which contacts
@@ -50,6 +51,11 @@ PIECES = 4
 # of the tolerance: the impact is over where no contact has more energy, loaded ones included. Ten
 # times more is the energy of one tolerance of velocity, which would be lost.
 LEFT = 0.1
+
+
+# Closings of a contact from which on it is wedged if it hardly moves at the end. Ten times
+# more: ends of fewer closings stay coarse; ten times less: contacts that come to rest otherwise.
+WEDGED = 100
 
 
 def ridge(dtype: Any) -> float:
@@ -342,8 +348,70 @@ class FrictionFlow(ContactFlow):
         if self.at_once:
             return modes, self._after_one(modes, y)
         m = self.contacts
-        x = jnp.zeros_like(y[:m])
-        return modes, jnp.concatenate([x, y[m:]])
+        ended = jnp.concatenate([jnp.zeros_like(y[:m]), y[m:]])
+        if self.normal_tangent.shape[1] != m:
+            return modes, ended
+        wedged = self.wedged(modes, y)
+        return modes, cond(
+            jnp.any(wedged), lambda: self.unwedged(modes, ended, wedged), lambda: ended
+        )
+
+    def wedged(self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]) -> Bool[Array, "m B"]:
+        """Mask of contacts that hardly move, where one closed WEDGED times: they decay to 0.
+
+        Those that closed often, and those that still approach.
+        """
+        m = self.contacts
+        gamma = self.scales(modes) * self.rows(y)[1]
+        slow = jnp.abs(gamma) <= WIDENED * self.tolerance
+        often = slow & (modes[m : 2 * m] >= WEDGED)
+        approaches = slow & (gamma < -SNAP * self.tolerance)
+        return (often | approaches) & any_of(often)
+
+    def unwedged(
+        self, modes: Int[Array, "modes B"], y: Float[Array, "n B"], wedged: Bool[Array, "m B"]
+    ) -> Float[Array, "n B"]:
+        """The state in the limit of the `wedged` contacts, where friction permits it.
+
+        With the impulses p and q that are left, `gamma + G p + K_nt q = 0` of these contacts, and
+        `u + K_tn p + K_tt q = 0` where slip is as small, else `q = -mu p sign(u)`; p = q = 0 of
+        others. What does not stop within its cone slides. The state remains where that needs p < 0
+        or |q| > mu p.
+        """
+        m, (x, g, p), u = self.contacts, self.rows(y), self.slip(y)
+        stops = wedged & (jnp.abs(u) <= WIDENED * self.tolerance)
+        eye = unit(self.tangent)
+        coupling = self.coupling.dense(m)
+        across, back = self.normal_tangent, jnp.swapaxes(self.normal_tangent, 0, 1)
+        drag = self.friction * jnp.sign(jax.lax.stop_gradient(u))
+        gamma = self.scales(modes) * g
+
+        def solved(stops: Bool[Array, "m B"]) -> tuple[Float[Array, "m B"], Float[Array, "m B"]]:
+            """Impulses p and q that are left where the contacts `stops` have no slip."""
+            slides = (wedged & ~stops)[:, None]
+            rubs = jnp.where(slides, eye * drag[:, None], 0.0)
+            lower = [
+                jnp.where(stops[:, None], back, rubs),
+                jnp.where(stops[:, None], self.tangent, eye),
+            ]
+            normal = jnp.where(wedged[:, None], coupling, eye)
+            upper = [normal, jnp.where(wedged[:, None], across, 0.0)]
+            matrix = jnp.concatenate([jnp.concatenate(z, axis=1) for z in (upper, lower)])
+            right = [jnp.where(wedged, -gamma, 0.0), jnp.where(stops, -u, 0.0)]
+            left = solve(matrix, jnp.concatenate(right)[:, None])[:, 0]
+            return left[:m], left[m:]
+
+        def above(dp: Float[Array, "m B"], dq: Float[Array, "m B"]) -> Bool[Array, "m B"]:
+            """Mask of contacts beyond their cones."""
+            return jnp.abs(dq) > self.friction * jnp.abs(dp) + SNAP * self.tolerance
+
+        first = above(*solved(stops))
+        dp, dq = solved(stops & ~first)
+        fails = any_of(~jnp.isfinite(dp + dq) | (dp < 0) | above(dp, dq))
+        dp, dq = jnp.where(fails, 0.0, dp), jnp.where(fails, 0.0, dq)
+        g = g + self.as_rows(modes, times(coupling, dp) + times(across, dq))
+        u = u + times(back, dp) + times(self.tangent, dq)
+        return jnp.concatenate([x, g, p + dp, u, y[4 * m : 5 * m] + dq, y[5 * m :]])
 
     def _after_one(
         self, modes: Int[Array, "modes B"], y: Float[Array, "n B"]
