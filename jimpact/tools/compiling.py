@@ -72,25 +72,27 @@ def is_top_level_call(*args: Any) -> bool:
 
 def precise_jit(function: Function) -> Function:
     """`eqx.filter_jit(function)` in full precision; kept programs are loaded (`kept_programs`)."""
-    return _compiled(function, dict, eqx.is_array)
+    return _compiled(function, dict, _Results.of, _Results.joined)
 
 
 def quick_jit(function: Function) -> Function:
     """`precise_jit(function)`, compiled quickly where called at top level."""
-    return _compiled(function, known_options, eqx.is_array_like)
+    return _compiled(function, known_options, _same, _same)
 
 
 def _compiled(
     function: Function,
     options: Callable[[], dict[str, Any]],
-    becomes_array: Callable[[Any], bool],
+    packed: Callable[[Any], Any],
+    unpacked: Callable[[Any], Any],
 ) -> Function:
     """The function as a program, by itself where called at top level.
 
     Args:
         function: to be compiled.
         options: of the compiler, where called at top level.
-        becomes_array: True for results that are arrays then; others stay as they are.
+        packed: the results of the function as those of a program, all leaves of which are arrays.
+        unpacked: the inverse.
     """
     inside = eqx.filter_jit(function)
 
@@ -104,7 +106,7 @@ def _compiled(
             values = iter(arrays)
             leaves = [next(values) if x is None else x[0] for x in fixed]
             args, keywords = jax.tree.unflatten(tree, leaves)
-            return _Results(*eqx.partition(function(*args, **keywords), becomes_array))
+            return packed(function(*args, **keywords))
 
         of_arrays.__name__ = name
         return jax.jit(of_arrays, static_argnums=0, compiler_options=options())
@@ -120,7 +122,7 @@ def _compiled(
         arrays = [x for x in leaves if eqx.is_array(x)]
         kept = _kept(function, program, fixed, arrays)
         results = program()(fixed, arrays) if kept is None else kept(arrays)
-        return eqx.combine(results.arrays, results.others)
+        return unpacked(results)
 
     return call  # type: ignore[return-value]
 
@@ -130,6 +132,20 @@ class _Results(eqx.Module):
 
     arrays: Any
     others: Any = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, results: Any) -> "_Results":
+        """The results in two parts."""
+        return cls(*eqx.partition(results, eqx.is_array))
+
+    def joined(self) -> Any:
+        """The results as they were."""
+        return eqx.combine(self.arrays, self.others)
+
+
+def _same(results: Any) -> Any:
+    """The results, all of which become arrays."""
+    return results
 
 
 def _kept(

@@ -160,7 +160,7 @@ class _KeptProgram:
     def _tried(self, kept: "_Bytes", arrays: list[Any]) -> Any:
         """The results by the program of these bytes, which is used from now on; None if it fails.
 
-        Programs never give None: their results are a module.
+        The results of programs are never None.
         """
         try:
             program = kept.loaded(self.arrays)
