@@ -145,7 +145,8 @@ def read_study(path: str | Path, law: str | None = None) -> Study | MotionStudy:
         ValueError: the file is not TOML; a key is unknown or missing; scene, system, law or data
             refuse a value.
 
-    >>>     >>> ji.read_study("three_balls.toml").title, ji.read_study("cradle_motion.toml").title
+    >>> import jimpact as ji
+    >>> ji.read_study("three_balls.toml").title, ji.read_study("cradle_motion.toml").title
     ('Three equal hard balls, one shot', "Newton's cradle, three balls")
     """
 

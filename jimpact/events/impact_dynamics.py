@@ -351,7 +351,7 @@ class ImplicitProgram(ImpulseProgram):
         return jnp.where(busy, CODE["max_steps"], CODE["ok"]).astype(jnp.int32)
 
 
-def method_for(method: str, contact: Contact, friction: bool, springs: bool) -> str:
+def method_for(method: str, contact: Contact, friction: bool, springs: bool = False) -> str:
     """The method; for 'auto' 'implicit' of several contacts with friction in space, else 'time'.
 
     With tangential `springs` it is 'time', too.

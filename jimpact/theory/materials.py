@@ -102,7 +102,7 @@ def mindlin_ratio(
     >>> round(float(ji.theory.mindlin_ratio(0.3)), 4)  # steel
     0.8235
     >>> round(float(ji.theory.mindlin_ratio(0.25, 70e9, 0.3, 210e9)), 4)  # glass on steel
-    0.8471
+    0.8487
     """
     nu1 = as_float_array("poisson", poisson)
     nu2 = nu1 if poisson2 is None else as_float_array("poisson2", poisson2)

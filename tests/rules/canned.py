@@ -102,5 +102,5 @@ def impact_history():
     return History(
         *(37e-6 * t[:, 0], 900 * rows, rows, 0.5 * rows**2, rows, rows - 0.5, 0.6 * rows + 0.4 * t),
         np.zeros((9, 3)),
-        *(none, none, none, np.float64(37e-6), rows.max(axis=0), np.int32(0)),
+        *(none, none, none, none, np.float64(37e-6), rows.max(axis=0), np.int32(0)),
     )
